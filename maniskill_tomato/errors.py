@@ -1,0 +1,25 @@
+"""The exceptions of this package, one family under `TomatoError`."""
+
+from collections.abc import Iterable
+
+
+class TomatoError(Exception):
+    """Base of every error that this package raises on purpose."""
+
+
+class InvalidInputError(TomatoError, ValueError):
+    """An argument, option or file has a value that cannot be used."""
+
+    @classmethod
+    def choice(cls, name: str, value: object, allowed: Iterable[object]) -> "InvalidInputError":
+        """The error for a `value` of the option `name` that is not among the `allowed` ones."""
+        listed = ", ".join(repr(a) for a in allowed)
+        return cls(f"{name} must be one of {listed}; got {value!r}")
+
+
+class RenderingUnavailableError(TomatoError, RuntimeError):
+    """Pictures were asked for on a machine without a usable Vulkan device."""
+
+
+class CheckpointError(TomatoError):
+    """A checkpoint is missing, damaged or made for something else."""

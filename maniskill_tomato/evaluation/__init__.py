@@ -1,0 +1,1 @@
+"""Episodes to metrics, plots and reports."""

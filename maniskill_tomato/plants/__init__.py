@@ -1,0 +1,1 @@
+"""Procedural tomato plants as triangle meshes."""

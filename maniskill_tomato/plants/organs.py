@@ -1,0 +1,107 @@
+"""A plant as the rest of the package sees it: organs made of triangles, and the fruits among them.
+
+Plant frame: origin where the stem leaves the ground, z up, metres, right-handed. The row runs along y; a robot stands at -x.
+"""
+
+from dataclasses import dataclass
+from enum import IntEnum
+from functools import cached_property
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+Float32 = NDArray[np.float32]
+Int32 = NDArray[np.int32]
+Ripeness = Literal["ripe", "turning", "green"]
+
+
+class SemanticClass(IntEnum):
+    """What a pixel shows; the values are stable and used in datasets."""
+
+    BACKGROUND = 0
+    STEM = 1
+    """Main stem, peduncles, pedicels and calyces."""
+    LEAF = 2
+    """Leaflets with their petiole and rachis."""
+    FRUIT_RIPE = 3
+    FRUIT_TURNING = 4
+    FRUIT_GREEN = 5
+    ROBOT = 6
+
+
+@dataclass(frozen=True, eq=False)
+class MeshPart:
+    """Triangles of one material."""
+
+    vertices: Float32
+    """Positions in the plant frame, in [m]. Shape (V, 3)."""
+    normals: Float32
+    """Unit vertex normals. Shape (V, 3)."""
+    uvs: Float32
+    """Texture coordinates in [0, 1]. Shape (V, 2)."""
+    faces: Int32
+    """Vertex indices, counter-clockwise from outside. Shape (F, 3)."""
+    material: str
+    """Name of the material, a key of `materials.MATERIALS`."""
+
+
+@dataclass(frozen=True, eq=False)
+class Organ:
+    """One instance for segmentation: a fruit, a leaf, a truss without its fruits, the stem."""
+
+    name: str
+    """Unique in the plant, e.g. `leaf_07` or `fruit_03`."""
+    semantic_class: SemanticClass
+    parts: tuple[MeshPart, ...]
+
+    @cached_property
+    def vertices(self) -> Float32:
+        """All positions in the plant frame, in [m]. Shape (V, 3)."""
+        return np.concatenate([part.vertices for part in self.parts])
+
+    @cached_property
+    def faces(self) -> Int32:
+        """All triangles, indices into `vertices`. Shape (F, 3)."""
+        offsets = np.cumsum([0] + [len(part.vertices) for part in self.parts[:-1]])
+        return np.concatenate([part.faces + o for part, o in zip(self.parts, offsets, strict=True)]).astype(np.int32)
+
+
+@dataclass(frozen=True, eq=False)
+class Fruit:
+    """Where a fruit hangs."""
+
+    organ_index: int
+    """Index of its organ in `Plant.organs`."""
+    centre: Float32
+    """Centre of the fruit in the plant frame, in [m]. Shape (3,)."""
+    radius: float
+    """Radius of the smallest sphere around `centre` that holds every vertex, in [m]."""
+    ripeness: Ripeness
+
+
+@dataclass(frozen=True, eq=False)
+class Plant:
+    """A generated plant."""
+
+    preset: str
+    seed: int
+    detail: Literal["training", "picture"]
+    organs: tuple[Organ, ...]
+    fruits: tuple[Fruit, ...]
+
+    @cached_property
+    def vertices(self) -> Float32:
+        """All positions in the plant frame, in [m]. Shape (V, 3)."""
+        return np.concatenate([organ.vertices for organ in self.organs])
+
+    @cached_property
+    def faces(self) -> Int32:
+        """All triangles, indices into `vertices`. Shape (F, 3)."""
+        offsets = np.cumsum([0] + [len(organ.vertices) for organ in self.organs[:-1]])
+        return np.concatenate([o.faces + k for o, k in zip(self.organs, offsets, strict=True)]).astype(np.int32)
+
+    @cached_property
+    def organ_of_face(self) -> Int32:
+        """Index into `organs` for every triangle. Shape (F,)."""
+        return np.repeat(np.arange(len(self.organs)), [len(o.faces) for o in self.organs]).astype(np.int32)

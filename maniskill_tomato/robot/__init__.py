@@ -1,0 +1,1 @@
+"""The arm and its camera: numbers, kinematics, the ManiSkill agent."""

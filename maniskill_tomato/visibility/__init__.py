@@ -1,0 +1,1 @@
+"""How much of a fruit a camera sees."""

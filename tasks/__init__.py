@@ -1,0 +1,40 @@
+"""Gym registration of the tomato tasks.
+
+Importing this module is cheap: every spec names its environment by a string, so ManiSkill, SAPIEN and PyTorch load only when
+`gymnasium.make` builds one.
+"""
+
+from gymnasium.envs.registration import WrapperSpec, register, registry
+
+if __name__ != "maniskill_tomato.tasks":
+    raise ImportError(
+        f"imported as {__name__!r}; import `maniskill_tomato.tasks` instead "
+        "(is the repository root on sys.path?)"
+    )
+
+MAX_EPISODE_STEPS = 30
+"""The thesis's horizon T (Tables 5-1 and 5-2)."""
+
+TASK_IDS = ("TomatoViewpointGuided-v1", "TomatoViewpointSparse-v1")
+
+
+def _register(env_id: str, entry_point: str, max_episode_steps: int) -> None:
+    if env_id in registry:
+        return
+    register(
+        id=env_id,
+        entry_point=entry_point,
+        max_episode_steps=max_episode_steps,
+        disable_env_checker=True,  # ManiSkill batches observations and rewards.
+        additional_wrappers=(
+            WrapperSpec(
+                name="MSTimeLimit",
+                entry_point="mani_skill.utils.registration:TimeLimitWrapper",
+                kwargs={"max_episode_steps": max_episode_steps},
+            ),
+        ),
+    )
+
+
+_register("TomatoViewpointGuided-v1", "maniskill_tomato.tasks.viewpoint:TomatoViewpointGuidedEnv", MAX_EPISODE_STEPS)
+_register("TomatoViewpointSparse-v1", "maniskill_tomato.tasks.viewpoint:TomatoViewpointSparseEnv", MAX_EPISODE_STEPS)
