@@ -1,0 +1,160 @@
+"""The viewpoint control mode: an increment of the end-effector's position and roll, pitch, yaw, then move there and look.
+
+The increment is added to where the end-effector is; the closed-form inverse kinematics says whether the arm can take that pose,
+and `outside_workspace` what it does when it cannot. The action's 1 means 1 m or 1 rad, as the thesis's tanh output does
+(section 4-3-2).
+"""
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+import torch
+from gymnasium import spaces
+from mani_skill.agents.controllers.base_controller import BaseController, ControllerConfig
+from torch import Tensor
+
+from maniskill_tomato.robot.inverse_kinematics import InverseKinematics, Reach
+from maniskill_tomato.robot.kinematics import forward_kinematics
+from maniskill_tomato.robot.rotations import matrix_to_rpy, rpy_to_matrix
+
+
+class ViewpointController(BaseController):
+    """Turns an action (dx, dy, dz, droll, dpitch, dyaw) in the base frame into joint targets.
+
+    The orientation is an increment of angles whose matrix is singular at pitch = pi/2, the usual viewing direction, so the
+    controller remembers the angles that it asked for (`viewpoint`) instead of reading them back from a matrix.
+    """
+
+    config: "ViewpointControllerConfig"
+    sets_target_qpos = True
+    sets_target_qvel = False
+
+    viewpoint: Tensor
+    """Where the end-effector is or is heading: x, y, z [m], roll, pitch, yaw [rad], base frame. Shape (num_envs, 6), float32."""
+    reach: Tensor
+    """`Reach` of the pose asked for last. Shape (num_envs,), int64."""
+    target_qpos: Tensor
+    """Joint positions of `viewpoint`, in [rad]. Shape (num_envs, 7), float32."""
+
+    def _initialize_action_space(self) -> None:
+        self.single_action_space = spaces.Box(-1.0, 1.0, (6,), np.float32)
+
+    def set_drive_property(self) -> None:
+        """Gives every joint its PD gains and torque limit."""
+        for joint, limit in zip(self.joints, self.config.force_limits, strict=True):
+            joint.set_drive_properties(self.config.stiffness, self.config.damping, force_limit=limit, mode="force")
+
+    def reset(self) -> None:
+        """Takes the arm as it stands as the pose reached, with the angles nearest to those of before."""
+        if not hasattr(self, "viewpoint"):
+            n = self.scene.num_envs
+            self._inverse_kinematics = InverseKinematics(device=str(self.device))
+            self.viewpoint = torch.zeros(n, 6, device=self.device)
+            self.reach = torch.zeros(n, dtype=torch.int64, device=self.device)
+            self.target_qpos = torch.zeros(n, 7, device=self.device)
+        mask = self.scene._reset_mask
+        self.reach[mask] = Reach.REACHABLE
+        self.observe(mask)
+
+    def observe(self, mask: Tensor | None = None) -> None:
+        """Sets `viewpoint` and `target_qpos` from the joints as they are.
+
+        Args:
+            mask: The environments to update, all if None. Shape (num_envs,), bool.
+        """
+        qpos = self.qpos.clone()
+        T_base_ee = forward_kinematics(qpos.double())
+        rpy = matrix_to_rpy(T_base_ee[:, :3, :3], self.viewpoint[:, 3:].double())
+        viewpoint = torch.cat([T_base_ee[:, :3, 3], rpy], dim=-1).float()
+        if mask is None:
+            self.viewpoint, self.target_qpos = viewpoint, qpos
+        else:
+            self.viewpoint[mask], self.target_qpos[mask] = viewpoint[mask], qpos[mask]
+
+    def go_to(self, viewpoint: Tensor) -> None:
+        """Asks for absolute viewpoints; `viewpoint`, `reach` and `target_qpos` then say what comes of it.
+
+        Args:
+            viewpoint: x, y, z [m], roll, pitch, yaw [rad] in the base frame. Shape (num_envs, 6).
+        """
+        T_base_ee = pose_matrix(viewpoint.double())
+        qpos = self.qpos.double()
+        solution = self._inverse_kinematics.solve(T_base_ee, qpos, neighbour=self.config.neighbour_poses)
+        reach = solution.reach
+        target_qpos, taken = solution.qpos, viewpoint.double()
+        if bool((reach != Reach.REACHABLE).any()):
+            neighbour = (reach == Reach.NEIGHBOUR)[:, None]
+            unreachable = (reach == Reach.UNREACHABLE)[:, None]
+            reached = solution.T_base_ee
+            rpy = matrix_to_rpy(reached[:, :3, :3], taken[:, 3:])
+            taken = torch.where(neighbour, torch.cat([reached[:, :3, 3], rpy], dim=-1), taken)
+            if self.config.outside_workspace == "home":
+                home = torch.zeros_like(target_qpos)
+                T_home = forward_kinematics(home)
+                at_home = torch.cat([T_home[:, :3, 3], torch.zeros_like(rpy)], dim=-1)
+                target_qpos = torch.where(unreachable, home, target_qpos)
+                taken = torch.where(unreachable, at_home, taken)
+            else:
+                target_qpos = torch.where(unreachable, qpos, target_qpos)
+                taken = torch.where(unreachable, self.viewpoint.double(), taken)
+        self.viewpoint, self.reach, self.target_qpos = taken.float(), reach, target_qpos.float()
+
+    def set_action(self, action: Tensor) -> None:
+        """Adds the action, clipped to [-1, 1], to the viewpoint and sets the joint drives' targets.
+
+        Args:
+            action: dx, dy, dz [m], droll, dpitch, dyaw [rad]. Shape (num_envs, 6).
+        """
+        self.go_to(self.viewpoint + action.clamp(-1.0, 1.0))
+        if self.config.drive_joints:
+            self.articulation.set_joint_drive_targets(self.target_qpos, self.joints, self.active_joint_indices)
+
+    def get_state(self) -> dict[str, Tensor]:
+        """The viewpoint, shape (num_envs, 6), and the reach of the last pose asked for, shape (num_envs, 1)."""
+        return {"viewpoint": self.viewpoint.clone(), "reach": self.reach[:, None].float()}
+
+    def set_state(self, state: dict[str, Tensor]) -> None:
+        """Takes back what `get_state` gave; the joints must have been set before.
+
+        Args:
+            state: `viewpoint` of shape (num_envs, 6) and `reach` of shape (num_envs, 1).
+        """
+        self.viewpoint = state["viewpoint"].to(self.device).clone()
+        self.reach = state["reach"][:, 0].to(self.device, torch.int64)
+        self.target_qpos = self.qpos.clone()
+
+
+@dataclass
+class ViewpointControllerConfig(ControllerConfig):
+    """Options of the viewpoint control mode."""
+
+    stiffness: float
+    """Proportional gain of the joint drives, in [N m/rad]."""
+    damping: float
+    """Derivative gain of the joint drives, in [N m s/rad]."""
+    force_limits: tuple[float, ...]
+    """Largest torque of each joint, in [N m]."""
+    neighbour_poses: bool = True
+    """Whether the nearest reachable pose within 5 cm and 10 degrees is taken for one that cannot be reached."""
+    outside_workspace: Literal["home", "stay"] = "stay"
+    """An unreachable pose sends the arm to its home configuration (all joints 0), or leaves it where it is."""
+    drive_joints: bool = True
+    """Whether to hand the targets to the joint drives; a purely kinematic user sets the joints itself."""
+    controller_cls = ViewpointController
+
+
+def pose_matrix(viewpoint: Tensor) -> Tensor:
+    """The homogeneous transform of a viewpoint.
+
+    Args:
+        viewpoint: x, y, z [m], roll, pitch, yaw [rad]. Shape (B, 6).
+
+    Returns:
+        Shape (B, 4, 4).
+    """
+    T = torch.zeros(*viewpoint.shape[:-1], 4, 4, dtype=viewpoint.dtype, device=viewpoint.device)
+    T[..., :3, :3] = rpy_to_matrix(viewpoint[..., 3:])
+    T[..., :3, 3] = viewpoint[..., :3]
+    T[..., 3, 3] = 1.0
+    return T
