@@ -1,0 +1,77 @@
+"""Triangle meshes on a Warp device: one set per plant, shared by every environment that shows it."""
+
+from collections import OrderedDict
+from typing import Any
+
+import numpy as np
+import warp as wp
+from numpy.typing import NDArray
+
+from maniskill_tomato.errors import InvalidInputError
+from maniskill_tomato.plants.organs import Plant, SemanticClass
+
+FRUIT_CLASSES = (SemanticClass.FRUIT_RIPE, SemanticClass.FRUIT_TURNING, SemanticClass.FRUIT_GREEN)
+
+
+def build_mesh(vertices: Any, faces: NDArray[Any], device: str) -> Any:
+    """A Warp mesh with its bounding volume hierarchy.
+
+    Args:
+        vertices: Positions in [m], as an array of Shape (V, 3) or a Warp array of vec3 to share.
+        faces: Vertex indices. Shape (F, 3).
+        device: A Warp device name.
+    """
+    if isinstance(vertices, np.ndarray):
+        vertices = wp.array(np.ascontiguousarray(vertices, dtype=np.float32), dtype=wp.vec3, device=device)
+    indices = wp.array(np.ascontiguousarray(faces, dtype=np.int32).ravel(), dtype=wp.int32, device=device)
+    return wp.Mesh(points=vertices, indices=indices, bvh_constructor="sah")
+
+
+class PlantMeshes:
+    """The meshes of one plant: all of it, and each fruit on its own."""
+
+    def __init__(self, plant: Plant, device: str) -> None:
+        if not plant.fruits:
+            raise InvalidInputError(f"a plant needs at least one fruit to look at; {plant.preset!r} has none")
+        self.plant = plant
+        """Kept so that the identity by which this set is found stays taken."""
+        is_fruit = np.array([organ.semantic_class in FRUIT_CLASSES for organ in plant.organs])
+        fruit_last = np.argsort(is_fruit[plant.organ_of_face], kind="stable")
+        self.first_fruit_face = int(np.count_nonzero(~is_fruit[plant.organ_of_face]))
+        points = wp.array(np.ascontiguousarray(plant.vertices), dtype=wp.vec3, device=device)
+        self.whole = build_mesh(points, plant.faces[fruit_last], device)
+        self.fruits = [
+            build_mesh(points, plant.faces[plant.organ_of_face == fruit.organ_index], device)
+            for fruit in plant.fruits
+        ]
+        self.spheres = np.array([(*fruit.centre, fruit.radius) for fruit in plant.fruits], dtype=np.float32)
+        """Centre in the plant frame and radius of each fruit, in [m]. Shape (F, 4)."""
+        self.is_ripe = np.array([fruit.ripeness == "ripe" for fruit in plant.fruits], dtype=np.int32)
+
+
+class PlantMeshCache:
+    """The meshes of the plants seen last, found by the plant's identity.
+
+    Building the hierarchy of a plant takes tens of milliseconds, so plants that come back should be found
+    here. Environments hold on to the sets they show themselves; the bound is on what this cache keeps alive.
+    """
+
+    def __init__(self, device: str, capacity: int) -> None:
+        self._device = device
+        self._capacity = capacity
+        self._entries: OrderedDict[int, PlantMeshes] = OrderedDict()
+
+    def __len__(self) -> int:
+        return len(self._entries)
+
+    def get(self, plant: Plant) -> PlantMeshes:
+        """The meshes of a plant, built now if they are not at hand."""
+        key = id(plant)
+        entry = self._entries.get(key)
+        if entry is None:
+            entry = self._entries[key] = PlantMeshes(plant, self._device)
+            if len(self._entries) > self._capacity:
+                self._entries.popitem(last=False)
+        else:
+            self._entries.move_to_end(key)
+        return entry
