@@ -18,7 +18,8 @@ SEED_SPLITS: dict[str, tuple[int, int]] = {
 }
 """Half-open, disjoint ranges of plant seeds; a choice with a split's name as seed takes a new plant at every reset."""
 
-MAX_SEED = 2**31 - 1
+MAX_SEED = 2**24 - 1
+"""The largest plant seed: a saved state holds it as a float32."""
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -6,7 +6,7 @@ and `outside_workspace` what it does when it cannot. The action's 1 means 1 m or
 """
 
 from dataclasses import dataclass
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 import torch
@@ -37,6 +37,14 @@ class ViewpointController(BaseController):
     target_qpos: Tensor
     """Joint positions of `viewpoint`, in [rad]. Shape (num_envs, 7), float32."""
 
+    def __init__(self, *args: Any, **kwargs: Any) -> None:
+        super().__init__(*args, **kwargs)
+        n = self.scene.num_envs
+        self._inverse_kinematics = InverseKinematics(device=str(self.device))
+        self.viewpoint = torch.zeros(n, 6, device=self.device)
+        self.reach = torch.full((n,), int(Reach.REACHABLE), dtype=torch.int64, device=self.device)
+        self.target_qpos = torch.zeros(n, 7, device=self.device)
+
     def _initialize_action_space(self) -> None:
         self.single_action_space = spaces.Box(-1.0, 1.0, (6,), np.float32)
 
@@ -47,12 +55,6 @@ class ViewpointController(BaseController):
 
     def reset(self) -> None:
         """Takes the arm as it stands as the pose reached, with the angles nearest to those of before."""
-        if not hasattr(self, "viewpoint"):
-            n = self.scene.num_envs
-            self._inverse_kinematics = InverseKinematics(device=str(self.device))
-            self.viewpoint = torch.zeros(n, 6, device=self.device)
-            self.reach = torch.zeros(n, dtype=torch.int64, device=self.device)
-            self.target_qpos = torch.zeros(n, 7, device=self.device)
         mask = self.scene._reset_mask
         self.reach[mask] = Reach.REACHABLE
         self.observe(mask)

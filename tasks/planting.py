@@ -1,0 +1,144 @@
+"""The plants of an environment: grown, put into the scene, moved, and asked for fruits and segmentation ids."""
+
+from collections.abc import Sequence
+from functools import lru_cache
+
+import numpy as np
+import sapien
+import torch
+from mani_skill.envs.scene import ManiSkillScene
+from mani_skill.utils.structs.actor import Actor
+from mani_skill.utils.structs.pose import Pose
+from torch import Tensor
+
+from maniskill_tomato.plants.generator import generate_plant
+from maniskill_tomato.plants.organs import Plant, SemanticClass
+from maniskill_tomato.plants.rendering import build_plant_actors
+from maniskill_tomato.tasks.plant_choice import PlantChoice
+
+
+@lru_cache(maxsize=32)
+def grow(choice: PlantChoice, seed: int) -> Plant:
+    """The plant of a choice and seed; the last few are kept, as environments often share them."""
+    return generate_plant(choice.preset, seed, choice.detail, choice.leaf_density)
+
+
+class Planting:
+    """One plant for every environment of a scene."""
+
+    def __init__(self, scene: ManiSkillScene, choice: PlantChoice, seeds: Sequence[int], device: torch.device) -> None:
+        """Grows the plants and adds their organs to the scene as kinematic actors.
+
+        Args:
+            scene: The scene, before it is set up.
+            choice: Which plants.
+            seeds: The seed of each environment's plant; environments with equal seeds share actors' meshes.
+            device: Where tensors live.
+        """
+        self.plants = [grow(choice, seed) for seed in seeds]
+        self.seeds = list(seeds)
+        self._device = device
+        num_envs = len(self.plants)
+        self.position_w = torch.zeros(num_envs, 3, device=device)
+        """Stem base in the world frame, in [m]. Shape (num_envs, 3)."""
+        self.yaw = torch.zeros(num_envs, device=device)
+        """Rotation about the vertical, in [rad]. Shape (num_envs,)."""
+        self.T_world_plant = torch.eye(4, device=device).repeat(num_envs, 1, 1)
+        """Plant frame in the world frame. Shape (num_envs, 4, 4)."""
+
+        self._actors: list[tuple[list[int], list[Actor]]] = []
+        pose = sapien.Pose()
+        if len(set(seeds)) == 1:
+            actors = build_plant_actors(
+                scene, self.plants[0], scene_idxs=list(range(num_envs)), pose=pose, name_prefix="plant/"
+            )
+            self._actors.append((list(range(num_envs)), actors))
+        else:
+            for i, plant in enumerate(self.plants):
+                actors = build_plant_actors(scene, plant, scene_idxs=[i], pose=pose, name_prefix=f"plant_{i}/")
+                self._actors.append(([i], actors))
+        # The pose of the plant is task state; thirteen numbers for each of its organs would only repeat it.
+        for _, actors in self._actors:
+            for actor in actors:
+                scene.remove_from_state_dict_registry(actor)
+
+        max_fruits = max(len(plant.fruits) for plant in self.plants)
+        self._fruit_centre_p = torch.zeros(num_envs, max_fruits, 3, device=device)
+        self.fruit_segmentation_id = torch.zeros(num_envs, max_fruits, dtype=torch.int32, device=device)
+        """Segmentation id of every fruit, by index in `Plant.fruits`. Shape (num_envs, max_fruits), int32."""
+        self.ripe_fruits: list[list[int]] = []
+        """Indices of the ripe fruits of each environment's plant."""
+        self._organ_classes: list[dict[int, SemanticClass]] = []
+        for env_indices, actors in self._actors:
+            for k, i in enumerate(env_indices):
+                plant = self.plants[i]
+                ids = [int(actor._objs[k].per_scene_id) for actor in actors]
+                self._organ_classes.append(
+                    {d: organ.semantic_class for d, organ in zip(ids, plant.organs, strict=True)}
+                )
+                for j, fruit in enumerate(plant.fruits):
+                    self._fruit_centre_p[i, j] = torch.as_tensor(fruit.centre)
+                    self.fruit_segmentation_id[i, j] = ids[fruit.organ_index]
+                self.ripe_fruits.append([j for j, fruit in enumerate(plant.fruits) if fruit.ripeness == "ripe"])
+
+    def place(self, env_idx: Tensor, x: Tensor, y: Tensor, yaw: Tensor) -> None:
+        """Puts the plants of some environments somewhere else.
+
+        Args:
+            env_idx: Which environments. Shape (b,).
+            x: Stem base in the world frame, in [m]. Shape (b,).
+            y: Likewise. Shape (b,).
+            yaw: Rotation about the vertical, in [rad]. Shape (b,).
+        """
+        position = torch.stack([x, y, torch.zeros_like(x)], dim=-1)
+        same = torch.equal(self.position_w[env_idx], position) and torch.equal(self.yaw[env_idx], yaw)
+        if same:
+            return
+        self.position_w[env_idx] = position
+        self.yaw[env_idx] = yaw
+        c, s = yaw.cos(), yaw.sin()
+        T = torch.eye(4, device=self._device).repeat(len(env_idx), 1, 1)
+        T[:, 0, 0], T[:, 0, 1], T[:, 1, 0], T[:, 1, 1] = c, -s, s, c
+        T[:, :3, 3] = position
+        self.T_world_plant[env_idx] = T
+        half = 0.5 * self.yaw
+        quat_wxyz = torch.stack([half.cos(), 0.0 * half, 0.0 * half, half.sin()], dim=-1)
+        for env_indices, actors in self._actors:
+            pose = Pose.create_from_pq(self.position_w[env_indices], quat_wxyz[env_indices])
+            for actor in actors:
+                _set_pose_of_all(actor, pose)
+
+    def fruit_position_w(self, fruit: Tensor) -> Tensor:
+        """Centre of one fruit per environment in the world frame, in [m].
+
+        Args:
+            fruit: Index in `Plant.fruits`. Shape (num_envs,).
+
+        Returns:
+            Shape (num_envs, 3).
+        """
+        rows = torch.arange(len(self.plants), device=self._device)
+        centre_p = self._fruit_centre_p[rows, fruit]
+        rotation, translation = self.T_world_plant[:, :3, :3], self.T_world_plant[:, :3, 3]
+        return (rotation @ centre_p[..., None])[..., 0] + translation
+
+    def semantic_classes(self, env_index: int) -> dict[int, SemanticClass]:
+        """The semantic class of every organ of an environment's plant, by segmentation id."""
+        return dict(self._organ_classes[env_index])
+
+
+def _set_pose_of_all(actor: Actor, pose: Pose) -> None:
+    """Sets an actor's pose in all its scenes, whichever of them are being reset."""
+    scene = actor.scene
+    mask = scene._reset_mask
+    scene._reset_mask = torch.ones_like(mask)
+    try:
+        actor.set_pose(pose)
+    finally:
+        scene._reset_mask = mask
+
+
+def ripe_fruit_at_random(planting: Planting, env_index: int, rng: np.random.RandomState) -> int:
+    """A ripe fruit of an environment's plant, each with the same probability."""
+    ripe = planting.ripe_fruits[env_index]
+    return int(ripe[rng.randint(len(ripe))])
