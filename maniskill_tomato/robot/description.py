@@ -1,0 +1,91 @@
+"""The robot's description files: the URDF, and the triangles of every link as SAPIEN renders them."""
+
+import logging
+from functools import lru_cache
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+import numpy.typing as npt
+
+from maniskill_tomato.assets import asset_path
+from maniskill_tomato.robot import d435, glb, iiwa14, meshes, urdf
+
+URDF_NAME: Final = "iiwa14/iiwa14.urdf"
+"""The URDF, relative to the package's assets."""
+
+VISIBLE_LINK_NAMES: Final = (*iiwa14.LINK_NAMES, urdf.CAMERA_LINK_NAME)
+"""The links that have a mesh."""
+
+LinkMesh = tuple[npt.NDArray[np.float32], npt.NDArray[np.int32]]
+
+_logger = logging.getLogger(__name__)
+
+
+def urdf_path() -> str:
+    """The path of the shipped URDF.
+
+    Raises:
+        FileNotFoundError: The package was installed without its assets.
+    """
+    return str(asset_path(URDF_NAME))
+
+
+def _load(name: str) -> LinkMesh:
+    import trimesh
+
+    scene = trimesh.load(asset_path(f"iiwa14/meshes/{name}.glb"), force="scene")
+    vertices: list[npt.NDArray[np.float64]] = []
+    faces: list[npt.NDArray[np.int64]] = []
+    count = 0
+    for node in sorted(scene.graph.nodes_geometry):
+        transform, geometry = scene.graph[node]
+        mesh = scene.geometry[geometry]
+        vertices.append(mesh.vertices @ transform[:3, :3].T + transform[:3, 3])
+        faces.append(mesh.faces + count)
+        count += len(mesh.vertices)
+    return np.concatenate(vertices).astype(np.float32), np.concatenate(faces).astype(np.int32)
+
+
+@lru_cache(maxsize=1)
+def _link_meshes() -> dict[str, LinkMesh]:
+    result = {name: _load(name) for name in iiwa14.LINK_NAMES}
+    flange_vertices, flange_faces = result[iiwa14.EE_LINK_NAME]
+    camera_vertices, camera_faces = _load(urdf.CAMERA_LINK_NAME)
+    rotation, offset = d435.T_flange_camera[:3, :3], d435.T_flange_camera[:3, 3]
+    placed = (camera_vertices @ rotation.T + offset).astype(np.float32)
+    result[iiwa14.EE_LINK_NAME] = (
+        np.concatenate([flange_vertices, placed]),
+        np.concatenate([flange_faces, camera_faces + np.int32(len(flange_vertices))]),
+    )
+    return result
+
+
+def link_meshes() -> dict[str, LinkMesh]:
+    """Every triangle that one sees of the robot, from the files that SAPIEN renders.
+
+    Returns:
+        For each of `iiwa14.LINK_NAMES`: vertices in the link frame, in [m], float32, shape (V, 3); and faces, int32, shape
+        (F, 3), counter-clockwise from outside. `link_ee` holds the camera bracket and the D435's housing.
+
+    Raises:
+        FileNotFoundError: The package was installed without its assets.
+    """
+    return {name: (vertices.copy(), faces.copy()) for name, (vertices, faces) in _link_meshes().items()}
+
+
+def build(folder: Path) -> list[Path]:
+    """Writes the URDF and its meshes into `folder`; the same files on every run.
+
+    Returns:
+        The files written.
+    """
+    (folder / "meshes").mkdir(parents=True, exist_ok=True)
+    written = [folder / "iiwa14.urdf"]
+    written[0].write_text(urdf.urdf_text(), encoding="utf-8")
+    for name in VISIBLE_LINK_NAMES:
+        path = folder / "meshes" / f"{name}.glb"
+        path.write_bytes(glb.to_glb(meshes.link_parts(name)))
+        written.append(path)
+        _logger.info("%s: %d bytes", path, path.stat().st_size)
+    return written
