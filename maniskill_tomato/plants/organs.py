@@ -1,6 +1,7 @@
 """A plant as the rest of the package sees it: organs made of triangles, and the fruits among them.
 
-Plant frame: origin where the stem leaves the ground, z up, metres, right-handed. The row runs along y; a robot stands at -x.
+Plant frame: origin where the stem leaves the ground, z up, metres, right-handed. The row runs along y; a
+robot stands at -x.
 """
 
 from dataclasses import dataclass
@@ -64,7 +65,9 @@ class Organ:
     def faces(self) -> Int32:
         """All triangles, indices into `vertices`. Shape (F, 3)."""
         offsets = np.cumsum([0] + [len(part.vertices) for part in self.parts[:-1]])
-        return np.concatenate([part.faces + o for part, o in zip(self.parts, offsets, strict=True)]).astype(np.int32)
+        return np.concatenate([part.faces + o for part, o in zip(self.parts, offsets, strict=True)]).astype(
+            np.int32
+        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -99,7 +102,9 @@ class Plant:
     def faces(self) -> Int32:
         """All triangles, indices into `vertices`. Shape (F, 3)."""
         offsets = np.cumsum([0] + [len(organ.vertices) for organ in self.organs[:-1]])
-        return np.concatenate([o.faces + k for o, k in zip(self.organs, offsets, strict=True)]).astype(np.int32)
+        return np.concatenate([o.faces + k for o, k in zip(self.organs, offsets, strict=True)]).astype(
+            np.int32
+        )
 
     @cached_property
     def organ_of_face(self) -> Int32:

@@ -1,0 +1,339 @@
+"""What a tomato plant is made of, in numbers: every one a documented parameter with its unit and source.
+
+Sources are named short: [WUR] mean over the annotated young plants of the TomatoWUR data set; [phyllotaxis]
+the study of the main shoot of wild tomato; [Helios] the tomato of the Helios plant library; [blender] the
+tomato generator of fields-ignition; [Ci] Ci et al. 2024 ('Tasty Tom' truss tomato); [airobotsight] measured
+cherry trusses; [yjmpc] a grower's leaf description; [practice] usual greenhouse practice; [looks] set by
+comparing renders with photos.
+`docs/plants.md` lists all values.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass, field, fields
+from math import isfinite
+
+from maniskill_tomato.errors import InvalidInputError
+
+MAX_LEAF_DENSITY = 2.0
+
+
+def _check_positive(config: object, *names: str) -> None:
+    for name in names:
+        value = getattr(config, name)
+        if not (isfinite(value) and value > 0):
+            raise InvalidInputError(f"{type(config).__name__}.{name} must be positive, got {value}")
+
+
+def _check_ranges(config: object) -> None:
+    """Refuses every (low, high) pair of a config that is not ascending."""
+    for item in fields(config):  # type: ignore[arg-type]
+        value = getattr(config, item.name)
+        if item.name.endswith("_range") and not (len(value) == 2 and value[0] <= value[1]):
+            raise InvalidInputError(
+                f"{type(config).__name__}.{item.name} must be (low, high) with low <= high, got {value}"
+            )
+
+
+@dataclass(frozen=True, kw_only=True)
+class StemConfig:
+    """The main shoot, trained up a string."""
+
+    height: float = 1.5
+    """Height of the apex above the ground, in [m]; [blender] 1.25 +- 0.1, raised to the robot's working
+    height."""
+    base_radius: float = 0.0085
+    """Radius at the ground, in [m]; [blender] 9 mm."""
+    tip_radius_ratio: float = 0.42
+    """Radius at the apex over the radius at the ground; [blender] 42 %."""
+    internode_length: float = 0.071
+    """Mean distance between nodes above the first truss, in [m]; [practice] 7-8 cm in a high-wire crop."""
+    lower_internode_length: float = 0.053
+    """Mean distance between nodes below the first truss, in [m]; [WUR] 5.3 cm on young plants."""
+    internode_spread: float = 0.09
+    """Standard deviation of an internode's length over its mean; [WUR] order of its error, 6-12 %."""
+    divergence_mean_deg: float = 135.3
+    """Mean angle between successive leaves, in [deg]; [phyllotaxis]."""
+    divergence_spread_deg: float = 7.0
+    """Standard deviation of that angle, in [deg]; fits the observed range of [phyllotaxis]."""
+    divergence_range_deg: tuple[float, float] = (119.3, 154.7)
+    """Smallest and largest divergence angle, in [deg]; [phyllotaxis]."""
+    nodes_below_first_truss: int = 8
+    """Leaves that the shoot makes before its first truss; [Helios] first floral node at 8 or later."""
+    leaves_per_truss: int = 3
+    """Leaves of one sympodial unit; 3 in indeterminate cultivars, [yjmpc] and [practice]."""
+    wander: float = 0.008
+    """Amplitude of the stem's slow sideways wander on its string, in [m]; [looks]."""
+    zigzag: float = 0.0022
+    """Sideways step of the axis at each node, away from the leaf, in [m]; [looks]."""
+
+    def __post_init__(self) -> None:
+        _check_positive(self, "height", "base_radius", "internode_length", "lower_internode_length")
+        _check_positive(self, "divergence_mean_deg", "nodes_below_first_truss", "leaves_per_truss")
+        if not 0 < self.tip_radius_ratio <= 1:
+            raise InvalidInputError(
+                f"StemConfig.tip_radius_ratio must be in (0, 1], got {self.tip_radius_ratio}"
+            )
+        low, high = self.divergence_range_deg
+        if not low <= self.divergence_mean_deg <= high:
+            raise InvalidInputError(
+                f"StemConfig.divergence_range_deg must hold the mean {self.divergence_mean_deg}, "
+                f"got {(low, high)}"
+            )
+
+
+@dataclass(frozen=True, kw_only=True)
+class LeafConfig:
+    """Compound, odd-pinnate leaves."""
+
+    length_range: tuple[float, float] = (0.25, 0.36)
+    """Length of petiole and rachis of a grown leaf, without the terminal leaflet, in [m]; [yjmpc] 15-45 cm
+    overall."""
+    insertion_deg: float = 59.0
+    """Angle between petiole and upward stem, in [deg]; [WUR] 59."""
+    insertion_spread_deg: float = 6.5
+    """Standard deviation of that angle, in [deg]; [WUR] mean absolute error 6.5."""
+    end_angle_range_deg: tuple[float, float] = (112.0, 150.0)
+    """Angle of the rachis to the upward vertical at its tip (90 is level, 180 hangs), in [deg]; [looks],
+    [Helios]."""
+    sway_spread_deg: float = 9.0
+    """Standard deviation of the sideways bend of a rachis, in [deg]; [looks]."""
+    pairs_range: tuple[int, int] = (2, 4)
+    """Pairs of large lateral leaflets, so 5 to 9 leaflets with the terminal one; [yjmpc] 5-9, [Helios] 7-9.
+    """
+    petiole_fraction: float = 0.30
+    """Part of the petiole and rachis that is bare, from the stem to the first leaflets; [looks]."""
+    petiole_radius: float = 0.0026
+    """Radius of the petiole at the stem, in [m]; [Helios] 2-2.5 mm."""
+    leaflet_length_range: tuple[float, float] = (0.100, 0.135)
+    """Length of the terminal leaflet, in [m]; [Helios] 0.12-0.18, less for a leaf with its lobes spread;
+    [looks]."""
+    lateral_scale: float = 0.82
+    """Length of the largest lateral leaflets over that of the terminal one; [Helios] 0.7-0.9."""
+    leaflet_aspect: float = 0.62
+    """Width over length of a leaflet; [Helios] 0.5-0.6; [looks]."""
+    lobes_per_side: float = 3.5
+    """Lobes or large teeth on each side of a leaflet; [yjmpc] lobed, uneven; [looks]."""
+    lobe_depth: float = 0.34
+    """Depth of the sinuses near the leaflet's base over its half width; shallower towards the tip; [looks].
+    """
+    leaflet_curl_range_deg: tuple[float, float] = (25.0, 65.0)
+    """Turn of the midrib from base to tip, downward, in [deg]; [Helios] strong negative curvature; [looks].
+    """
+    leaflet_droop_range: tuple[float, float] = (0.25, 0.75)
+    """Pull of gravity on a leaflet's direction, as a weight against 1 for its own direction; [looks]."""
+    fold: float = 0.16
+    """Rise of each half of the blade from the midrib over its half width; [Helios] fold 0.1."""
+    lateral_curve: float = 0.42
+    """Fall of the margin by lateral curvature over the half width; [Helios] -0.3 to -0.8."""
+    waviness: float = 0.10
+    """Amplitude of the wave of the margin over the half width; [looks]."""
+    intercalary_per_gap: int = 1
+    """Pairs of small leaflets between two large pairs; [yjmpc] size uneven; [looks]."""
+    intercalary_scale: float = 0.24
+    """Length of a small leaflet over that of the terminal one; [looks]."""
+    young_leaves: int = 5
+    """Leaves below the apex that are still growing; [looks]."""
+    curtain_gap_range: tuple[float, float] = (0.022, 0.042)
+    """Gap between a hidden fruit's skin and the leaflet that hangs before it, in [m]; `one_tomato`,
+    `three_tomatoes`."""
+
+    def __post_init__(self) -> None:
+        _check_ranges(self)
+        _check_positive(self, "leaflet_aspect", "lateral_scale", "petiole_radius", "lobes_per_side")
+        if not 1 <= self.pairs_range[0] <= self.pairs_range[1] <= 4:
+            raise InvalidInputError(f"LeafConfig.pairs_range must lie in 1 to 4, got {self.pairs_range}")
+
+
+@dataclass(frozen=True, kw_only=True)
+class TrussConfig:
+    """Scorpioid cymes: a peduncle with pedicels to the right and left in turn."""
+
+    azimuth_spread_deg: float = 38.0
+    """Standard deviation of a truss's direction about the aisle's (-x), in [deg]; [practice] trusses hang to
+    the aisle."""
+    insertion_deg: float = 74.0
+    """Angle between peduncle and upward stem, in [deg]; [looks], [Helios] pitch 20 below level after bending.
+    """
+    end_angle_deg: float = 172.0
+    """Angle of the peduncle's tip to the upward vertical, in [deg]; it hangs under the fruits' weight;
+    [looks]."""
+    base_length: float = 0.055
+    """Peduncle from the stem to the first pedicel, in [m]; [airobotsight] rachis 170 mm for a whole truss;
+    [looks]."""
+    pedicel_spacing: float = 0.026
+    """Peduncle between pedicels, in [m]; [airobotsight] 170 mm rachis over 6-8 fruits."""
+    base_radius: float = 0.0033
+    """Radius of the peduncle at the stem, in [m]; [Ci] 7 mm across at maturity."""
+    tip_radius_ratio: float = 0.58
+    """Radius at the peduncle's tip over that at its base; [airobotsight] 1.9 of 3.3 mm."""
+    pedicel_length_range: tuple[float, float] = (0.024, 0.034)
+    """Length of a pedicel from peduncle to calyx, in [m]; [looks]."""
+    pedicel_radius: float = 0.0015
+    """Radius of a pedicel, in [m]; [Helios] 1.5 mm."""
+    knuckle_fraction: float = 0.55
+    """Where on the pedicel the knuckle (abscission zone) sits, from the peduncle; [looks]."""
+    sepals: int = 5
+    """Sepals of a calyx; five-merous flower."""
+    sepal_length: float = 0.85
+    """Length of a sepal over the fruit's radius; [looks]."""
+    sepal_width: float = 0.0062
+    """Width of a sepal, in [m]; [looks]."""
+
+    def __post_init__(self) -> None:
+        _check_ranges(self)
+        _check_positive(self, "base_length", "pedicel_spacing", "base_radius", "pedicel_radius", "sepals")
+        _check_positive(self, "sepal_length", "sepal_width")
+
+
+@dataclass(frozen=True, kw_only=True)
+class FruitConfig:
+    """Berries: size, shape and how ripe they are."""
+
+    radius_range: tuple[float, float] = (0.026, 0.033)
+    """Equatorial radius of a grown fruit, in [m]; truss tomatoes are 50-65 mm across."""
+    oblateness_range: tuple[float, float] = (0.86, 0.95)
+    """Height over width; slightly flattened round type; [looks]."""
+    rib_depth_range: tuple[float, float] = (0.004, 0.018)
+    """Depth of the ribs at the shoulder over the radius; [looks]."""
+    shoulder_dent: float = 0.14
+    """Depth of the dent around the calyx over the radius; [looks]."""
+    tilt_spread_deg: float = 9.0
+    """Standard deviation of the fruit's axis about its pedicel's end, in [deg]; [looks]."""
+    truss_ripening_step: float = 0.30
+    """Loss of ripeness (0 to 1) from one truss to the next above; about 8 days a truss, [practice]."""
+    fruit_ripening_step: float = 0.055
+    """Loss of ripeness from one fruit to the next, further from the stem; [practice]."""
+    ripeness_spread: float = 0.05
+    """Standard deviation of a fruit's ripeness; [looks]."""
+    ripe_above: float = 0.62
+    """Ripeness from which a fruit is red all over; between it and `turning_above` it is turning."""
+    turning_above: float = 0.34
+    """Ripeness from which a fruit leaves green."""
+
+    def __post_init__(self) -> None:
+        _check_ranges(self)
+        if not 0 < self.turning_above < self.ripe_above <= 1:
+            raise InvalidInputError(
+                "FruitConfig must have 0 < turning_above < ripe_above <= 1, "
+                f"got {self.turning_above} and {self.ripe_above}"
+            )
+        if self.radius_range[0] <= 0:
+            raise InvalidInputError(f"FruitConfig.radius_range must be positive, got {self.radius_range}")
+
+
+@dataclass(frozen=True, kw_only=True)
+class PlantConfig:
+    """A whole plant."""
+
+    name: str = "full"
+    """Name of the preset, kept in `Plant.preset`."""
+    stem: StemConfig = field(default_factory=StemConfig)
+    leaf: LeafConfig = field(default_factory=LeafConfig)
+    truss: TrussConfig = field(default_factory=TrussConfig)
+    fruit: FruitConfig = field(default_factory=FruitConfig)
+    fruits_per_truss: tuple[int, ...] = (6, 6, 5, 4, 2)
+    """Fruits of each truss from the lowest up; ~8 on cocktail, 6-7 on plum trusses before pruning;
+    [practice]."""
+    fruit_heights: tuple[float, ...] = ()
+    """Heights of the fruits over the ground, in [m], when each truss carries a single one; empty leaves them
+    free."""
+    fruit_height_spread: float = 0.0
+    """Half width of the uniform spread about `fruit_heights`, in [m]."""
+    hide_fruits: bool = False
+    """Hang a leaf before each fruit, on the robot's side, and keep one way of looking at it clear."""
+    clear_azimuth_range_deg: tuple[float, float] = (44.0, 72.0)
+    """Angle of the clear direction to the robot's (-x), in the horizontal plane, in [deg]; used by
+    `hide_fruits`."""
+    clear_elevation_range_deg: tuple[float, float] = (-28.0, 8.0)
+    """Elevation of the clear direction seen from the fruit (negative: from below), in [deg]; used by
+    `hide_fruits`."""
+    clear_right_share: float = 0.65
+    """Share of fruits whose clear side is -y, where the thesis's guided exploration leads; used by
+    `hide_fruits`."""
+    clear_half_angle_deg: float = 11.0
+    """Half angle by which the clear corridor widens away from the fruit, in [deg]; used by `hide_fruits`."""
+    leaves_kept_below_truss: int = 0
+    """Leaves left below the lowest truss; growers take them off as it ripens; [practice]."""
+    leaf_density: float = 1.0
+    """Foliage relative to the preset: 0 none, below 1 leaves and leaflets are left out, above 1 side-shoot
+    leaves."""
+
+    def __post_init__(self) -> None:
+        _check_ranges(self)
+        if not (isfinite(self.leaf_density) and 0 <= self.leaf_density <= MAX_LEAF_DENSITY):
+            raise InvalidInputError(
+                f"leaf_density must be a number from 0 (no leaves) to {MAX_LEAF_DENSITY:g}, "
+                f"got {self.leaf_density}"
+            )
+        if (
+            not self.fruits_per_truss
+            or any(n < 0 for n in self.fruits_per_truss)
+            or not sum(self.fruits_per_truss)
+        ):
+            raise InvalidInputError(
+                "fruits_per_truss must name at least one fruit and no negative count, "
+                f"got {self.fruits_per_truss}"
+            )
+        if self.fruit_heights:
+            if len(self.fruit_heights) != len(self.fruits_per_truss) or set(self.fruits_per_truss) != {1}:
+                raise InvalidInputError(
+                    "fruit_heights needs one height per truss and one fruit on each; "
+                    f"got {self.fruit_heights} for fruits_per_truss {self.fruits_per_truss}"
+                )
+            if list(self.fruit_heights) != sorted(self.fruit_heights) or self.fruit_heights[0] < 0.3:
+                raise InvalidInputError(
+                    f"fruit_heights must ascend from 0.3 m or more, got {self.fruit_heights}"
+                )
+        if self.hide_fruits and not self.fruit_heights:
+            raise InvalidInputError("hide_fruits needs fruit_heights; give a height per truss")
+
+
+def make_one_tomato_config() -> PlantConfig:
+    """The thesis's first training plant (5-1): one ripe tomato under overlapping leaves."""
+    return PlantConfig(
+        name="one_tomato",
+        stem=StemConfig(height=1.42),
+        fruit=FruitConfig(radius_range=(0.0305, 0.0345)),
+        fruits_per_truss=(1,),
+        fruit_heights=(0.775,),
+        fruit_height_spread=0.06,
+        hide_fruits=True,
+    )
+
+
+def make_three_tomatoes_config() -> PlantConfig:
+    """The thesis's second training plant (5-2): three ripe tomatoes at different heights under overlapping
+    leaves."""
+    return PlantConfig(
+        name="three_tomatoes",
+        stem=StemConfig(height=1.46),
+        fruit=FruitConfig(radius_range=(0.029, 0.0345), truss_ripening_step=0.0),
+        fruits_per_truss=(1, 1, 1),
+        fruit_heights=(0.62, 0.80, 0.98),
+        fruit_height_spread=0.02,
+        hide_fruits=True,
+    )
+
+
+def make_full_config() -> PlantConfig:
+    """A whole greenhouse plant: five trusses from ripe to green and all its foliage."""
+    return PlantConfig(name="full", leaves_kept_below_truss=1)
+
+
+PRESETS: dict[str, Callable[[], PlantConfig]] = {
+    "one_tomato": make_one_tomato_config,
+    "three_tomatoes": make_three_tomatoes_config,
+    "full": make_full_config,
+}
+"""The plants of the thesis by name."""
+
+
+def make_config(preset: str) -> PlantConfig:
+    """The configuration of a preset.
+
+    Raises:
+        InvalidInputError: If there is no such preset.
+    """
+    if preset not in PRESETS:
+        raise InvalidInputError.choice("preset", preset, PRESETS)
+    return PRESETS[preset]()

@@ -1,0 +1,144 @@
+"""The blade of a leaflet: a lobed, folded and curled surface, meshed from both sides."""
+
+from dataclasses import dataclass
+from math import pi
+
+import numpy as np
+
+from maniskill_tomato.plants.meshing import Float64, Patch, cross, flipped, normalized
+
+
+@dataclass(frozen=True, eq=False)
+class Leaflet:
+    """Shape and place of one leaflet."""
+
+    base: Float64
+    """Where the blade begins, in the plant frame, in [m]. Shape (3,)."""
+    direction: Float64
+    """Unit vector along the midrib at the base. Shape (3,)."""
+    up: Float64
+    """Unit vector out of the upper side at the base, across `direction`. Shape (3,)."""
+    length: float
+    """Length of the midrib, in [m]."""
+    width: float
+    """Greatest width without lobes, in [m]."""
+    lobes: float
+    """Lobes per side."""
+    depth: float
+    """Depth of the sinuses over the half width."""
+    curl: float
+    """Downward turn of the midrib over its length, in [rad]."""
+    fold: float
+    """Rise of the halves over their width."""
+    curve: float
+    """Fall of the margin over the half width."""
+    waviness: float
+    """Amplitude of the margin's wave over the half width."""
+    phases: Float64
+    """Phases of the lobes of the left and right side, of the margin's wave and its frequency, in [rad]. Shape
+    (4,)."""
+    asymmetry: float
+    """Width of the left half less that of the right half, over the width."""
+
+    @property
+    def small(self) -> bool:
+        """Whether this is one of the little leaflets between the large ones, meshed with few triangles."""
+        return self.length < 0.045
+
+
+def _half_width(leaflet: Leaflet, t: Float64, side: Float64, *, serrate: bool) -> Float64:
+    """Half width along the midrib on one side (+1 left, -1 right), in [m]."""
+    envelope = np.sin(pi * np.clip(t, 0.0, 1.0) ** 0.68) ** 0.82 * (1.0 - 0.18 * t)
+    lobe_phase = 2 * pi * leaflet.lobes * t**0.9 + np.where(side > 0, leaflet.phases[0], leaflet.phases[1])
+    # A raised cosine to a low power: round lobes and narrow sinuses.
+    sinus = (0.5 + 0.5 * np.cos(lobe_phase)) ** 1.6
+    depth = leaflet.depth * (1.0 - 0.75 * t)
+    outline = envelope * (1.0 - depth * sinus)
+    if serrate:
+        outline = outline * (1.0 + 0.030 * np.sin(5.0 * lobe_phase + 1.0) * np.sin(pi * np.clip(t, 0, 1)))
+    return np.asarray(0.5 * leaflet.width * (1.0 + side * leaflet.asymmetry) * outline)
+
+
+def _surface(leaflet: Leaflet, t: Float64, s: Float64, *, serrate: bool) -> Float64:
+    """Points of the blade.
+
+    Args:
+        leaflet: Its shape.
+        t: Parameter along the midrib, 0 at the base and 1 at the tip. Shape (...).
+        s: Parameter across, -1 at the right margin, 0 on the midrib, 1 at the left margin. Shape (...).
+        serrate: Whether the margin has its fine teeth.
+    """
+    side = np.where(s >= 0, 1.0, -1.0)
+    half = _half_width(leaflet, t, side, serrate=serrate)
+    across = s * half
+    a = np.abs(s)
+    # Side veins run forward, and the lobes with them.
+    along = t + 0.16 * a * np.sin(pi * t) * (1.0 - 0.5 * t)
+    rise = half * (leaflet.fold * a - leaflet.curve * a * a)
+    wave = np.sin(2 * pi * (1.6 + 0.8 * np.sin(leaflet.phases[3])) * t + leaflet.phases[2] + 1.3 * side)
+    rise = rise + half * leaflet.waviness * wave * a * a
+    # The blade between the side veins bulges upward a little.
+    veins = 2 * pi * leaflet.lobes * 2.0 * (t - 0.25 * a)
+    rise = rise + 0.022 * leaflet.width * np.sin(veins) * a * (1.0 - a) * 4.0
+    angle = leaflet.curl * along
+    safe = leaflet.curl if abs(leaflet.curl) > 1e-6 else 1e-6
+    x = np.sin(angle) / safe * leaflet.length
+    z = -(1.0 - np.cos(angle)) / safe * leaflet.length
+    # The rise is measured across the curled midrib.
+    x, z = x + rise * np.sin(angle), z + rise * np.cos(angle)
+    left = cross(leaflet.up, leaflet.direction)
+    return np.asarray(
+        leaflet.base + x[..., None] * leaflet.direction + across[..., None] * left + z[..., None] * leaflet.up
+    )
+
+
+def _rows(leaflet: Leaflet, *, picture: bool) -> Float64:
+    """Parameters along the midrib at which the blade is cut. Shape (N,)."""
+    if picture:
+        return np.linspace(0.0, 1.0, 9 if leaflet.small else 33)
+    if leaflet.small:
+        return np.array([0.0, 0.3, 0.68, 1.0])
+    # Cuts at the lobes' tips and sinuses keep the outline with few triangles.
+    phase = 0.5 * (leaflet.phases[0] + leaflet.phases[1])
+    turns = (np.arange(-2, 2 * leaflet.lobes + 2) * pi - phase) / (2 * pi * leaflet.lobes)
+    inner = turns[(turns > 0.06) & (turns < 0.90)] ** (1 / 0.9)
+    if inner[0] > 0.13:
+        inner = np.concatenate([[0.06], inner])
+    return np.concatenate([[0.0], inner, [1.0]])
+
+
+def blade(leaflet: Leaflet, *, picture: bool) -> Patch:
+    """The upper side of a leaflet's blade."""
+    rows = _rows(leaflet, picture=picture)
+    half_columns = 1 if not picture else (2 if leaflet.small else 4)
+    columns = np.linspace(-1.0, 1.0, 2 * half_columns + 1)
+    t = np.concatenate([[0.0], np.repeat(rows[1:-1], len(columns)), [1.0]])
+    s = np.concatenate([[0.0], np.tile(columns, len(rows) - 2), [0.0]])
+    step = 1e-3
+    vertices = _surface(leaflet, t, s, serrate=picture)
+    # Normals of the smooth blade: taken a little inside the margin, and to the side on which the point lies.
+    ti = np.clip(t, 0.04, 0.96)
+    si = np.where(s == 0, 0.0, 0.85 * s)
+    at_midrib = s == 0
+    du = _surface(leaflet, ti + step, si, serrate=False) - _surface(leaflet, ti - step, si, serrate=False)
+    dv = _surface(leaflet, ti, si + step, serrate=False) - _surface(leaflet, ti, si - step, serrate=False)
+    dv = np.where(at_midrib[:, None], cross(leaflet.up, leaflet.direction), dv)
+    normals = normalized(cross(du, dv))
+    uvs = np.stack([0.02 + 0.96 * t, 0.5 + 0.48 * s], 1)
+
+    width = len(columns)
+    first, last = 1, 1 + (len(rows) - 3) * width
+    fan = np.arange(width - 1)
+    faces = [np.stack([np.zeros(width - 1, np.int64), first + fan, first + fan + 1], 1)]
+    for row in range(len(rows) - 3):
+        a = first + row * width + fan
+        faces.append(np.stack([a, a + width, a + width + 1], 1))
+        faces.append(np.stack([a, a + width + 1, a + 1], 1))
+    faces.append(np.stack([last + fan, np.full(width - 1, len(t) - 1), last + fan + 1], 1))
+    return Patch(vertices, normals, uvs, np.concatenate(faces).astype(np.int64))
+
+
+def both_sides(leaflet: Leaflet, *, picture: bool) -> tuple[Patch, Patch]:
+    """Upper and lower side of a leaflet; SAPIEN draws only the side whose triangles face the camera."""
+    upper = blade(leaflet, picture=picture)
+    return upper, flipped(upper)

@@ -1,0 +1,85 @@
+"""Plants as actors of a ManiSkill scene: one kinematic body, and so one segmentation id, per organ."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from maniskill_tomato.plants.materials import MATERIALS
+from maniskill_tomato.plants.organs import MeshPart, Plant
+
+if TYPE_CHECKING:
+    import sapien
+    import sapien.render
+    from mani_skill.envs.scene import ManiSkillScene
+    from mani_skill.utils.structs.actor import Actor
+
+
+def make_render_material(name: str) -> sapien.render.RenderMaterial:
+    """A SAPIEN material from `MATERIALS`; needs a Vulkan device."""
+    import sapien.render
+
+    material = MATERIALS[name]
+    result = sapien.render.RenderMaterial(
+        base_color=[1.0, 1.0, 1.0, 1.0], roughness=material.roughness, specular=material.specular
+    )
+    result.base_color_texture = sapien.render.RenderTexture2D(
+        material.base_color,
+        "R8G8B8A8Unorm",
+        mipmap_levels=6,
+        filter_mode="linear",
+        address_mode="repeat",
+        srgb=True,
+    )
+    return result
+
+
+def _make_shape(
+    part: MeshPart, materials: dict[str, sapien.render.RenderMaterial]
+) -> sapien.render.RenderShapeTriangleMesh:
+    import numpy as np
+    import sapien.render
+
+    if part.material not in materials:
+        materials[part.material] = make_render_material(part.material)
+    return sapien.render.RenderShapeTriangleMesh(
+        vertices=part.vertices,
+        triangles=part.faces.astype(np.uint32),
+        normals=part.normals,
+        uvs=part.uvs,
+        material=materials[part.material],
+    )
+
+
+def build_plant_actors(
+    scene: ManiSkillScene, plant: Plant, *, scene_idxs: list[int], pose: sapien.Pose, name_prefix: str
+) -> list[Actor]:
+    """Puts a plant into some of a scene's sub-scenes.
+
+    Every organ becomes a kinematic actor without collision shapes whose own frame is the plant's. A scene
+    that cannot render gets the same actors without shapes, so segmentation ids (`per_scene_id`) agree between
+    backends.
+
+    Args:
+        scene: Where to build.
+        plant: What to build.
+        scene_idxs: Indices of the sub-scenes that get this plant.
+        pose: Pose of the plant's frame in the world.
+        name_prefix: Put before every organ's name; with it, names must be unique in the scene.
+
+    Returns:
+        The actors in the order of `plant.organs`.
+    """
+    from mani_skill.utils.structs.pose import Pose
+
+    materials: dict[str, sapien.render.RenderMaterial] = {}
+    initial_pose = Pose.create(pose)
+    actors = []
+    for organ in plant.organs:
+        builder = scene.create_actor_builder()
+        builder.set_scene_idxs(scene_idxs)
+        builder.initial_pose = initial_pose
+        if scene.can_render():
+            # ManiSkill's own builders hand over meshes made in memory in this way.
+            builder._procedural_shapes.extend(_make_shape(part, materials) for part in organ.parts)
+        actors.append(builder.build_kinematic(f"{name_prefix}{organ.name}"))
+    return actors
