@@ -23,3 +23,7 @@ class RenderingUnavailableError(TomatoError, RuntimeError):
 
 class CheckpointError(TomatoError):
     """A checkpoint is missing, damaged or made for something else."""
+
+
+class TrainingDivergedError(TomatoError):
+    """A loss or a weight is no longer a finite number."""

@@ -1,0 +1,159 @@
+"""Checkpoints: weights with everything needed to use them, written whole or not at all."""
+
+import io
+import os
+import pickle
+import zipfile
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+import maniskill_tomato
+from maniskill_tomato.errors import CheckpointError
+from maniskill_tomato.learning.agent import Agent
+from maniskill_tomato.learning.presets import ACTION_NAMES, OBSERVATION_NAMES
+
+FORMAT = 1
+"""Version of the layout that `make_checkpoint` documents."""
+
+REQUIRED_KEYS = (
+    "format",
+    "package_version",
+    "env_id",
+    "config",
+    "observation",
+    "action",
+    "normalizer",
+    "actor",
+    "counters",
+)
+
+
+def make_checkpoint(
+    agent: Agent,
+    env_id: str,
+    action_bounds: tuple[Tensor, Tensor],
+    counters: dict[str, int | float],
+    with_training_state: bool = True,
+) -> dict[str, Any]:
+    """What a checkpoint file holds: tensors, numbers and strings only, so that it loads without running code.
+
+    Args:
+        agent: Its weights.
+        env_id: The task that it was trained on.
+        action_bounds: Low and high of the environment's action space. Each of shape (action_dim,).
+        counters: Steps, episodes, updates, seconds, seed.
+        with_training_state: Also keep critics, target networks and optimisers; a policy to be used needs none
+            of them.
+    """
+    low, high = action_bounds
+    scale = torch.tensor(agent.config.action_scale)
+    observation_dim = len(agent.normalizer.centre)
+    data: dict[str, Any] = {
+        "format": FORMAT,
+        "package_version": maniskill_tomato.__version__,
+        "env_id": env_id,
+        "config": agent.config.to_dict(),
+        "observation": {
+            "names": _names(OBSERVATION_NAMES, observation_dim),
+            "shape": [observation_dim],
+            "frame": "world = robot base",
+            "units": "m, rad",
+        },
+        "action": {
+            "names": _names(ACTION_NAMES, len(scale)),
+            "low": low.cpu(),
+            "high": high.cpu(),
+            "scale": scale,
+            "units": "m, rad",
+        },
+        "normalizer": agent.normalizer.state_dict(),
+        "actor": agent.actor.state_dict(),
+        "counters": counters,
+    }
+    if with_training_state:
+        for name in ("critics", "target_actor", "target_critics", "actor_optimizer", "critic_optimizer"):
+            data[name] = getattr(agent, name).state_dict()
+    return data
+
+
+def save_checkpoint(path: Path, data: dict[str, Any]) -> None:
+    """Writes `data` to a neighbouring file first and renames it, so that `path` never holds half a
+    checkpoint.
+
+    Raises:
+        CheckpointError: The file cannot be written, for instance because the disk is full; an older file
+            stays.
+    """
+    buffer = io.BytesIO()
+    torch.save(data, buffer)
+    write_atomically(path, buffer.getvalue())
+
+
+def write_atomically(path: Path, content: bytes) -> None:
+    """Replaces the file `path` by one with `content` in a single step.
+
+    Raises:
+        CheckpointError: The file cannot be written.
+    """
+    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with temporary.open("wb") as file:
+            file.write(content)
+            file.flush()
+            os.fsync(file.fileno())
+        temporary.replace(path)
+    except OSError as error:
+        temporary.unlink(missing_ok=True)
+        raise CheckpointError(
+            f"cannot write {path}: {error.strerror or error}; free some space or choose another --out"
+        ) from error
+
+
+def load_checkpoint(path: Path | str, device: torch.device | str = "cpu") -> dict[str, Any]:
+    """The content of a checkpoint file (see `make_checkpoint`).
+
+    Raises:
+        CheckpointError: The file is missing, damaged, not one of ours, or of a newer format.
+    """
+    path = Path(path)
+    if not path.is_file():
+        raise CheckpointError(
+            f"no checkpoint at {path}; `maniskill-tomato train` writes policy.pt into its run folder"
+        )
+    try:
+        data = torch.load(path, map_location=device, weights_only=True)
+    except (
+        RuntimeError,
+        EOFError,
+        OSError,
+        ValueError,
+        KeyError,
+        pickle.UnpicklingError,
+        zipfile.BadZipFile,
+    ) as error:
+        reason = (str(error).splitlines() or [type(error).__name__])[0]
+        raise CheckpointError(
+            f"{path} is not a readable checkpoint ({reason}); it may be truncated: "
+            "use an earlier one from its run folder"
+        ) from error
+    if not isinstance(data, dict) or any(key not in data for key in REQUIRED_KEYS):
+        raise CheckpointError(
+            f"{path} is not a checkpoint of this package, which would hold {', '.join(REQUIRED_KEYS)}"
+        )
+    content: dict[str, Any] = data
+    if not isinstance(content["format"], int) or content["format"] > FORMAT:
+        raise CheckpointError(
+            f"{path} has checkpoint format {content['format']}, written by version "
+            f"{content['package_version']}; "
+            f"this version, {maniskill_tomato.__version__}, reads up to {FORMAT}: upgrade maniskill-tomato"
+        )
+    return content
+
+
+def _names(names: tuple[str, ...], count: int) -> list[str]:
+    """The documented names, or numbered ones for spaces of another size."""
+    return list(names) if len(names) == count else [f"value_{i}" for i in range(count)]

@@ -1,0 +1,70 @@
+"""The environments a learner steps: many at once, reset when done, with the last observation of an episode
+kept."""
+
+from typing import Any, Protocol, cast
+
+import gymnasium as gym
+import torch
+from torch import Tensor
+
+from maniskill_tomato.errors import InvalidInputError
+from maniskill_tomato.tasks import TASK_IDS
+
+
+class LearnerEnv(Protocol):
+    """What a learner needs of an environment; ManiSkill's `ManiSkillVectorEnv` offers it.
+
+    Environments that are done are reset within `step`: the returned observation is the first of the new
+    episode and `info["final_observation"]`, `info["final_info"]` are what the step itself gave.
+    """
+
+    num_envs: int
+    single_observation_space: gym.Space[Any]
+    single_action_space: gym.Space[Any]
+
+    def reset(self, *, seed: int | list[int] | None = None) -> tuple[Tensor, dict[str, Any]]:
+        """Starts an episode everywhere."""
+        ...
+
+    def step(self, actions: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor, dict[str, Any]]:
+        """Observations, rewards, terminations, truncations, info; `num_envs` rows each."""
+        ...
+
+    def close(self) -> None:
+        """Frees the simulation."""
+        ...
+
+
+def check_env_id(env_id: str) -> None:
+    """Accepts the ids of this package's tasks.
+
+    Raises:
+        InvalidInputError: Another id; the message lists the allowed ones.
+    """
+    if env_id not in TASK_IDS:
+        raise InvalidInputError.choice("the environment id", env_id, TASK_IDS)
+
+
+def make_env(env_id: str, num_envs: int = 1, **options: Any) -> gym.Env[Any, Any]:
+    """One of this package's tasks with state observations, without rendering unless `options` say otherwise.
+
+    Raises:
+        InvalidInputError: The id is unknown, or more environments are asked for than this machine can
+            simulate at once.
+    """
+    check_env_id(env_id)
+    if num_envs > 1 and not torch.cuda.is_available():
+        raise InvalidInputError(
+            f"num_envs must be 1 without a CUDA device, where ManiSkill simulates on the CPU; got {num_envs}"
+        )
+    options = {"obs_mode": "state", "render_backend": "none", "num_envs": num_envs, **options}
+    return gym.make(env_id, **options)
+
+
+def make_learner_env(env_id: str, num_envs: int = 1, **options: Any) -> LearnerEnv:
+    """The same, wrapped for a learner; see `make_env`."""
+    env = make_env(env_id, num_envs, **options)
+    # ManiSkill takes seconds to import; commands that do not simulate need not wait for it.
+    from mani_skill.vector.wrappers.gymnasium import ManiSkillVectorEnv
+
+    return cast(LearnerEnv, ManiSkillVectorEnv(env, auto_reset=True))

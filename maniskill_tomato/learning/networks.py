@@ -1,0 +1,133 @@
+"""Actor and critic networks: the thesis's (section 4-3-2) and wider ones of the same shape."""
+
+from collections.abc import Sequence
+from typing import Literal
+
+import torch
+from torch import Tensor, nn
+
+CRITIC_OUTPUT_BOUND = 0.05
+"""Half-width of the critic's uniform output weights. The thesis says "a uniform distribution" and no bound;
+this is the default of Keras's RandomUniform, whose vocabulary (dense layer, kernel, He and Glorot
+initialiser) the thesis uses."""
+
+ACTOR_SMALL_OUTPUT_BOUND = 3e-3
+"""Half-width of the actor's output weights with `output_init="small"`: the first actions are nearly zero
+(Lillicrap et al., 2016)."""
+
+ActorOutputInit = Literal["glorot", "small"]
+
+
+def initialise_hidden_(layer: nn.Linear) -> None:
+    """He initialisation for a ReLU layer: weights N(0, 2 / fan_in), biases zero."""
+    nn.init.kaiming_normal_(layer.weight, nonlinearity="relu")
+    nn.init.zeros_(layer.bias)
+
+
+class Actor(nn.Module):
+    """The policy mu(s): hidden ReLU layers, then tanh.
+
+    The output is in units of the action scale: the environment's action is `output * action_scale`.
+    """
+
+    def __init__(
+        self,
+        observation_dim: int,
+        action_dim: int,
+        hidden: Sequence[int] = (100, 100),
+        output_init: ActorOutputInit = "glorot",
+    ) -> None:
+        """Builds the layers.
+
+        Args:
+            observation_dim: Number of observed values.
+            action_dim: Number of actions.
+            hidden: Width of each hidden layer.
+            output_init: `glorot`: uniform within sqrt(6 / (fan_in + fan_out)), as the thesis; `small`:
+                uniform within `ACTOR_SMALL_OUTPUT_BOUND`.
+        """
+        super().__init__()
+        widths = (observation_dim, *hidden)
+        layers = [nn.Linear(a, b) for a, b in zip(widths[:-1], widths[1:], strict=True)]
+        for layer in layers:
+            initialise_hidden_(layer)
+        self.hidden = nn.ModuleList(layers)
+        self.output = nn.Linear(widths[-1], action_dim)
+        if output_init == "glorot":
+            nn.init.xavier_uniform_(self.output.weight)
+        else:
+            nn.init.uniform_(self.output.weight, -ACTOR_SMALL_OUTPUT_BOUND, ACTOR_SMALL_OUTPUT_BOUND)
+        nn.init.zeros_(self.output.bias)
+
+    def pre_activation(self, observations: Tensor) -> Tensor:
+        """The output before tanh. Shape (B, action_dim)."""
+        x = observations
+        for layer in self.hidden:
+            x = torch.relu(layer(x))
+        out: Tensor = self.output(x)
+        return out
+
+    def forward(self, observations: Tensor) -> Tensor:
+        """Actions in [-1, 1] for normalised observations of shape (B, observation_dim). Shape (B,
+        action_dim)."""
+        return torch.tanh(self.pre_activation(observations))
+
+
+class Critic(nn.Module):
+    """The value Q(s, a): hidden ReLU layers, then one linear output.
+
+    The action joins the input of the hidden layer `action_layer`: 1 as in the thesis (the first layer sees
+    the state alone), 0 to give the state and the action to the first layer.
+    """
+
+    def __init__(
+        self,
+        observation_dim: int,
+        action_dim: int,
+        hidden: Sequence[int] = (100, 100),
+        action_layer: int = 1,
+    ) -> None:
+        super().__init__()
+        self.action_layer = action_layer
+        layers: list[nn.Linear] = []
+        fan_in = observation_dim
+        for index, width in enumerate(hidden):
+            layers.append(nn.Linear(fan_in + (action_dim if index == action_layer else 0), width))
+            initialise_hidden_(layers[-1])
+            fan_in = width
+        self.hidden = nn.ModuleList(layers)
+        self.output = nn.Linear(fan_in, 1)
+        nn.init.uniform_(self.output.weight, -CRITIC_OUTPUT_BOUND, CRITIC_OUTPUT_BOUND)
+        nn.init.zeros_(self.output.bias)
+
+    def forward(self, observations: Tensor, actions: Tensor) -> Tensor:
+        """Values of shape (B,) for observations (B, observation_dim) and actions in [-1, 1], (B,
+        action_dim)."""
+        x = observations
+        for index, layer in enumerate(self.hidden):
+            if index == self.action_layer:
+                x = torch.cat((x, actions), dim=-1)
+            x = torch.relu(layer(x))
+        values: Tensor = self.output(x)
+        return values.squeeze(-1)
+
+
+class ObservationNormalizer(nn.Module):
+    """A fixed affine map `(observation - centre) / half_range`; the identity by default."""
+
+    centre: Tensor
+    half_range: Tensor
+
+    def __init__(self, centre: Sequence[float], half_range: Sequence[float]) -> None:
+        super().__init__()
+        self.register_buffer("centre", torch.tensor(centre, dtype=torch.float32))
+        self.register_buffer("half_range", torch.tensor(half_range, dtype=torch.float32))
+
+    @classmethod
+    def identity(cls, observation_dim: int) -> "ObservationNormalizer":
+        """The map that changes nothing."""
+        return cls([0.0] * observation_dim, [1.0] * observation_dim)
+
+    def forward(self, observations: Tensor) -> Tensor:
+        """Scaled observations, of the same shape (B, observation_dim)."""
+        return (observations - self.centre) / self.half_range

@@ -1,0 +1,82 @@
+"""Replay: a ring of transitions kept in preallocated tensors."""
+
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from maniskill_tomato.errors import InvalidInputError
+
+
+class Batch(NamedTuple):
+    """Transitions (s, a, r, s', done), one per row."""
+
+    observations: Tensor
+    """Shape (B, observation_dim)."""
+    actions: Tensor
+    """In units of the action scale. Shape (B, action_dim)."""
+    rewards: Tensor
+    """Shape (B,)."""
+    next_observations: Tensor
+    """What was seen after the action, before any reset. Shape (B, observation_dim)."""
+    terminations: Tensor
+    """1.0 where the episode ended for good, 0.0 where it went on or only ran out of time. Shape (B,)."""
+
+
+class ReplayBuffer:
+    """The newest `capacity` transitions; older ones are overwritten."""
+
+    def __init__(
+        self, capacity: int, observation_dim: int, action_dim: int, device: torch.device | str = "cpu"
+    ) -> None:
+        if capacity < 1:
+            raise InvalidInputError(f"the replay capacity must be 1 or more, got {capacity}")
+        self.capacity = capacity
+        self._storage = Batch(
+            torch.zeros(capacity, observation_dim, device=device),
+            torch.zeros(capacity, action_dim, device=device),
+            torch.zeros(capacity, device=device),
+            torch.zeros(capacity, observation_dim, device=device),
+            torch.zeros(capacity, device=device),
+        )
+        self._next = 0
+        self._size = 0
+
+    def __len__(self) -> int:
+        """Number of transitions held."""
+        return self._size
+
+    def add(self, transitions: Batch) -> None:
+        """Stores one transition per row, the first row first.
+
+        Raises:
+            InvalidInputError: There are more rows than the buffer can hold.
+        """
+        count = len(transitions.rewards)
+        if count > self.capacity:
+            raise InvalidInputError(
+                f"{count} transitions at once do not fit a replay buffer of {self.capacity}; "
+                "raise buffer_size or lower num_envs"
+            )
+        end = self._next + count
+        if end <= self.capacity:
+            rows: slice | Tensor = slice(self._next, end)
+        else:
+            rows = torch.arange(self._next, end, device=self._storage.rewards.device) % self.capacity
+        for stored, new in zip(self._storage, transitions, strict=True):
+            stored[rows] = new.to(stored.dtype)
+        self._next = end % self.capacity
+        self._size = min(self._size + count, self.capacity)
+
+    def sample(self, batch_size: int, generator: torch.Generator | None = None) -> Batch:
+        """Draws `batch_size` transitions uniformly, with replacement.
+
+        Raises:
+            InvalidInputError: The buffer is empty.
+        """
+        if self._size == 0:
+            raise InvalidInputError("cannot sample from an empty replay buffer")
+        rows = torch.randint(
+            self._size, (batch_size,), generator=generator, device=self._storage.rewards.device
+        )
+        return Batch(*(stored[rows] for stored in self._storage))
