@@ -1,0 +1,219 @@
+"""Measures the speed and the memory of the simulator on this machine, all in one run, as one JSON.
+
+Usage:
+    python scripts/benchmark.py --out benchmark.json
+"""
+
+import json
+import logging
+import os
+import platform
+import statistics
+import sys
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import torch
+import tyro
+from mani_skill.envs.sapien_env import BaseEnv
+from mani_skill.utils.registration import register_env
+from mani_skill.utils.structs.types import SimConfig
+
+import maniskill_tomato  # noqa: F401
+from maniskill_tomato.plants.generator import generate_plant
+from maniskill_tomato.rendering import rendering_available
+from maniskill_tomato.robot import agent as agent
+from maniskill_tomato.robot.d435 import color_intrinsics
+from maniskill_tomato.robot.inverse_kinematics import InverseKinematics
+from maniskill_tomato.robot.iiwa14 import JOINT_LOWER, JOINT_UPPER
+from maniskill_tomato.robot.kinematics import forward_kinematics
+from maniskill_tomato.visibility.caster import VisibilityCaster
+
+GUIDED = "TomatoViewpointGuided-v1"
+EMPTY = "TomatoBenchmarkEmpty-v1"
+MIB = 2**20
+
+
+@dataclass(frozen=True, kw_only=True)
+class Args:
+    """What to measure and where to write it."""
+
+    out: Path = Path("benchmark.json")
+    """The JSON file."""
+    repeats: int = 5
+    """Each rate is the median of this number of measurements, taken in turns."""
+    memory_steps: int = 10_000
+    """Steps over which memory must not grow."""
+    memory_resets: int = 500
+    """Resets with new plants over which memory must not grow."""
+
+
+@register_env(EMPTY, max_episode_steps=10**9)
+class EmptyEnv(BaseEnv):
+    """This robot and nothing else: ManiSkill's own step with one physics step per action, the yardstick for ours."""
+
+    SUPPORTED_ROBOTS = ["iiwa14_d435"]
+
+    @property
+    def _default_sim_config(self) -> SimConfig:
+        return SimConfig(sim_freq=20, control_freq=20)
+
+    def compute_dense_reward(self, obs: Any, action: Any, info: Any) -> torch.Tensor:
+        return torch.zeros(self.num_envs)
+
+
+def steps_per_second(env: gym.Env[Any, Any], steps: int, actions: np.ndarray[Any, Any]) -> float:
+    """Rate of `env.step` alone, resets left out; episodes end after at most 30 steps."""
+    spent, done = 0.0, 0
+    while done < steps:
+        env.reset()
+        for _ in range(min(30, steps - done)):
+            action = actions[done % len(actions)]
+            start = time.perf_counter()
+            _, _, terminated, _, _ = env.step(action)
+            spent += time.perf_counter() - start
+            done += 1
+            if bool(terminated):
+                break
+    return done / spent
+
+
+def per_second(function: Callable[[], object], calls: int) -> float:
+    """Rate of a call."""
+    function()
+    start = time.perf_counter()
+    for _ in range(calls):
+        function()
+    return calls / (time.perf_counter() - start)
+
+
+def resident_mib() -> float:
+    """Memory of this process that is in RAM, in [MiB]."""
+    pages = int(Path("/proc/self/statm").read_text().split()[1])
+    return pages * os.sysconf("SC_PAGE_SIZE") / MIB
+
+
+def growth(work: Callable[[], object], times: int) -> dict[str, float]:
+    """Memory before and after `times` calls, once a tenth of them has filled caches and allocators, in [MiB]."""
+    for _ in range(max(1, times // 10)):
+        work()
+    before = resident_mib()
+    for _ in range(times):
+        work()
+    after = resident_mib()
+    return {"calls": times, "before_mib": round(before, 1), "after_mib": round(after, 1), "growth_mib": round(after - before, 1)}
+
+
+def small_actions(size: int) -> np.ndarray[Any, Any]:
+    """Increments of up to 5 cm and 0.05 rad, which keep the arm in its workspace."""
+    return np.random.default_rng(0).uniform(-0.05, 0.05, (512, size)).astype(np.float32)
+
+
+def inverse_kinematics_rate(batch: int) -> float:
+    """Poses solved per second, in batches of this size, for poses made from random joints."""
+    rng = np.random.default_rng(0)
+    qpos = torch.as_tensor(rng.uniform(JOINT_LOWER, JOINT_UPPER, (batch, 7)))
+    poses, reference = forward_kinematics(qpos), torch.zeros(batch, 7, dtype=torch.float64)
+    solver = InverseKinematics()
+    return batch * per_second(lambda: solver.solve(poses, reference), max(1, 20_000 // batch))
+
+
+def rays_rate(rays_per_side: int) -> float:
+    """Rays per second towards fruits of a full plant, the caller's overhead included."""
+    plant = generate_plant("full", 0)
+    caster = VisibilityCaster(plants=[plant], intrinsics=color_intrinsics(640, 480), rays_per_side=rays_per_side)
+    ripe = [j for j, fruit in enumerate(plant.fruits) if fruit.ripeness == "ripe"]
+    pose = torch.eye(4).repeat(1, 1, 1)
+    pose[0, :3, :3] = torch.tensor([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
+    pose[0, :3, 3] = torch.as_tensor(plant.fruits[ripe[0]].centre) - torch.tensor([0.5, 0.0, 0.0])
+    target, plant_pose = torch.tensor([ripe[0]]), torch.eye(4)[None]
+    return rays_per_side**2 * per_second(lambda: caster.cast(pose, target, plant_pose), 400)
+
+
+def main(args: Args) -> int:
+    """Runs every measurement and writes the file."""
+    logging.getLogger("mani_skill").setLevel(logging.ERROR)
+    torch.set_num_threads(1)
+    plain: dict[str, Any] = {"num_envs": 1, "obs_mode": "state", "render_backend": "none"}
+    empty = gym.make(EMPTY, control_mode="pd_joint_pos", robot_uids="iiwa14_d435", reward_mode="dense", **plain)
+    guided = gym.make(GUIDED, **plain)
+    new_plants = gym.make(GUIDED, plant={"seed": "train"}, **plain)
+    rendered = None
+    if rendering_available():
+        rendered = gym.make(
+            GUIDED, num_envs=1, obs_mode="rgb+segmentation", sensor_configs={"width": 128, "height": 128}
+        )
+
+    rates: dict[str, list[float]] = {}
+    for _ in range(args.repeats):
+        for name, value in {
+            "empty_environment_steps": lambda: steps_per_second(empty, 1000, np.zeros((1, 7), dtype=np.float32)),
+            "guided_state_steps": lambda: steps_per_second(guided, 1000, small_actions(6)),
+            "guided_resets": lambda: per_second(guided.reset, 100),
+            "guided_resets_with_new_plant": lambda: per_second(new_plants.reset, 5),
+            "inverse_kinematics_solves_batch_1": lambda: inverse_kinematics_rate(1),
+            "inverse_kinematics_solves_batch_1024": lambda: inverse_kinematics_rate(1024),
+            "rays_16_per_side": lambda: rays_rate(16),
+            "rays_64_per_side": lambda: rays_rate(64),
+            "guided_rendered_128_steps": lambda: steps_per_second(rendered, 20, small_actions(6)) if rendered else None,
+        }.items():
+            rate = value()
+            if rate is not None:
+                rates.setdefault(name, []).append(rate)
+    medians = {name: statistics.median(values) for name, values in rates.items()}
+
+    actions = iter(np.tile(small_actions(6), (2 + (args.memory_steps * 11 // 10) // 512, 1)))
+
+    def step_or_reset() -> None:
+        _, _, terminated, truncated, _ = guided.step(next(actions))
+        if bool(terminated) or bool(truncated):
+            guided.reset()
+
+    guided.reset()
+    result = {
+        "machine": {
+            "processor": _processor(),
+            "cores": os.cpu_count(),
+            "python": platform.python_version(),
+            "torch_threads": torch.get_num_threads(),
+            **{name: version(name) for name in ("mani-skill", "sapien", "torch", "warp-lang", "maniskill-tomato")},
+        },
+        "per_second": {name: round(value, 1) for name, value in medians.items()},
+        "spread": {name: [round(min(v), 1), round(max(v), 1)] for name, v in rates.items()},
+        "ratios": {
+            "guided_state_over_empty": round(medians["guided_state_steps"] / medians["empty_environment_steps"], 3),
+            "guided_state_over_rendered": (
+                round(medians["guided_state_steps"] / medians["guided_rendered_128_steps"], 1) if rendered else None
+            ),
+        },
+        "memory": {
+            "steps": growth(step_or_reset, args.memory_steps),
+            "resets_with_new_plants": growth(new_plants.reset, args.memory_resets),
+        },
+        "left_out": [] if rendered else ["guided_rendered_128_steps: no Vulkan device; `make vulkan` installs one"],
+    }
+    for env in (empty, guided, new_plants, rendered):
+        if env is not None:
+            env.close()
+    text = json.dumps(result, indent=2)
+    args.out.parent.mkdir(parents=True, exist_ok=True)
+    args.out.write_text(text + "\n")
+    sys.stdout.write(text + "\n")
+    return 0
+
+
+def _processor() -> str:
+    for line in Path("/proc/cpuinfo").read_text().splitlines():
+        if line.startswith("model name"):
+            return line.partition(":")[2].strip()
+    return platform.processor()
+
+
+if __name__ == "__main__":
+    sys.exit(main(tyro.cli(Args)))
