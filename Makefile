@@ -1,0 +1,82 @@
+# Every target works from a fresh clone; those that need .venv create it first. `make` lists them.
+
+SHELL := bash
+.SHELLFLAGS := -eu -o pipefail -c
+MAKEFLAGS += --no-builtin-rules --no-print-directory
+.SUFFIXES:
+.DEFAULT_GOAL := help
+
+# make venv PYTHON=/path/to/python3.12 chooses the interpreter; ARGS="..." goes on to demo, test and test-all.
+PYTHON ?=
+ARGS ?=
+export PYTHON
+
+BIN := .venv/bin
+STAMP := .venv/.installed-from
+
+# An environment that was made in another folder (a moved or copied checkout) is made anew.
+ifneq "$(shell cat $(STAMP) 2>/dev/null)" "$(CURDIR)"
+$(STAMP): FORCE
+endif
+
+$(STAMP): pyproject.toml constraints.txt overrides.txt scripts/setup_env.sh scripts/check_env.py
+	@scripts/setup_env.sh
+
+.PHONY: help
+help: ## List the targets
+	@printf 'Targets (make TARGET):\n\n'
+	@sed -nE 's/^([a-z-]+):.*## (.*)/  \1\t\2/p' Makefile | expand -t 14
+	@printf '\nPYTHON=... chooses the interpreter for venv; ARGS="..." goes on to demo, test and test-all.\n'
+
+.PHONY: venv
+venv: $(STAMP) ## Create .venv, or bring it up to date (nothing is installed outside it)
+
+.PHONY: vulkan
+vulkan: ## Install CPU Vulkan for rendering, if missing (system packages: root or sudo)
+	@scripts/install_vulkan.sh
+
+.PHONY: demo
+demo: $(STAMP) ## Train the guided task, evaluate it, write a report and a video
+	@$(BIN)/maniskill-tomato demo $(ARGS)
+
+.PHONY: test
+test: $(STAMP) ## Run the tests that need no GPU and little time
+	@$(BIN)/python -m pytest -m "not slow and not gpu" $(ARGS)
+
+.PHONY: test-all
+test-all: $(STAMP) ## Run every test that this machine can run
+	@$(BIN)/python -m pytest $(ARGS)
+
+.PHONY: lint
+lint: $(STAMP) ## Check the style (ruff)
+	@$(BIN)/ruff check .
+	@$(BIN)/ruff format --check .
+
+.PHONY: format
+format: $(STAMP) ## Repair the style (ruff)
+	@$(BIN)/ruff check --fix .
+	@$(BIN)/ruff format .
+
+.PHONY: type
+type: $(STAMP) ## Check the types (mypy, pyright)
+	@$(BIN)/mypy
+	@$(BIN)/pyright
+
+.PHONY: check
+check: lint type test ## Everything that must pass before a commit
+
+.PHONY: build
+build: $(STAMP) ## Build the wheel and try it in a clean environment
+	@scripts/build_wheel.sh
+
+.PHONY: clean
+clean: ## Remove build outputs and caches (keeps .venv and runs)
+	@rm -rf build dist maniskill_tomato.egg-info .pytest_cache .mypy_cache .ruff_cache
+	@find . -path ./.venv -prune -o -name __pycache__ -type d -prune -exec rm -rf {} +
+
+.PHONY: distclean
+distclean: clean ## Remove .venv too
+	@rm -rf .venv
+
+.PHONY: FORCE
+FORCE:

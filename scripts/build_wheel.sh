@@ -1,0 +1,30 @@
+#!/usr/bin/env bash
+# Builds the source archive and, from it, the wheel; then tries the wheel in a clean environment outside the checkout.
+set -euo pipefail
+
+cd "$(dirname "${BASH_SOURCE[0]}")/.."
+root="$(pwd -P)"
+uv="$root/.venv/bin/uv"
+
+say() { printf 'build: %s\n' "$*"; }
+
+work="$(mktemp -d)"
+trap 'rm -rf "$work"' EXIT
+
+say "building (a log appears only if that fails)"
+rm -rf build dist
+if ! "$root/.venv/bin/python" -m build --installer uv --outdir dist . >"$work/log" 2>&1; then
+    tail -n 40 "$work/log" >&2
+    exit 1
+fi
+rm -rf build
+wheel="$(ls dist/*.whl)"
+
+say "installing $wheel into a clean environment"
+"$uv" venv -q --python "$root/.venv/bin/python" "$work/venv"
+"$uv" pip install -q --python "$work/venv/bin/python" --override overrides.txt -c constraints.txt "$root/$wheel"
+
+say "trying it"
+# From another folder and isolated (-I), so that nothing of the checkout can be imported.
+(cd "$work" && "$work/venv/bin/python" -I "$root/scripts/wheel_smoke.py")
+say "done: $wheel ($(du -h "$wheel" | cut -f1))"

@@ -1,0 +1,56 @@
+"""Which tests this machine can run: `render` needs a Vulkan device, `gpu` needs CUDA.
+
+Where pictures must work (CI=true or TOMATO_REQUIRE_RENDER=1), a `render` test that cannot run fails;
+elsewhere it is skipped.
+"""
+
+import functools
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parent.parent
+PROBE_SECONDS = 300
+"""The first picture on a machine compiles shaders, about 11 s when it is idle."""
+
+# ManiSkill asks on the terminal before it downloads an asset; a test must not wait for an answer.
+os.environ.setdefault("MS_SKIP_ASSET_DOWNLOAD_PROMPT", "1")
+
+
+@functools.cache
+def rendering_problem() -> str | None:
+    """Why SAPIEN cannot render here, or None if it can; asked once, in another process: drivers crash."""
+    command = [sys.executable, "-W", "ignore", str(ROOT / "scripts" / "check_vulkan.py"), "--render"]
+    try:
+        result = subprocess.run(command, capture_output=True, text=True, timeout=PROBE_SECONDS)
+    except subprocess.TimeoutExpired:
+        return f"a first picture took more than {PROBE_SECONDS} s"
+    if result.returncode == 0:
+        return None
+    output = (result.stdout + result.stderr).strip().splitlines()
+    return output[-1] if output else f"the probe ended with status {result.returncode}"
+
+
+def rendering_required() -> bool:
+    """Whether a test that cannot render is a failure."""
+    return os.environ.get("CI") == "true" or os.environ.get("TOMATO_REQUIRE_RENDER") == "1"
+
+
+@functools.cache
+def cuda_problem() -> str | None:
+    """Why CUDA cannot be used here, or None if it can."""
+    import torch
+
+    return None if torch.cuda.is_available() else "no CUDA device"
+
+
+def pytest_runtest_setup(item: pytest.Item) -> None:
+    if item.get_closest_marker("gpu") is not None and (problem := cuda_problem()) is not None:
+        pytest.skip(problem)
+    if item.get_closest_marker("render") is not None and (problem := rendering_problem()) is not None:
+        if rendering_required():
+            pytest.fail(f"rendering is required here, but {problem}", pytrace=False)
+        pytest.skip(f"{problem} (needs Vulkan)")

@@ -1,0 +1,93 @@
+"""Gym registration: the promised IDs, lazily, as serialisable specs."""
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import gymnasium as gym
+import pytest
+from gymnasium.envs.registration import EnvSpec, load_env_creator
+
+import maniskill_tomato
+from maniskill_tomato.tasks import MAX_EPISODE_STEPS, TASK_IDS
+
+EXPECTED_IDS = ("TomatoViewpointGuided-v1", "TomatoViewpointSparse-v1")
+
+
+def run_python(code: str, cwd: Path) -> "subprocess.CompletedProcess[str]":
+    return subprocess.run(
+        [sys.executable, "-I", "-c", code], capture_output=True, text=True, cwd=cwd, timeout=300
+    )
+
+
+def test_importing_the_package_is_enough_to_register_the_tasks(tmp_path: Path) -> None:
+    code = (
+        "import gymnasium, json\n"
+        "before = [i for i in gymnasium.registry if 'Tomato' in i]\n"
+        "import maniskill_tomato\n"
+        "print(json.dumps([before, sorted(i for i in gymnasium.registry if 'Tomato' in i)]))\n"
+    )
+    result = run_python(code, tmp_path)
+    assert result.returncode == 0, result.stderr
+    assert json.loads(result.stdout) == [[], sorted(EXPECTED_IDS)]
+
+
+def test_the_list_of_ids_is_what_others_build_on() -> None:
+    assert set(TASK_IDS) == set(EXPECTED_IDS)
+    assert maniskill_tomato.tasks.TASK_IDS is TASK_IDS
+
+
+@pytest.mark.parametrize("env_id", EXPECTED_IDS)
+def test_a_spec_survives_json(env_id: str) -> None:
+    spec = gym.spec(env_id)
+    copy = EnvSpec.from_json(spec.to_json())
+    assert copy == spec
+    assert copy.max_episode_steps == MAX_EPISODE_STEPS == 30  # The thesis's horizon, Tables 5-1 and 5-2.
+
+
+@pytest.mark.parametrize("env_id", EXPECTED_IDS)
+def test_a_spec_names_its_environment_by_a_string_inside_the_package(env_id: str) -> None:
+    entry_point = gym.spec(env_id).entry_point
+    assert isinstance(entry_point, str)
+    assert entry_point.startswith("maniskill_tomato.tasks.")
+
+
+@pytest.mark.parametrize("env_id", EXPECTED_IDS)
+def test_the_entry_point_resolves_to_a_class_that_maniskill_knows_under_the_same_id(env_id: str) -> None:
+    entry_point = gym.spec(env_id).entry_point
+    assert isinstance(entry_point, str)
+    environment = load_env_creator(entry_point)
+    from mani_skill.utils.registration import REGISTERED_ENVS
+
+    assert REGISTERED_ENVS[env_id].cls is environment
+
+
+def test_reloading_the_registration_module_neither_warns_nor_duplicates(tmp_path: Path) -> None:
+    code = (
+        "import warnings; warnings.simplefilter('error')\n"
+        "import importlib, gymnasium, maniskill_tomato.tasks as tasks\n"
+        "n = len(gymnasium.registry); importlib.reload(tasks); assert len(gymnasium.registry) == n\n"
+    )
+    result = run_python(code, tmp_path)
+    assert result.returncode == 0, result.stderr
+    assert result.stderr == ""
+
+
+@pytest.mark.parametrize("env_id", EXPECTED_IDS)
+def test_make_works_from_the_module_form_in_a_fresh_process(env_id: str, tmp_path: Path) -> None:
+    code = (
+        "import gymnasium as gym\n"
+        f"env = gym.make('maniskill_tomato.tasks:{env_id}', obs_mode='state', render_backend='none')\n"
+        "observation, info = env.reset(seed=3)\n"
+        "assert tuple(observation.shape)[0] == 1, observation.shape\n"
+        f"assert env.spec.id == '{env_id}', env.spec\n"
+        "env.close()\n"
+    )
+    result = run_python(code, tmp_path)
+    assert result.returncode == 0, result.stderr
+
+
+def test_an_unknown_version_is_refused_with_the_one_that_exists() -> None:
+    with pytest.raises(gym.error.Error, match="TomatoViewpointGuided"):
+        gym.spec("TomatoViewpointGuided-v9")
