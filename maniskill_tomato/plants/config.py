@@ -133,9 +133,6 @@ class LeafConfig:
     """Length of a small leaflet over that of the terminal one; [looks]."""
     young_leaves: int = 5
     """Leaves below the apex that are still growing; [looks]."""
-    curtain_gap_range: tuple[float, float] = (0.022, 0.042)
-    """Gap between a hidden fruit's skin and the leaflet that hangs before it, in [m]; `one_tomato`,
-    `three_tomatoes`."""
 
     def __post_init__(self) -> None:
         _check_ranges(self)
@@ -222,6 +219,48 @@ class FruitConfig:
 
 
 @dataclass(frozen=True, kw_only=True)
+class HidingConfig:
+    """Leaves that overlap a fruit on the robot's side, as on the thesis's plants (Fig. 5-5, 5-18).
+
+    Angles are seen from the fruit: azimuth from the robot's side (-x), positive towards +y; elevation upward.
+    All values are chosen so that a start pose of the thesis sees little of the fruit and the arm can reach a
+    full view.
+    """
+
+    gap_range: tuple[float, float] = (0.010, 0.034)
+    """Gap between the fruit's skin and the leaflet that hangs before it, in [m]."""
+    offset_range: tuple[float, float] = (0.000, 0.032)
+    """Shift of that leaflet away from the clear side, in [m]."""
+    covered_views_deg: tuple[tuple[float, float], ...] = (
+        (0.0, 0.0),
+        (-22.0, 4.0),
+        (12.0, 4.0),
+        (-10.0, 20.0),
+    )
+    """Azimuth and elevation of the views that a leaf is hung to cover, in [deg]."""
+    attempts: int = 8
+    """Leaves tried for each fruit, of which the best covers these views and spares the clear one."""
+    clear_right_share: float = 0.75
+    """Share of fruits whose clear side is -y, where the thesis's guided exploration (Eq. 5-6) leads."""
+    clear_azimuth_range_deg: tuple[float, float] = (36.0, 62.0)
+    """Angle of the clear direction to the robot's side, in [deg]."""
+    clear_elevation_range_deg: tuple[float, float] = (-36.0, -10.0)
+    """Elevation of the clear direction, in [deg]; negative is from below, where leaves hang open."""
+    clear_half_angle_deg: float = 8.0
+    """Half angle by which the corridor free of other leaves widens away from the fruit, in [deg]."""
+    clear_share: float = 0.95
+    """Share of the fruit that the covering leaf shall leave open in the clear direction."""
+    curtain_clear_share: float = 0.80
+    """Radius over the fruit's radius of the corridor that the covering leaf's side leaflets keep free."""
+
+    def __post_init__(self) -> None:
+        _check_ranges(self)
+        _check_positive(self, "attempts", "clear_half_angle_deg")
+        if not self.covered_views_deg:
+            raise InvalidInputError("HidingConfig.covered_views_deg must name at least one view")
+
+
+@dataclass(frozen=True, kw_only=True)
 class PlantConfig:
     """A whole plant."""
 
@@ -239,19 +278,9 @@ class PlantConfig:
     free."""
     fruit_height_spread: float = 0.0
     """Half width of the uniform spread about `fruit_heights`, in [m]."""
-    hide_fruits: bool = False
-    """Hang a leaf before each fruit, on the robot's side, and keep one way of looking at it clear."""
-    clear_azimuth_range_deg: tuple[float, float] = (44.0, 72.0)
-    """Angle of the clear direction to the robot's (-x), in the horizontal plane, in [deg]; used by
-    `hide_fruits`."""
-    clear_elevation_range_deg: tuple[float, float] = (-28.0, 8.0)
-    """Elevation of the clear direction seen from the fruit (negative: from below), in [deg]; used by
-    `hide_fruits`."""
-    clear_right_share: float = 0.65
-    """Share of fruits whose clear side is -y, where the thesis's guided exploration leads; used by
-    `hide_fruits`."""
-    clear_half_angle_deg: float = 11.0
-    """Half angle by which the clear corridor widens away from the fruit, in [deg]; used by `hide_fruits`."""
+    hiding: HidingConfig | None = None
+    """How leaves hang before the fruits, for the thesis's plants with a single fruit a truss; None leaves
+    them free."""
     leaves_kept_below_truss: int = 0
     """Leaves left below the lowest truss; growers take them off as it ripens; [practice]."""
     leaf_density: float = 1.0
@@ -284,8 +313,8 @@ class PlantConfig:
                 raise InvalidInputError(
                     f"fruit_heights must ascend from 0.3 m or more, got {self.fruit_heights}"
                 )
-        if self.hide_fruits and not self.fruit_heights:
-            raise InvalidInputError("hide_fruits needs fruit_heights; give a height per truss")
+        if self.hiding is not None and not self.fruit_heights:
+            raise InvalidInputError("hiding needs fruit_heights; give a height per truss")
 
 
 def make_one_tomato_config() -> PlantConfig:
@@ -297,7 +326,7 @@ def make_one_tomato_config() -> PlantConfig:
         fruits_per_truss=(1,),
         fruit_heights=(0.775,),
         fruit_height_spread=0.06,
-        hide_fruits=True,
+        hiding=HidingConfig(),
     )
 
 
@@ -311,7 +340,7 @@ def make_three_tomatoes_config() -> PlantConfig:
         fruits_per_truss=(1, 1, 1),
         fruit_heights=(0.62, 0.80, 0.98),
         fruit_height_spread=0.02,
-        hide_fruits=True,
+        hiding=HidingConfig(),
     )
 
 

@@ -15,6 +15,7 @@ class Stream(IntEnum):
     FRUIT = 3
     VIEW = 4
     SIDE_LEAF = 5
+    CURTAIN = 6
 
 
 def stream(seed: int, kind: Stream, index: int = 0) -> Generator:

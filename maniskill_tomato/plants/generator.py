@@ -8,9 +8,10 @@ import numpy as np
 
 from maniskill_tomato.errors import InvalidInputError
 from maniskill_tomato.plants.config import PlantConfig, make_config
-from maniskill_tomato.plants.draws import Stream, normal, stream, uniform
+from maniskill_tomato.plants.draws import Stream, normal, stream
 from maniskill_tomato.plants.fruit import berry_patch, draw_berry
-from maniskill_tomato.plants.leaf import Leaf, draw_leaf, draw_rachis, leaf_parts, leaflet_points
+from maniskill_tomato.plants.hiding import choose_clear_directions, clear_view, hang_curtain
+from maniskill_tomato.plants.leaf import Leaf, draw_leaf, draw_rachis, leaf_parts
 from maniskill_tomato.plants.meshing import Float64, join
 from maniskill_tomato.plants.organs import Fruit, Organ, Plant, Ripeness, SemanticClass
 from maniskill_tomato.plants.stem import Shoot, grow_shoot, stem_patch
@@ -38,7 +39,7 @@ def _grow_trusses(config: PlantConfig, shoot: Shoot, seed: int) -> list[Truss]:
         if node >= len(shoot.heights) or count == 0:
             continue
         rng = stream(seed, Stream.TRUSS, k)
-        if config.hide_fruits:
+        if config.hiding:
             azimuth = float(shoot.azimuths[node + 1]) + radians(normal(rng, 0.0, 10.0))
             # Trusses lean to the aisle, so the outer ones turn back part of the way.
             aside = (azimuth - pi + pi) % (2 * pi) - pi
@@ -54,45 +55,21 @@ def _grow_trusses(config: PlantConfig, shoot: Shoot, seed: int) -> list[Truss]:
     return trusses
 
 
-def _clear_directions(config: PlantConfig, fruits: list[Hanging], seed: int) -> list[Float64]:
-    """For each fruit, the unit vector from it towards the viewpoint that is kept free."""
-    directions = []
-    for i, _ in enumerate(fruits):
-        rng = stream(seed, Stream.VIEW, i)
-        side = -1.0 if rng.random() < config.clear_right_share else 1.0
-        azimuth = radians(uniform(rng, config.clear_azimuth_range_deg))
-        elevation = radians(uniform(rng, config.clear_elevation_range_deg))
-        directions.append(
-            np.array([-cos(elevation) * cos(azimuth), side * cos(elevation) * sin(azimuth), sin(elevation)])
-        )
-    return directions
-
-
-def _in_corridor(points: Float64, fruit: Hanging, direction: Float64, half_angle: float) -> bool:
-    """Whether any point stands in the widening corridor from a fruit along a direction."""
-    away = points - fruit.centre
-    ahead = away @ direction
-    across = np.sqrt(np.maximum((away * away).sum(1) - ahead * ahead, 0.0))
-    return bool(((ahead > 0) & (across < 1.04 * fruit.berry.radius + ahead * np.tan(half_angle))).any())
-
-
 def _grow_leaves(config: PlantConfig, shoot: Shoot, seed: int, fruits: list[Hanging]) -> list[Leaf]:
-    clear = _clear_directions(config, fruits, seed) if config.hide_fruits else []
-    half_angle = radians(config.clear_half_angle_deg)
-    lowest = shoot.truss_nodes[0] + 1 - config.leaves_kept_below_truss
+    hiding = config.hiding
+    hidden = choose_clear_directions(hiding, fruits, seed) if hiding else []
+    lowest = max(shoot.truss_nodes[0] + 1 - config.leaves_kept_below_truss, 0)
     last = len(shoot.heights) - 1
-    curtains = {shoot.truss_nodes[i] + 1: i for i in range(len(fruits))} if config.hide_fruits else {}
-    seconds = {shoot.truss_nodes[i] + 4: i for i in range(len(fruits))} if config.hide_fruits else {}
+    curtains = {shoot.truss_nodes[i] + 1: target for i, target in enumerate(hidden)}
     density = config.leaf_density
     leaves = []
     for kind in (Stream.LEAF, Stream.SIDE_LEAF):
+        side_shoot = kind is Stream.SIDE_LEAF
+        share = density - 1.0 if side_shoot else sqrt(density)
         for node in range(lowest, last + 1):
             rng = stream(seed, kind, node)
-            # Drawn first, so that foliage of a lower density is part of that of a higher one.
-            leaf_rank = rng.random()
-            side_shoot = kind is Stream.SIDE_LEAF
-            share = density - 1.0 if side_shoot else sqrt(density)
-            if leaf_rank >= share:
+            # Drawn first, so that the foliage of a lower density is part of that of a higher one.
+            if rng.random() >= share:
                 continue
             vigour = min(1.0, 0.34 + 0.66 * (last - node) / max(config.leaf.young_leaves, 1))
             azimuth = float(shoot.azimuths[node])
@@ -100,33 +77,22 @@ def _grow_leaves(config: PlantConfig, shoot: Shoot, seed: int, fruits: list[Hang
                 azimuth += radians(40.0) * (1.0 if rng.random() < 0.5 else -1.0)
                 vigour *= 0.75
             base = _on_stem(shoot, float(shoot.heights[node]), azimuth)
-            rachis = draw_rachis(config.leaf, rng, base, azimuth, vigour)
-            target = None
-            if not side_shoot and node in curtains:
-                target = _before(config, fruits[curtains[node]], rng.random(), 0.0)
-            elif not side_shoot and node in seconds and node not in curtains:
-                target = _before(config, fruits[seconds[node]], rng.random(), 0.05)
-            leaf = draw_leaf(config.leaf, rng, rachis, 1.0 if target is not None else vigour, target=target)
-            ranks = rng.random(len(leaf.leaflets))
-            keep = [bool(side_shoot or rank < sqrt(density)) for rank in ranks]
-            for fruit, direction in zip(fruits if clear else [], clear, strict=True):
-                keep = [
-                    k and not _in_corridor(leaflet_points(leaflet), fruit, direction, half_angle)
-                    for k, leaflet in zip(keep, leaf.leaflets, strict=True)
-                ]
-                if _in_corridor(leaf.rachis.points(24), fruit, direction, 0.0):
-                    keep = [False] * len(keep)
+            if hiding and node in curtains and not side_shoot:
+                leaf = hang_curtain(hiding, config.leaf, seed, node, base, curtains[node])
+                others = [target for target in hidden if target is not curtains[node]]
+            else:
+                rachis = draw_rachis(config.leaf, rng, base, azimuth, vigour)
+                leaf = draw_leaf(config.leaf, rng, rachis, vigour)
+                others = hidden
+            keep = [
+                side_shoot or rank < sqrt(density) for rank in rng.random(16).tolist()[: len(leaf.leaflets)]
+            ]
+            if hiding:
+                keep = [a and b for a, b in zip(keep, clear_view(hiding, leaf, others), strict=True)]
             leaf = leaf.keeping(keep)
             if leaf.leaflets:
                 leaves.append(leaf)
     return leaves
-
-
-def _before(config: PlantConfig, fruit: Hanging, rank: float, extra: float) -> Float64:
-    """A point before a fruit on the robot's side, where a leaflet hides it. Shape (3,)."""
-    low, high = config.leaf.curtain_gap_range
-    gap = fruit.berry.radius + low + (high - low) * rank + extra
-    return np.asarray(fruit.centre + np.array([-gap, 0.0, 0.004]))
 
 
 def generate_plant(

@@ -100,28 +100,19 @@ def aim_rachis(rachis: Rachis, target: Float64, leaflet_length: float, droop: fl
     away = target - rachis.base
     azimuth = atan2(float(away[1]), float(away[0]))
     reach, rise = sqrt(float(away[0]) ** 2 + float(away[1]) ** 2), float(away[2])
-    best, best_miss = rachis, float("inf")
-    steps = 24
-    for end_deg in range(95, 176, 4):
-        end = radians(end_deg)
-        polar = [
-            rachis.start_angle + (end - rachis.start_angle) * ((i + 0.5) / steps) ** 1.25
-            for i in range(steps)
-        ]
-        out = sum(sin(p) for p in polar) / steps
-        up = sum(cos(p) for p in polar) / steps
-        hang_out, hang_up = sin(end), cos(end) - droop
-        norm = sqrt(hang_out**2 + hang_up**2)
-        for k in range(16):
-            length = 0.10 + 0.018 * k
-            miss_out = length * out + 0.48 * leaflet_length * hang_out / norm - reach
-            miss_up = length * up + 0.48 * leaflet_length * hang_up / norm - rise
-            # A small preference for long, well bent leaves among those that hit.
-            miss = sqrt(miss_out**2 + miss_up**2) + 0.01 * abs(length - 0.26)
-            if miss < best_miss:
-                best_miss = miss
-                best = replace(rachis, azimuth=azimuth, end_angle=end, length=length, sway=0.0)
-    return best
+    end = np.radians(np.arange(95.0, 176.0, 3.0))[:, None]
+    length = (0.10 + 0.015 * np.arange(20))[None]
+    part = ((np.arange(24) + 0.5) / 24) ** 1.25
+    polar = rachis.start_angle + (end - rachis.start_angle) * part
+    out, up = np.sin(polar).mean(1, keepdims=True), np.cos(polar).mean(1, keepdims=True)
+    hang_out, hang_up = np.sin(end), np.cos(end) - droop
+    half = 0.48 * leaflet_length / np.sqrt(hang_out**2 + hang_up**2)
+    miss = np.sqrt((length * out + half * hang_out - reach) ** 2 + (length * up + half * hang_up - rise) ** 2)
+    # A small preference for long, well bent leaves among those that hit.
+    miss = np.round(miss + 0.01 * np.abs(length - 0.26), 9)
+    row, column = divmod(int(np.argmin(miss)), miss.shape[1])
+    end_angle, arc = float(end[row, 0]), float(length[0, column])
+    return replace(rachis, azimuth=azimuth, end_angle=end_angle, length=arc, sway=0.0)
 
 
 def draw_leaf(

@@ -78,7 +78,7 @@ def grow_shoot(config: PlantConfig, seed: int) -> Shoot:
         values = np.concatenate([[0.0], targets])
         above = heights > knots[-1]
         heights = np.where(above, heights - knots[-1] + values[-1], np.interp(heights, knots, values))
-    if config.hide_fruits:
+    if config.hiding:
         # The leaf above the middle fruit points to the robot's side, as a grower turns a plant on its string.
         middle = truss_nodes[len(truss_nodes) // 2] + 1
         azimuths = azimuths - azimuths[middle] + pi + radians(normal(rng, 0.0, 9.0))
