@@ -10,8 +10,8 @@ which share V / T (Eq. 4-4 of the thesis) of a target fruit a camera sees:
 
 T is the area of the target's whole silhouette in the image plane with nothing in front, also outside the
 image. V is the part of it inside the image that no leaf, stem, other fruit or robot link hides. The camera
-looks along the z axis of its optical frame, x points right and y down. One ray stands for an equal part of the
-rectangle around the silhouette, on a fixed lattice: the same scene gives the same answer.
+looks along the z axis of its optical frame, x points right and y down. One ray stands for an equal part of
+the rectangle around the silhouette, on a fixed lattice: the same scene gives the same answer.
 
 The target counts as not visible (V = 0) where its bounding sphere lies behind the camera's near plane or
 holds the camera. It has no silhouette then, and T is that of such a sphere straight ahead.
