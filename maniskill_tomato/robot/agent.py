@@ -20,10 +20,10 @@ from maniskill_tomato.errors import InvalidInputError
 from maniskill_tomato.robot import d435, iiwa14, urdf
 from maniskill_tomato.robot.description import urdf_path
 
-STIFFNESS = (4000.0, 4000.0, 2500.0, 2500.0, 1200.0, 800.0, 400.0)
+STIFFNESS = (10000.0, 10000.0, 5000.0, 5000.0, 2500.0, 1600.0, 800.0)
 """Proportional gain of each joint's drive, in [N m / rad]."""
 
-DAMPING = (400.0, 400.0, 220.0, 220.0, 60.0, 40.0, 16.0)
+DAMPING = (500.0, 500.0, 190.0, 190.0, 60.0, 40.0, 16.0)
 """Derivative gain of each joint's drive, in [N m s / rad]."""
 
 JOINT_STEP = 0.1

@@ -75,6 +75,37 @@ def cone(start: Sequence[float], end: Sequence[float], r_start: float, r_end: fl
     return solid
 
 
+def leaning_tube(
+    start: Sequence[float], end: Sequence[float], r_start: float, r_end: float, straight: float
+) -> Solid:
+    """A tube that leaves `start` along z and drifts to a round `end`, changing its radius smoothly on the way.
+
+    Args:
+        start: Centre of the first end, in [m].
+        end: Centre of the other end, at another height, in [m].
+        r_start: Radius at `start`, in [m].
+        r_end: Radius at `end`, in [m].
+        straight: Share of the height over which the tube stays as it starts.
+    """
+    a, b = _vector(start), _vector(end)
+
+    def solid(points: FloatArray) -> FloatArray:
+        share = (points[:, 2] - a[2]) / (b[2] - a[2])
+        t = np.clip((share - straight) / (1.0 - straight), 0.0, 1.0)
+        smooth = t * t * (3.0 - 2.0 * t)
+        centre = a[:2] + smooth[:, None] * (b - a)[:2]
+        beyond = np.maximum(np.sign(b[2] - a[2]) * (points[:, 2] - b[2]), 0.0)
+        radial = np.hypot(np.linalg.norm(points[:, :2] - centre, axis=1), beyond)
+        return np.asarray(radial - (r_start + smooth * (r_end - r_start)))
+
+    return solid
+
+
+def grown(solid: Solid, thickness: float) -> Solid:
+    """A solid grown on all sides, in [m]."""
+    return lambda points: solid(points) - thickness
+
+
 def box(center: Sequence[float], size: Sequence[float], rounding: float = 0.0) -> Solid:
     """An axis-aligned box with edges rounded with the radius `rounding`, in [m]."""
     c, half = _vector(center), _vector(size) / 2 - rounding
@@ -286,14 +317,16 @@ def _with_normals(
 
 
 def revolve(
-    profile: Sequence[Sequence[float]], segments: int = 36
+    profile: Sequence[Sequence[float]], segments: int = 36, stretch: float = 0.0
 ) -> tuple[FloatArray, FloatArray, IntArray]:
     """The surface swept by a profile turning about the z axis; edges of the profile above 30 degrees stay sharp.
 
     Args:
-        profile: Radius and height of each point, in [m], such that the outside is to the right when walking along it.
-            Shape (P, 2).
-        segments: Number of facets around the axis.
+        profile: Radius and height of each point, in [m], such that the outside is to the right when walking along
+            it. Shape (P, 2).
+        segments: Number of facets around the axis, even.
+        stretch: How far the two halves are moved apart, each along its own direction of x, in [m]: circles become
+            stadiums.
 
     Returns:
         Vertices (V, 3) in [m], unit normals (V, 3), faces (F, 3) counter-clockwise from outside.
@@ -302,28 +335,41 @@ def revolve(
     tangents = np.diff(points, axis=0)
     tangents /= np.linalg.norm(tangents, axis=1, keepdims=True)
     outward = np.stack([tangents[:, 1], -tangents[:, 0]], axis=1)
-    angles = 2 * np.pi * np.arange(segments) / segments
-    cos, sin = np.cos(angles), np.sin(angles)
-    vertices, normals, faces = [], [], []
+    if stretch:
+        half = np.pi * np.arange(segments // 2 + 1) / (segments // 2) - np.pi / 2
+        angles = np.concatenate([half, half + np.pi])
+        core = np.repeat([stretch, -stretch], len(half))
+    else:
+        angles = 2 * np.pi * np.arange(segments) / segments
+        core = np.zeros(segments)
+    around = np.stack([np.cos(angles), np.sin(angles), np.zeros(len(angles))], axis=1)
+    centre = np.stack([core, np.zeros(len(angles)), np.zeros(len(angles))], axis=1)
+    up = np.array([0.0, 0.0, 1.0])
+
+    j = np.arange(len(angles))
+    following = (j + 1) % len(angles)
+    vertices: list[FloatArray] = []
+    normals: list[FloatArray] = []
+    faces: list[IntArray] = []
     for i in range(len(tangents)):
-        ends = []
+        base = 2 * i * len(angles)
         for end, neighbour in ((i, i - 1), (i + 1, i + 1)):
             normal = outward[i]
             if 0 <= neighbour < len(tangents) and outward[i] @ outward[neighbour] > _CREASE_COSINE:
-                normal = outward[i] + outward[neighbour]
-                normal = normal / np.linalg.norm(normal)
-            ends.append((points[end], normal))
-        base = sum(len(v) for v in vertices)
-        for point, normal in ends:
-            vertices.append(np.stack([point[0] * cos, point[0] * sin, np.full(segments, point[1])], axis=1))
-            normals.append(np.stack([normal[0] * cos, normal[0] * sin, np.full(segments, normal[1])], axis=1))
-        j = np.arange(segments)
-        nxt = (j + 1) % segments
-        a, b, c, d = base + j, base + nxt, base + segments + nxt, base + segments + j
-        if points[i, 0] > 1e-9:
-            faces.append(np.stack([a, b, c], axis=1))
-        if points[i + 1, 0] > 1e-9:
-            faces.append(np.stack([a, c, d], axis=1))
-    all_faces = np.concatenate(faces)
-    kept, renumbered = np.unique(all_faces, return_inverse=True)
-    return np.concatenate(vertices)[kept], np.concatenate(normals)[kept], renumbered.reshape(all_faces.shape)
+                normal = (outward[i] + outward[neighbour]) / np.linalg.norm(outward[i] + outward[neighbour])
+            vertices.append(centre + points[end, 0] * around + points[end, 1] * up)
+            normals.append(normal[0] * around + normal[1] * up)
+        a, b = base + j, base + following
+        c, d = b + len(angles), a + len(angles)
+        faces += [np.stack([a, b, c], axis=1), np.stack([a, c, d], axis=1)]
+    return _compact(np.concatenate(vertices), np.concatenate(normals), np.concatenate(faces))
+
+
+def _compact(
+    vertices: FloatArray, normals: FloatArray, faces: IntArray
+) -> tuple[FloatArray, FloatArray, IntArray]:
+    """Without the triangles that have no area and the vertices that no triangle uses."""
+    p = vertices[faces]
+    area = np.linalg.norm(np.cross(p[:, 1] - p[:, 0], p[:, 2] - p[:, 0]), axis=1)
+    used, renumbered = np.unique(faces[area > 1e-12], return_inverse=True)
+    return vertices[used], normals[used], renumbered.reshape(-1, 3)
