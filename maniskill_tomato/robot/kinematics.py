@@ -23,27 +23,20 @@ LARGEST_KEPT_BATCH = 4096
 
 
 class RecordedLaunch:
-    """A kernel with the tensors that it reads and writes, ready to run again and again.
+    """A Warp kernel with its arguments, ready to run again and again at little cost."""
 
-    Attributes:
-        tensors: The kernel's arguments, in order; written before and read after a call.
-    """
-
-    def __init__(self, kernel: Any, batch: int, tensors: tuple[torch.Tensor, ...], dtypes: tuple[Any, ...]):
+    def __init__(self, kernel: Any, threads: int, device: torch.device, arguments: list[Any]):
         """Records the launch without running it.
 
         Args:
             kernel: The Warp kernel.
-            batch: Number of kernel threads.
-            tensors: Arguments of the kernel, contiguous, all on one device.
-            dtypes: Warp's element type of each tensor, a scalar, vector or matrix.
+            threads: Number of kernel threads.
+            device: Where it runs.
+            arguments: Warp arrays, structs and numbers, in the order of the kernel's parameters.
         """
-        wp.init()
-        self.tensors = tensors
-        self._device = tensors[0].device
-        arrays = [wp.from_torch(t, dtype=d) for t, d in zip(tensors, dtypes, strict=True)]
+        self._device = device
         self._command: Any = wp.launch(
-            kernel, batch, inputs=arrays, device=wp.device_from_torch(self._device), record_cmd=True
+            kernel, threads, inputs=arguments, device=wp.device_from_torch(device), record_cmd=True
         )
 
     def __call__(self) -> None:
@@ -54,13 +47,18 @@ class RecordedLaunch:
             self._command.launch()
 
 
-def _link_transforms_launch(batch: int, device: torch.device) -> RecordedLaunch:
-    qpos = torch.zeros(batch, NUM_JOINTS, dtype=torch.float64, device=device)
-    transforms = torch.zeros(batch, len(LINK_NAMES), 4, 4, dtype=torch.float64, device=device)
-    return RecordedLaunch(link_transforms_kernel, batch, (qpos, transforms), (wp.float64, wp.mat44d))
+class _LinkTransformsLaunch:
+    """The kernel's launch for one batch size, with its tensors."""
+
+    def __init__(self, batch: int, device: torch.device):
+        wp.init()
+        self.qpos = torch.zeros(batch, NUM_JOINTS, dtype=torch.float64, device=device)
+        self.transforms = torch.zeros(batch, len(LINK_NAMES), 4, 4, dtype=torch.float64, device=device)
+        arrays = [wp.from_torch(self.qpos), wp.from_torch(self.transforms, dtype=wp.mat44d)]
+        self.run = RecordedLaunch(link_transforms_kernel, batch, device, arrays)
 
 
-_kept_link_transforms_launch = lru_cache(maxsize=16)(_link_transforms_launch)
+_kept_link_transforms_launch = lru_cache(maxsize=16)(_LinkTransformsLaunch)
 
 
 def link_transforms(qpos: torch.Tensor) -> torch.Tensor:
@@ -84,11 +82,10 @@ def link_transforms(qpos: torch.Tensor) -> torch.Tensor:
     if batch == 0:
         return qpos.new_zeros(0, len(LINK_NAMES), 4, 4)
     kept = batch <= LARGEST_KEPT_BATCH
-    launch = (_kept_link_transforms_launch if kept else _link_transforms_launch)(batch, qpos.device)
-    angles, transforms = launch.tensors
-    angles.copy_(qpos.detach())
-    launch()
-    return transforms.to(qpos.dtype, copy=kept)
+    launch = (_kept_link_transforms_launch if kept else _LinkTransformsLaunch)(batch, qpos.device)
+    launch.qpos.copy_(qpos.detach())
+    launch.run()
+    return launch.transforms.to(qpos.dtype, copy=kept)
 
 
 def forward_kinematics(qpos: torch.Tensor) -> torch.Tensor:

@@ -1,0 +1,134 @@
+# mypy: ignore-errors
+# pyright: reportArgumentType=false, reportCallIssue=false, reportIndexIssue=false, reportInvalidTypeForm=false
+# pyright: reportOperatorIssue=false, reportReturnType=false, reportAttributeAccessIssue=false
+# The type checkers are silent here: Warp's stubs describe calls from outside, not the inside of a kernel.
+"""The kernel of the inverse kinematics: exact solution, else neighbour, else unreachable."""
+
+import warp as wp
+
+from maniskill_tomato.robot.ik_chain import HALF, HAND, ONE, TWO, ZERO, flange_transform, vec7d
+from maniskill_tomato.robot.ik_circle import elbow_circle
+from maniskill_tomato.robot.ik_neighbour import Allowed, hand_of, nearest_neighbour, pose_ratios
+from maniskill_tomato.robot.ik_select import NO_COST, Weights, angles_at, refined_psi, sampled_choice
+
+wp.set_module_options({"enable_backward": False, "max_unroll": 7})
+
+REACHABLE = wp.constant(wp.int64(0))
+NEIGHBOUR = wp.constant(wp.int64(1))
+UNREACHABLE = wp.constant(wp.int64(2))
+INVALID = wp.constant(wp.int64(-1))
+"""The pose is not a rigid transform, or something is not finite."""
+
+STRICT = wp.constant(wp.float64(2.0e-11))
+"""Tolerance of the first attempt: what rounding does to a pose at the edge of the workspace."""
+LARGEST_SKEW = wp.constant(wp.float64(1.0e-3))
+"""How far R^T R may be from the identity, in every element."""
+
+
+@wp.struct
+class Solution:
+    found: wp.int32
+    q: vec7d
+
+
+@wp.func
+def exact_solution(
+    position: wp.vec3d, rotation: wp.mat33d, q_ref: vec7d, weights: Weights, tolerance: wp.float64
+) -> Solution:
+    """The cheapest joint angles that reach a pose to within a few tolerances."""
+    solution = Solution()
+    x = wp.vec3d(rotation[0, 0], rotation[1, 0], rotation[2, 0])
+    y = wp.vec3d(rotation[0, 1], rotation[1, 1], rotation[2, 1])
+    z = wp.vec3d(rotation[0, 2], rotation[1, 2], rotation[2, 2])
+    circle = elbow_circle(x, y, z, position, q_ref, tolerance)
+    if circle.reachable == 1:
+        choice = sampled_choice(circle, q_ref, weights, tolerance)
+        if choice.cost < NO_COST:
+            psi = refined_psi(circle, choice, q_ref, weights, tolerance)
+            q = angles_at(circle, psi, choice.configuration, q_ref, tolerance)
+            unit = Allowed()
+            unit.distance = ONE
+            unit.angle = ONE
+            off = pose_ratios(hand_of(q), position, rotation, unit)
+            if wp.max(off[0], off[1]) < wp.float64(50.0) * tolerance:
+                solution.found = 1
+                solution.q = q
+    return solution
+
+
+@wp.func
+def nearest_rotation(m: wp.mat33d) -> wp.mat33d:
+    """The rotation nearest to a matrix that is almost one: Newton's iteration for the polar decomposition."""
+    identity = wp.identity(n=3, dtype=wp.float64)
+    for _ in range(2):
+        m = m * (wp.float64(1.5) * identity - HALF * (wp.transpose(m) * m))
+    return m
+
+
+@wp.func
+def is_rigid(m: wp.mat33d, bottom: wp.vec4d) -> wp.bool:
+    """Whether a transform has a rotation and the last row 0 0 0 1, to the precision of float32 and worse."""
+    skew = wp.transpose(m) * m - wp.identity(n=3, dtype=wp.float64)
+    largest = wp.max(wp.abs(bottom - wp.vec4d(ZERO, ZERO, ZERO, ONE)))
+    for i in range(3):
+        for j in range(3):
+            # The comparison is false for NaN.
+            if not (wp.abs(skew[i, j]) < LARGEST_SKEW):
+                largest = ONE
+    return largest < LARGEST_SKEW and wp.determinant(m) > ZERO
+
+
+@wp.kernel
+def solve_kernel(
+    poses: wp.array[wp.mat44d],
+    references: wp.array[vec7d],
+    weights: Weights,
+    tolerance: wp.float64,
+    neighbours: wp.int32,
+    allowed: Allowed,
+    qpos: wp.array[vec7d],
+    reach: wp.array[wp.int64],
+    reached: wp.array[wp.mat44d],
+):
+    i = wp.tid()
+    pose = poses[i]
+    q_ref = references[i]
+    rotation = wp.mat33d(
+        pose[0, 0], pose[0, 1], pose[0, 2],
+        pose[1, 0], pose[1, 1], pose[1, 2],
+        pose[2, 0], pose[2, 1], pose[2, 2],
+    )  # fmt: skip
+    position = wp.vec3d(pose[0, 3], pose[1, 3], pose[2, 3])
+    outcome = UNREACHABLE
+    q = q_ref
+    finite = wp.isfinite(wp.length(position)) and wp.isfinite(wp.length(q_ref))
+    if not (finite and is_rigid(rotation, pose[3])):
+        outcome = INVALID
+    else:
+        rotation = nearest_rotation(rotation)
+        solution = exact_solution(position, rotation, q_ref, weights, STRICT)
+        if solution.found == 0:
+            solution = exact_solution(position, rotation, q_ref, weights, tolerance)
+        if solution.found == 1:
+            outcome = REACHABLE
+            q = solution.q
+        elif neighbours == 1:
+            x = wp.vec3d(rotation[0, 0], rotation[1, 0], rotation[2, 0])
+            y = wp.vec3d(rotation[0, 1], rotation[1, 1], rotation[2, 1])
+            z = wp.vec3d(rotation[0, 2], rotation[1, 2], rotation[2, 2])
+            # The wrist of a neighbour pose is at most this far away.
+            wrist_shift = allowed.distance + TWO * HAND * wp.sin(HALF * allowed.angle)
+            circle = elbow_circle(x, y, z, position, q_ref, wrist_shift)
+            if circle.reachable == 1:
+                neighbour = nearest_neighbour(circle, position, rotation, q_ref, allowed)
+                if neighbour.distance < NO_COST:
+                    outcome = NEIGHBOUR
+                    q = neighbour.q
+                    hand = hand_of(q)
+                    # The pose found is reachable, maybe also nearer to the reference.
+                    solution = exact_solution(hand.position, hand.rotation, q_ref, weights, STRICT)
+                    if solution.found == 1:
+                        q = solution.q
+    qpos[i] = q
+    reach[i] = outcome
+    reached[i] = flange_transform(q)
