@@ -72,11 +72,6 @@ def check_sapien() -> str:
     try:
         importlib.import_module("mani_skill.envs")
     except ImportError as error:
-        if "libX11" in str(error):
-            raise EnvironmentProblem(
-                "SAPIEN needs the system library libX11, even without a screen; `make vulkan` installs it "
-                "with the CPU renderer, or: sudo apt-get install libx11-6"
-            ) from error
         raise EnvironmentProblem(f"ManiSkill does not load ({error}); {REBUILD}") from error
     return f"mani-skill {version('mani-skill')} with sapien {version('sapien')}"
 

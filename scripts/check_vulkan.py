@@ -164,6 +164,11 @@ def main() -> int:
     arguments = parser.parse_args()
 
     try:
+        ctypes.CDLL("libX11.so.6")
+    except OSError:
+        print("no: the system library libX11 is missing, which SAPIEN needs even without a screen; run `make vulkan`")
+        return 1
+    try:
         devices = list_devices()
     except OSError as error:
         print(f"no: {error}; `make vulkan` installs a CPU driver")

@@ -67,6 +67,11 @@ if [[ ! -x $python ]]; then
             "On Debian and Ubuntu:  sudo apt-get install python3-venv"
     fi
 fi
+# Asked first, because the answer would otherwise come after gigabytes.
+if [[ $(uname -s) == Linux ]] && ! "$python" -c 'import ctypes; ctypes.CDLL("libX11.so.6")' 2>/dev/null; then
+    fail "SAPIEN needs the system library libX11, even without a screen" \
+        "Run  make vulkan  (it also installs a CPU renderer), or:  sudo apt-get install libx11-6"
+fi
 if [[ ! -x $venv/bin/uv ]]; then
     say "installing uv into $venv"
     "$python" -m pip --version >/dev/null 2>&1 || "$python" -m ensurepip >/dev/null 2>&1 || fail "$venv has no pip" \
