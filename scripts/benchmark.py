@@ -30,8 +30,8 @@ from maniskill_tomato.plants.generator import generate_plant
 from maniskill_tomato.rendering import rendering_available
 from maniskill_tomato.robot import agent as agent
 from maniskill_tomato.robot.d435 import color_intrinsics
-from maniskill_tomato.robot.inverse_kinematics import InverseKinematics
 from maniskill_tomato.robot.iiwa14 import JOINT_LOWER, JOINT_UPPER
+from maniskill_tomato.robot.inverse_kinematics import InverseKinematics
 from maniskill_tomato.robot.kinematics import forward_kinematics
 from maniskill_tomato.visibility.caster import VisibilityCaster
 
@@ -107,7 +107,12 @@ def growth(work: Callable[[], object], times: int) -> dict[str, float]:
     for _ in range(times):
         work()
     after = resident_mib()
-    return {"calls": times, "before_mib": round(before, 1), "after_mib": round(after, 1), "growth_mib": round(after - before, 1)}
+    return {
+        "calls": times,
+        "before_mib": round(before, 1),
+        "after_mib": round(after, 1),
+        "growth_mib": round(after - before, 1),
+    }
 
 
 def small_actions(size: int) -> np.ndarray[Any, Any]:
@@ -127,7 +132,9 @@ def inverse_kinematics_rate(batch: int) -> float:
 def rays_rate(rays_per_side: int) -> float:
     """Rays per second towards fruits of a full plant, the caller's overhead included."""
     plant = generate_plant("full", 0)
-    caster = VisibilityCaster(plants=[plant], intrinsics=color_intrinsics(640, 480), rays_per_side=rays_per_side)
+    caster = VisibilityCaster(
+        plants=[plant], intrinsics=color_intrinsics(640, 480), rays_per_side=rays_per_side
+    )
     ripe = [j for j, fruit in enumerate(plant.fruits) if fruit.ripeness == "ripe"]
     pose = torch.eye(4).repeat(1, 1, 1)
     pose[0, :3, :3] = torch.tensor([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
@@ -141,7 +148,9 @@ def main(args: Args) -> int:
     logging.getLogger("mani_skill").setLevel(logging.ERROR)
     torch.set_num_threads(1)
     plain: dict[str, Any] = {"num_envs": 1, "obs_mode": "state", "render_backend": "none"}
-    empty = gym.make(EMPTY, control_mode="pd_joint_pos", robot_uids="iiwa14_d435", reward_mode="dense", **plain)
+    empty = gym.make(
+        EMPTY, control_mode="pd_joint_pos", robot_uids="iiwa14_d435", reward_mode="dense", **plain
+    )
     guided = gym.make(GUIDED, **plain)
     new_plants = gym.make(GUIDED, plant={"seed": "train"}, **plain)
     rendered = None
@@ -153,7 +162,9 @@ def main(args: Args) -> int:
     rates: dict[str, list[float]] = {}
     for _ in range(args.repeats):
         for name, value in {
-            "empty_environment_steps": lambda: steps_per_second(empty, 1000, np.zeros((1, 7), dtype=np.float32)),
+            "empty_environment_steps": lambda: steps_per_second(
+                empty, 1000, np.zeros((1, 7), dtype=np.float32)
+            ),
             "guided_state_steps": lambda: steps_per_second(guided, 1000, small_actions(6)),
             "guided_resets": lambda: per_second(guided.reset, 100),
             "guided_resets_with_new_plant": lambda: per_second(new_plants.reset, 5),
@@ -161,7 +172,9 @@ def main(args: Args) -> int:
             "inverse_kinematics_solves_batch_1024": lambda: inverse_kinematics_rate(1024),
             "rays_16_per_side": lambda: rays_rate(16),
             "rays_64_per_side": lambda: rays_rate(64),
-            "guided_rendered_128_steps": lambda: steps_per_second(rendered, 20, small_actions(6)) if rendered else None,
+            "guided_rendered_128_steps": lambda: (
+                steps_per_second(rendered, 20, small_actions(6)) if rendered else None
+            ),
         }.items():
             rate = value()
             if rate is not None:
@@ -182,21 +195,30 @@ def main(args: Args) -> int:
             "cores": os.cpu_count(),
             "python": platform.python_version(),
             "torch_threads": torch.get_num_threads(),
-            **{name: version(name) for name in ("mani-skill", "sapien", "torch", "warp-lang", "maniskill-tomato")},
+            **{
+                name: version(name)
+                for name in ("mani-skill", "sapien", "torch", "warp-lang", "maniskill-tomato")
+            },
         },
         "per_second": {name: round(value, 1) for name, value in medians.items()},
         "spread": {name: [round(min(v), 1), round(max(v), 1)] for name, v in rates.items()},
         "ratios": {
-            "guided_state_over_empty": round(medians["guided_state_steps"] / medians["empty_environment_steps"], 3),
+            "guided_state_over_empty": round(
+                medians["guided_state_steps"] / medians["empty_environment_steps"], 3
+            ),
             "guided_state_over_rendered": (
-                round(medians["guided_state_steps"] / medians["guided_rendered_128_steps"], 1) if rendered else None
+                round(medians["guided_state_steps"] / medians["guided_rendered_128_steps"], 1)
+                if rendered
+                else None
             ),
         },
         "memory": {
             "steps": growth(step_or_reset, args.memory_steps),
             "resets_with_new_plants": growth(new_plants.reset, args.memory_resets),
         },
-        "left_out": [] if rendered else ["guided_rendered_128_steps: no Vulkan device; `make vulkan` installs one"],
+        "left_out": []
+        if rendered
+        else ["guided_rendered_128_steps: no Vulkan device; `make vulkan` installs one"],
     }
     for env in (empty, guided, new_plants, rendered):
         if env is not None:

@@ -36,5 +36,9 @@ def _register(env_id: str, entry_point: str, max_episode_steps: int) -> None:
     )
 
 
-_register("TomatoViewpointGuided-v1", "maniskill_tomato.tasks.viewpoint:TomatoViewpointGuidedEnv", MAX_EPISODE_STEPS)
-_register("TomatoViewpointSparse-v1", "maniskill_tomato.tasks.viewpoint:TomatoViewpointSparseEnv", MAX_EPISODE_STEPS)
+_register(
+    "TomatoViewpointGuided-v1", "maniskill_tomato.tasks.viewpoint:TomatoViewpointGuidedEnv", MAX_EPISODE_STEPS
+)
+_register(
+    "TomatoViewpointSparse-v1", "maniskill_tomato.tasks.viewpoint:TomatoViewpointSparseEnv", MAX_EPISODE_STEPS
+)

@@ -60,7 +60,6 @@ def _listed(values: Iterable[str]) -> str:
     return ", ".join(repr(v) for v in values)
 
 
-
 def check_rays_per_side(rays_per_side: int) -> None:
     """Accepts 4 to 256."""
     if isinstance(rays_per_side, bool) or not isinstance(rays_per_side, int) or not 4 <= rays_per_side <= 256:

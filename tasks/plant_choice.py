@@ -45,8 +45,12 @@ class PlantChoice:
                 )
         elif isinstance(self.seed, bool) or not 0 <= self.seed <= MAX_SEED:
             raise InvalidInputError(f"plant seed must be an integer from 0 to {MAX_SEED}; got {self.seed!r}")
-        if self.leaf_density is not None and not (math.isfinite(self.leaf_density) and self.leaf_density >= 0.0):
-            raise InvalidInputError(f"leaf_density must be a finite number of 0 or more; got {self.leaf_density!r}")
+        if self.leaf_density is not None and not (
+            math.isfinite(self.leaf_density) and self.leaf_density >= 0.0
+        ):
+            raise InvalidInputError(
+                f"leaf_density must be a finite number of 0 or more; got {self.leaf_density!r}"
+            )
         if self.detail not in ("training", "picture"):
             raise InvalidInputError.choice("plant detail", self.detail, ("training", "picture"))
 
@@ -63,7 +67,9 @@ class PlantChoice:
         return int(rng.randint(low, high))
 
     @classmethod
-    def parse(cls, value: "PlantChoice | Mapping[str, object] | str | None", default: "PlantChoice") -> "PlantChoice":
+    def parse(
+        cls, value: "PlantChoice | Mapping[str, object] | str | None", default: "PlantChoice"
+    ) -> "PlantChoice":
         """A choice from what a user may write.
 
         Args:
@@ -84,7 +90,9 @@ class PlantChoice:
             names = [f.name for f in fields(cls)]
             unknown = sorted(set(value) - set(names))
             if unknown:
-                raise InvalidInputError(f"plant has no field {', '.join(map(repr, unknown))}; the fields are {', '.join(names)}")
+                raise InvalidInputError(
+                    f"plant has no field {', '.join(map(repr, unknown))}; the fields are {', '.join(names)}"
+                )
             return cls(**{**asdict(default), **value})
         raise InvalidInputError(
             f"plant must be None, a preset's name ({', '.join(PRESETS)}) or a mapping of "
@@ -127,7 +135,9 @@ class PlantPose:
         except (TypeError, ValueError):
             numbers = []
         if len(numbers) != 3:
-            raise InvalidInputError(f"plant_pose must be three numbers (x [m], y [m], yaw [rad]); got {value!r}")
+            raise InvalidInputError(
+                f"plant_pose must be three numbers (x [m], y [m], yaw [rad]); got {value!r}"
+            )
         return cls(x=numbers[0], y=numbers[1], yaw=numbers[2])
 
     def as_array(self) -> NDArray[np.float64]:

@@ -26,7 +26,9 @@ def grow(choice: PlantChoice, seed: int) -> Plant:
 class Planting:
     """One plant for every environment of a scene."""
 
-    def __init__(self, scene: ManiSkillScene, choice: PlantChoice, seeds: Sequence[int], device: torch.device) -> None:
+    def __init__(
+        self, scene: ManiSkillScene, choice: PlantChoice, seeds: Sequence[int], device: torch.device
+    ) -> None:
         """Grows the plants and adds their organs to the scene as kinematic actors.
 
         Args:
@@ -55,7 +57,9 @@ class Planting:
             self._actors.append((list(range(num_envs)), actors))
         else:
             for i, plant in enumerate(self.plants):
-                actors = build_plant_actors(scene, plant, scene_idxs=[i], pose=pose, name_prefix=f"plant_{i}/")
+                actors = build_plant_actors(
+                    scene, plant, scene_idxs=[i], pose=pose, name_prefix=f"plant_{i}/"
+                )
                 self._actors.append(([i], actors))
         # The pose of the plant is task state; thirteen numbers for each of its organs would only repeat it.
         for _, actors in self._actors:
@@ -79,7 +83,9 @@ class Planting:
                 for j, fruit in enumerate(plant.fruits):
                     self._fruit_centre_p[i, j] = torch.as_tensor(fruit.centre)
                     self.fruit_segmentation_id[i, j] = ids[fruit.organ_index]
-                self.ripe_fruits.append([j for j, fruit in enumerate(plant.fruits) if fruit.ripeness == "ripe"])
+                self.ripe_fruits.append(
+                    [j for j, fruit in enumerate(plant.fruits) if fruit.ripeness == "ripe"]
+                )
 
     def place(self, env_idx: Tensor, x: Tensor, y: Tensor, yaw: Tensor) -> None:
         """Puts the plants of some environments somewhere else.

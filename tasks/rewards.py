@@ -27,7 +27,9 @@ def in_forbidden_zone(ee_position_w: Tensor) -> Tensor:
     return (z < 0.15) | near_base | (x > 0.7)
 
 
-def guided_visual_reward(visible_fraction: Tensor, target_seen: Tensor, any_tomato_seen: Tensor, reach: Tensor) -> Tensor:
+def guided_visual_reward(
+    visible_fraction: Tensor, target_seen: Tensor, any_tomato_seen: Tensor, reach: Tensor
+) -> Tensor:
     """R_v of the guided task (Eq. 5-3).
 
     The cases exclude each other in this order: the asked pose is outside the workspace (-0.1), no tomato is seen (-0.5),
@@ -62,11 +64,15 @@ def guided_pose_penalty(reach: Tensor, forbidden: Tensor) -> Tensor:
     Returns:
         Shape (B,), from -1.6 to 0.
     """
-    workspace = torch.where(reach == Reach.UNREACHABLE, -0.3, torch.where(reach == Reach.NEIGHBOUR, -0.1, 0.0))
+    workspace = torch.where(
+        reach == Reach.UNREACHABLE, -0.3, torch.where(reach == Reach.NEIGHBOUR, -0.1, 0.0)
+    )
     return workspace + torch.where(forbidden, -1.5, 0.0)
 
 
-def sparse_visual_reward(visible_fraction: Tensor, target_seen: Tensor, any_tomato_seen: Tensor, reach: Tensor) -> Tensor:
+def sparse_visual_reward(
+    visible_fraction: Tensor, target_seen: Tensor, any_tomato_seen: Tensor, reach: Tensor
+) -> Tensor:
     """R_v of the sparse task (Eq. 5-9): 1 above 0.8, 0.1 between 0.6 and 0.8, -0.1 if no tomato is seen, otherwise 0.
 
     The bounds are strict as printed, so exactly 0.6 or 0.8 gives 0. `target_seen` and `reach` are not part of Eq. 5-9; they

@@ -1,5 +1,6 @@
 """The viewpoint tasks: move the wrist camera to where a tomato hidden by leaves is fully visible."""
 
+import copy
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any
@@ -8,7 +9,7 @@ import numpy as np
 import sapien
 import torch
 from mani_skill.envs.sapien_env import BaseEnv
-from mani_skill.sensors.camera import CameraConfig
+from mani_skill.sensors.camera import CameraConfig, parse_camera_configs, update_camera_configs_from_dict
 from mani_skill.utils import sapien_utils
 from mani_skill.utils.registration import register
 from mani_skill.utils.structs.types import SimConfig
@@ -17,7 +18,7 @@ from torch import Tensor
 from maniskill_tomato.errors import InvalidInputError, RenderingUnavailableError
 from maniskill_tomato.plants.organs import SemanticClass
 from maniskill_tomato.robot.agent import Iiwa14D435
-from maniskill_tomato.robot.d435 import CameraIntrinsics, T_FLANGE_COLOR_OPTICAL
+from maniskill_tomato.robot.d435 import CameraIntrinsics, T_flange_camera_color_optical
 from maniskill_tomato.robot.description import link_meshes
 from maniskill_tomato.robot.inverse_kinematics import InverseKinematics, Reach
 from maniskill_tomato.robot.kinematics import link_transforms
@@ -157,7 +158,9 @@ class TomatoViewpointEnv(BaseEnv):
                 device=str(self.device),
             )
             n, device = self.num_envs, self.device
-            self._T_ee_camera = torch.as_tensor(T_FLANGE_COLOR_OPTICAL, dtype=torch.float32, device=device)
+            self._T_ee_camera = torch.tensor(
+                T_flange_camera_color_optical, dtype=torch.float32, device=device
+            )
             self._inverse_kinematics = InverseKinematics(device=str(device))
             self._viewpoint = torch.zeros(n, 6, device=device)
             self._reach = torch.zeros(n, dtype=torch.int64, device=device)
@@ -171,8 +174,16 @@ class TomatoViewpointEnv(BaseEnv):
 
     @property
     def camera_intrinsics(self) -> CameraIntrinsics:
-        """Intrinsics of the wrist's colour camera, with the resolution asked for in `sensor_configs`."""
-        return self.agent.colour_intrinsics(self._custom_sensor_configs)
+        """Intrinsics of the wrist's colour camera, with what `sensor_configs` changes about them."""
+        configs = parse_camera_configs(self.agent._sensor_configs)
+        update_camera_configs_from_dict(configs, copy.deepcopy(self._custom_sensor_configs) or {})
+        camera = configs["d435"]
+        if camera.intrinsic is None:
+            return CameraIntrinsics.from_fov(width=camera.width, height=camera.height, fov_y=camera.fov)
+        K = np.asarray(camera.intrinsic, dtype=np.float64)
+        return CameraIntrinsics(
+            width=camera.width, height=camera.height, fx=K[0, 0], fy=K[1, 1], cx=K[0, 2], cy=K[1, 2]
+        )
 
     # ---------------------------------------------------------------- episode
 
@@ -205,7 +216,9 @@ class TomatoViewpointEnv(BaseEnv):
             draws = np.stack([rng.uniform(low, high, (START_CANDIDATES, 6)) for rng in rngs])
             candidates = torch.as_tensor(draws, dtype=torch.float32, device=self.device)
             solution = self._inverse_kinematics.solve(
-                pose_matrix(candidates.reshape(-1, 6).double()), ready.expand(b * START_CANDIDATES, 7), neighbour=False
+                pose_matrix(candidates.reshape(-1, 6).double()),
+                ready.expand(b * START_CANDIDATES, 7),
+                neighbour=False,
             )
             reachable = (solution.reach == Reach.REACHABLE).reshape(b, START_CANDIDATES)
             first = reachable.int().argmax(dim=-1)
@@ -224,7 +237,9 @@ class TomatoViewpointEnv(BaseEnv):
     def _checked_target(self, env_index: int, target: object) -> int:
         ripe = self.planting.ripe_fruits[env_index]
         if isinstance(target, bool) or not isinstance(target, int) or target not in ripe:
-            raise InvalidInputError(f"reset option target must be a ripe fruit of the plant, one of {ripe}; got {target!r}")
+            raise InvalidInputError(
+                f"reset option target must be a ripe fruit of the plant, one of {ripe}; got {target!r}"
+            )
         return target
 
     def _checked_start(self, viewpoint: Any, batch: int) -> tuple[Tensor, Tensor]:
@@ -235,9 +250,13 @@ class TomatoViewpointEnv(BaseEnv):
             )
         start = torch.as_tensor(values, dtype=torch.float32, device=self.device).expand(batch, 6)
         ready = torch.as_tensor(Iiwa14D435.keyframes["ready"].qpos, dtype=torch.float64, device=self.device)
-        solution = self._inverse_kinematics.solve(pose_matrix(start.double()), ready.expand(batch, 7), neighbour=False)
+        solution = self._inverse_kinematics.solve(
+            pose_matrix(start.double()), ready.expand(batch, 7), neighbour=False
+        )
         if bool((solution.reach != Reach.REACHABLE).any()):
-            raise InvalidInputError(f"the arm cannot reach the reset option viewpoint {viewpoint!r}; give one inside its workspace")
+            raise InvalidInputError(
+                f"the arm cannot reach the reset option viewpoint {viewpoint!r}; give one inside its workspace"
+            )
         return start, solution.qpos.float()
 
     def _set_arm(self, env_idx: Tensor, viewpoint: Tensor, qpos: Tensor) -> None:
@@ -252,7 +271,9 @@ class TomatoViewpointEnv(BaseEnv):
         if action is None:
             return None
         if isinstance(action, Mapping):
-            raise InvalidInputError("an action is an array; choose its meaning with control_mode in gymnasium.make")
+            raise InvalidInputError(
+                "an action is an array; choose its meaning with control_mode in gymnasium.make"
+            )
         batch = self._checked_action(action)
         controller = self.agent.controller
         if isinstance(controller, ViewpointController):
@@ -278,7 +299,9 @@ class TomatoViewpointEnv(BaseEnv):
         try:
             batch = torch.as_tensor(action, dtype=torch.float32, device=self.device)
         except (TypeError, ValueError, RuntimeError) as error:
-            raise InvalidInputError(f"an action must be an array of numbers; got {type(action).__name__}") from error
+            raise InvalidInputError(
+                f"an action must be an array of numbers; got {type(action).__name__}"
+            ) from error
         size = self._orig_single_action_space.shape[0]
         if batch.shape == (size,) and self.num_envs == 1:
             batch = batch[None]
@@ -390,7 +413,10 @@ class TomatoViewpointEnv(BaseEnv):
             InvalidInputError: The state belongs to another plant; nothing was changed.
         """
         indices = torch.arange(self.num_envs, device=self.device) if env_idx is None else env_idx
-        task = {k: torch.as_tensor(v, device=self.device).reshape(len(indices), -1) for k, v in state["task"].items()}
+        task = {
+            k: torch.as_tensor(v, device=self.device).reshape(len(indices), -1)
+            for k, v in state["task"].items()
+        }
         seeds = [self.planting.seeds[int(i)] for i in indices]
         if [int(s) for s in task["plant_seed"][:, 0]] != seeds:
             raise InvalidInputError(
@@ -400,7 +426,11 @@ class TomatoViewpointEnv(BaseEnv):
         super().set_state_dict({k: v for k, v in state.items() if k != "task"}, env_idx)
         x, y, yaw = task["plant_pose"].unbind(-1)
         self.planting.place(indices, x, y, yaw)
-        self._viewpoint, self._reach, self._target = self._viewpoint.clone(), self._reach.clone(), self._target.clone()
+        self._viewpoint, self._reach, self._target = (
+            self._viewpoint.clone(),
+            self._reach.clone(),
+            self._target.clone(),
+        )
         self._viewpoint[indices] = task["viewpoint"].float()
         self._reach[indices] = task["reach"][:, 0].long()
         self._target[indices] = task["target"][:, 0].long()

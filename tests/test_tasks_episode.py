@@ -18,7 +18,10 @@ from maniskill_tomato.robot.rotations import rpy_to_matrix
 GUIDED = "TomatoViewpointGuided-v1"
 SPARSE = "TomatoViewpointSparse-v1"
 BOXES = {
-    GUIDED: ([-0.1, -0.35, 0.65, 0.0, 0.45 * math.pi, 0.0], [0.2, 0.1, 1.15, 0.0, 0.7 * math.pi, 0.25 * math.pi]),
+    GUIDED: (
+        [-0.1, -0.35, 0.65, 0.0, 0.45 * math.pi, 0.0],
+        [0.2, 0.1, 1.15, 0.0, 0.7 * math.pi, 0.25 * math.pi],
+    ),
     SPARSE: (
         [-0.1, -0.25, 0.65, 0.0, 0.45 * math.pi, -math.pi / 8],
         [0.2, 0.25, 1.15, 0.0, 0.7 * math.pi, math.pi / 8],
@@ -27,7 +30,9 @@ BOXES = {
 
 
 def make(env_id: str, **kwargs: Any) -> gym.Env[Any, Any]:
-    return gym.make(env_id, num_envs=1, obs_mode="state", reward_mode="dense", render_backend="none", **kwargs)
+    return gym.make(
+        env_id, num_envs=1, obs_mode="state", reward_mode="dense", render_backend="none", **kwargs
+    )
 
 
 @pytest.fixture(scope="module", params=[GUIDED, SPARSE])
@@ -193,7 +198,9 @@ def test_success_ends_the_episode(env: gym.Env[Any, Any]) -> None:
         assert bool(info["success"]) is success and bool(terminated) is success
         outcomes.add(success)
         if success and not bool(info["in_forbidden_zone"]):
-            assert float(reward) == pytest.approx(float(info["visible_fraction"]) + 0.5 if base.spec.id == GUIDED else 1.0)
+            assert float(reward) == pytest.approx(
+                float(info["visible_fraction"]) + 0.5 if base.spec.id == GUIDED else 1.0
+            )
     assert outcomes == {True, False}
 
 
@@ -201,7 +208,11 @@ def sample_view(target: Tensor, rng: np.random.Generator) -> Tensor:
     """A random viewpoint 0.3 to 0.5 m from the target that looks at it."""
     azimuth, elevation, distance = rng.uniform(-1.3, 1.3), rng.uniform(-0.8, 0.5), rng.uniform(0.3, 0.5)
     direction = np.array(
-        [math.cos(elevation) * math.cos(azimuth), math.cos(elevation) * math.sin(azimuth), -math.sin(elevation)]
+        [
+            math.cos(elevation) * math.cos(azimuth),
+            math.cos(elevation) * math.sin(azimuth),
+            -math.sin(elevation),
+        ]
     )
     position = target.numpy() - distance * direction
     return torch.tensor([*position, 0.0, math.pi / 2 + elevation, azimuth], dtype=torch.float32)
@@ -247,7 +258,9 @@ def test_dynamic_motion_arrives_where_kinematic_motion_puts_the_arm() -> None:
     assert not torch.equal(seen["dynamic"][0], seen["kinematic"][0])
 
 
-@pytest.mark.parametrize("control_mode", ["pd_joint_pos", "pd_joint_delta_pos", "pd_ee_delta_pose", "pd_ee_pose"])
+@pytest.mark.parametrize(
+    "control_mode", ["pd_joint_pos", "pd_joint_delta_pos", "pd_ee_delta_pose", "pd_ee_pose"]
+)
 @pytest.mark.parametrize("motion", ["kinematic", "dynamic"])
 def test_usual_control_modes_work_on_the_task(control_mode: str, motion: str) -> None:
     env = make(GUIDED, control_mode=control_mode, motion=motion)

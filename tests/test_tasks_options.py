@@ -101,7 +101,9 @@ def test_plant_pose_moves_the_target_with_the_plant() -> None:
         obs, _ = env.reset(seed=0)
         positions.append(obs[0, 6:].double())
         env.close()
-    torch.testing.assert_close(positions[1] - positions[0], torch.tensor([-0.05, -0.3, 0.0]).double(), atol=1e-6, rtol=0)
+    torch.testing.assert_close(
+        positions[1] - positions[0], torch.tensor([-0.05, -0.3, 0.0]).double(), atol=1e-6, rtol=0
+    )
     stem = torch.tensor([0.85, 0.2, 0.0]).double()
     x, y, z = positions[0] - stem
     torch.testing.assert_close(positions[2] - stem, torch.stack([-y, x, z]), atol=1e-6, rtol=0)

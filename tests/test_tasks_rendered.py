@@ -94,7 +94,9 @@ def test_depth_points_of_the_target_lie_on_the_target() -> None:
         v, u = torch.nonzero(mask, as_tuple=True)
         z = data["depth"][0, ..., 0][mask].double() / 1000.0
         K = params["intrinsic_cv"][0].double()
-        rays = torch.stack([(u + 0.5 - K[0, 2]) / K[0, 0], (v + 0.5 - K[1, 2]) / K[1, 1], torch.ones_like(z)], dim=-1)
+        rays = torch.stack(
+            [(u + 0.5 - K[0, 2]) / K[0, 0], (v + 0.5 - K[1, 2]) / K[1, 1], torch.ones_like(z)], dim=-1
+        )
         points_c = rays * z[:, None]
         T_cam_world = params["extrinsic_cv"][0].double()
         points_w = (points_c - T_cam_world[:3, 3]) @ T_cam_world[:3, :3]

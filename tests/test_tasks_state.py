@@ -17,7 +17,12 @@ SPARSE = "TomatoViewpointSparse-v1"
 
 
 def make(env_id: str = GUIDED, **kwargs: Any) -> gym.Env[Any, Any]:
-    options: dict[str, Any] = {"num_envs": 1, "obs_mode": "state", "reward_mode": "dense", "render_backend": "none"}
+    options: dict[str, Any] = {
+        "num_envs": 1,
+        "obs_mode": "state",
+        "reward_mode": "dense",
+        "render_backend": "none",
+    }
     return gym.make(env_id, **(options | kwargs))
 
 
@@ -67,7 +72,11 @@ def test_restored_state_continues_exactly(env_id: str, flat: bool) -> None:
     torch.testing.assert_close(restored, saved if flat else restored, atol=0, rtol=0)
     for action, (obs, reward, terminated, _, info) in zip(actions, expected, strict=True):
         obs_2, reward_2, terminated_2, _, info_2 = env.step(action)
-        assert torch.equal(obs, obs_2) and torch.equal(reward, reward_2) and torch.equal(terminated, terminated_2)
+        assert (
+            torch.equal(obs, obs_2)
+            and torch.equal(reward, reward_2)
+            and torch.equal(terminated, terminated_2)
+        )
         assert torch.equal(info["visible_fraction"], info_2["visible_fraction"])
     env.close()
 
@@ -120,7 +129,6 @@ def test_async_vector_env_runs_one_environment_per_process() -> None:
 
 
 def _cpu_env() -> gym.Env[Any, Any]:
-    import maniskill_tomato  # noqa: F401
 
     from mani_skill.utils.wrappers.gymnasium import CPUGymWrapper
 
@@ -143,7 +151,9 @@ def test_recorded_trajectory_replays_to_the_same_states(tmp_path: Path) -> None:
     from mani_skill.trajectory.utils import index_dict
     from mani_skill.utils.wrappers.record import RecordEpisode
 
-    env = RecordEpisode(make(SPARSE), str(tmp_path), trajectory_name="run", save_video=False, save_on_reset=True)
+    env = RecordEpisode(
+        make(SPARSE), str(tmp_path), trajectory_name="run", save_video=False, save_on_reset=True
+    )
     rng = np.random.default_rng(0)
     observations = []
     for seed in (3, 4):
@@ -168,7 +178,9 @@ def test_recorded_trajectory_replays_to_the_same_states(tmp_path: Path) -> None:
                 here = base.get_state_dict()
                 for key, value in stored["task"].items():
                     torch.testing.assert_close(here["task"][key][0], torch.as_tensor(value), atol=0, rtol=0)
-                base.set_state_dict({g: {n: torch.as_tensor(v)[None] for n, v in d.items()} for g, d in stored.items()})
+                base.set_state_dict(
+                    {g: {n: torch.as_tensor(v)[None] for n, v in d.items()} for g, d in stored.items()}
+                )
                 torch.testing.assert_close(base.get_obs(), obs, atol=0, rtol=0)
     for a, b in zip(observations, seen, strict=True):
         torch.testing.assert_close(a, b, atol=0, rtol=0)
@@ -176,4 +188,6 @@ def test_recorded_trajectory_replays_to_the_same_states(tmp_path: Path) -> None:
 
 
 def _to_dict(states: Any, index: int, index_dict: Any) -> dict[str, dict[str, Any]]:
-    return {group: {name: values[index] for name, values in members.items()} for group, members in states.items()}
+    return {
+        group: {name: values[index] for name, values in members.items()} for group, members in states.items()
+    }

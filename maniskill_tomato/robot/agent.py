@@ -19,6 +19,7 @@ from mani_skill.sensors.camera import CameraConfig
 from maniskill_tomato.errors import InvalidInputError
 from maniskill_tomato.robot import d435, iiwa14, urdf
 from maniskill_tomato.robot.description import urdf_path
+from maniskill_tomato.robot.viewpoint_controller import ViewpointControllerConfig
 
 STIFFNESS = (10000.0, 10000.0, 5000.0, 5000.0, 2500.0, 1600.0, 800.0)
 """Proportional gain of each joint's drive, in [N m / rad]."""
@@ -111,10 +112,12 @@ class EEDeltaPoseController(PDEEPoseController):  # type: ignore[misc]
 class Iiwa14D435(BaseAgent):  # type: ignore[misc]
     """KUKA LBR iiwa 14 R820 with a RealSense D435 on its flange.
 
-    Sensor `d435`: the colour camera with depth aligned to it, as the SDK's align gives it. Its default of 128 x 128 px
-    suits learning; the real camera's usual mode is 640 x 480. All sizes up to 16:9 keep the vertical field of view of
+    Sensor `d435`: the colour camera with depth aligned to it, as the SDK's align gives it. Its default of 160 x 120 px
+    suits learning; the real camera's usual mode of 640 x 480 has the same field of view. All sizes up to 16:9 keep the vertical field of view of
     42.5 degrees.
     """
+
+    CONTROL_MODES = ("pd_viewpoint", "pd_joint_pos", "pd_joint_delta_pos", "pd_ee_delta_pose", "pd_ee_pose")
 
     uid = "iiwa14_d435"
     fix_root_link = True
@@ -155,7 +158,9 @@ class Iiwa14D435(BaseAgent):  # type: ignore[misc]
             **end_effector,
         )
         delta_pose.controller_cls = EEDeltaPoseController
+        viewpoint = ViewpointControllerConfig(joints, **drives)
         return {
+            "pd_viewpoint": viewpoint,
             "pd_joint_pos": PDJointPosControllerConfig(joints, None, None, normalize_action=False, **drives),
             "pd_joint_delta_pos": PDJointPosControllerConfig(
                 joints, -JOINT_STEP, JOINT_STEP, use_delta=True, **drives
@@ -179,8 +184,8 @@ class Iiwa14D435(BaseAgent):  # type: ignore[misc]
         return D435CameraConfig(
             uid=uid,
             pose=sapien.Pose(),
-            width=128,
-            height=128,
+            width=160,
+            height=120,
             near=d435.CAMERA_NEAR,
             far=d435.CAMERA_FAR,
             mount=self.robot.links_map[frame],

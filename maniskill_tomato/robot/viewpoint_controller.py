@@ -50,8 +50,10 @@ class ViewpointController(BaseController):
 
     def set_drive_property(self) -> None:
         """Gives every joint its PD gains and torque limit."""
-        for joint, limit in zip(self.joints, self.config.force_limits, strict=True):
-            joint.set_drive_properties(self.config.stiffness, self.config.damping, force_limit=limit, mode="force")
+        config = self.config
+        gains = zip(self.joints, config.stiffness, config.damping, config.force_limit, strict=True)
+        for joint, stiffness, damping, force_limit in gains:
+            joint.set_drive_properties(stiffness, damping, force_limit=force_limit, mode="force")
 
     def reset(self) -> None:
         """Takes the arm as it stands as the pose reached, with the angles nearest to those of before."""
@@ -110,7 +112,9 @@ class ViewpointController(BaseController):
         """
         self.go_to(self.viewpoint + action.clamp(-1.0, 1.0))
         if self.config.drive_joints:
-            self.articulation.set_joint_drive_targets(self.target_qpos, self.joints, self.active_joint_indices)
+            self.articulation.set_joint_drive_targets(
+                self.target_qpos, self.joints, self.active_joint_indices
+            )
 
     def get_state(self) -> dict[str, Tensor]:
         """The viewpoint, shape (num_envs, 6), and the reach of the last pose asked for, shape (num_envs, 1)."""
@@ -131,11 +135,11 @@ class ViewpointController(BaseController):
 class ViewpointControllerConfig(ControllerConfig):
     """Options of the viewpoint control mode."""
 
-    stiffness: float
-    """Proportional gain of the joint drives, in [N m/rad]."""
-    damping: float
-    """Derivative gain of the joint drives, in [N m s/rad]."""
-    force_limits: tuple[float, ...]
+    stiffness: tuple[float, ...]
+    """Proportional gain of each joint's drive, in [N m/rad]."""
+    damping: tuple[float, ...]
+    """Derivative gain of each joint's drive, in [N m s/rad]."""
+    force_limit: tuple[float, ...]
     """Largest torque of each joint, in [N m]."""
     neighbour_poses: bool = True
     """Whether the nearest reachable pose within 5 cm and 10 degrees is taken for one that cannot be reached."""
