@@ -166,7 +166,7 @@ def main() -> int:
     try:
         ctypes.CDLL("libX11.so.6")
     except OSError:
-        print("no: the system library libX11 is missing, which SAPIEN needs even without a screen; run `make vulkan`")
+        print("no: SAPIEN needs the system library libX11, even without a screen; `make vulkan` installs it")
         return 1
     try:
         devices = list_devices()
