@@ -55,8 +55,9 @@ class Args:
 
 
 @register_env(EMPTY, max_episode_steps=10**9)
-class EmptyEnv(BaseEnv):
-    """This robot and nothing else: ManiSkill's own step with one physics step per action, the yardstick for ours."""
+class EmptyEnv(BaseEnv):  # type: ignore[misc]
+    """This robot and nothing else: ManiSkill's own step with one physics step per action, the yardstick for
+    ours."""
 
     SUPPORTED_ROBOTS = ["iiwa14_d435"]
 
@@ -68,7 +69,7 @@ class EmptyEnv(BaseEnv):
         return torch.zeros(self.num_envs)
 
 
-def steps_per_second(env: gym.Env[Any, Any], steps: int, actions: np.ndarray[Any, Any]) -> float:
+def steps_per_second(env: Any, steps: int, actions: np.ndarray[Any, Any]) -> float:
     """Rate of `env.step` alone, resets left out; episodes end after at most 30 steps."""
     spent, done = 0.0, 0
     while done < steps:
@@ -100,7 +101,8 @@ def resident_mib() -> float:
 
 
 def growth(work: Callable[[], object], times: int) -> dict[str, float]:
-    """Memory before and after `times` calls, once a tenth of them has filled caches and allocators, in [MiB]."""
+    """Memory before and after `times` calls, once a tenth of them has filled caches and allocators, in
+    [MiB]."""
     for _ in range(max(1, times // 10)):
         work()
     before = resident_mib()

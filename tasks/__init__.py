@@ -1,7 +1,7 @@
 """Gym registration of the tomato tasks.
 
-Importing this module is cheap: every spec names its environment by a string, so ManiSkill, SAPIEN and PyTorch load only when
-`gymnasium.make` builds one.
+Importing this module is cheap: every spec names its environment by a string, so ManiSkill, SAPIEN and PyTorch
+load only when `gymnasium.make` builds one.
 """
 
 from gymnasium.envs.registration import WrapperSpec, register, registry

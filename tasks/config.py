@@ -1,4 +1,5 @@
-"""What tells the thesis's tasks apart: start ranges, thresholds, reward terms, what happens outside the workspace."""
+"""What tells the thesis's tasks apart: start ranges, thresholds, reward terms, what happens outside the
+workspace."""
 
 import math
 from collections.abc import Callable
@@ -32,7 +33,8 @@ class ViewpointTaskConfig:
     outside_workspace: Literal["home", "end"]
     """An unreachable pose sends the arm home (all joints 0) or ends the episode."""
     neighbour_poses: bool
-    """Whether a reachable pose close to an unreachable one is taken instead; otherwise it counts as unreachable."""
+    """Whether a reachable pose close to an unreachable one is taken instead; otherwise it counts as
+    unreachable."""
     visual_reward: VisualReward
     """R_v from V_f, target seen, any tomato seen, reach."""
     pose_penalty: PosePenalty
@@ -60,7 +62,8 @@ def guided_task() -> ViewpointTaskConfig:
 def sparse_task() -> ViewpointTaskConfig:
     """The sparse-reward task (section 5-2, Eq. 5-7 ... 5-11, Table 5-2).
 
-    Eq. 5-10 has no case for a neighbour pose, so any pose that cannot be reached exactly is outside the workspace.
+    Eq. 5-10 has no case for a neighbour pose, so any pose that cannot be reached exactly is outside the
+    workspace.
     """
     return ViewpointTaskConfig(
         plant=PlantChoice(preset="three_tomatoes", seed=0),

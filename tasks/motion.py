@@ -1,9 +1,11 @@
-"""Driving the arm to a joint position through physics: a minimum-jerk path within the velocity limits, then settling."""
+"""Driving the arm to a joint position through physics: a minimum-jerk path within the velocity limits, then
+settling."""
 
 import math
 
 import torch
 from mani_skill.agents.base_agent import BaseAgent
+from mani_skill.agents.controllers.base_controller import BaseController
 from mani_skill.envs.scene import ManiSkillScene
 from torch import Tensor
 
@@ -57,7 +59,7 @@ def drive_to(scene: ManiSkillScene, agent: BaseAgent, target_qpos: Tensor) -> No
             break
 
 
-def _step(scene: ManiSkillScene, agent: BaseAgent, controller: object, targets: Tensor) -> None:
+def _step(scene: ManiSkillScene, agent: BaseAgent, controller: BaseController, targets: Tensor) -> None:
     agent.robot.set_joint_drive_targets(targets, controller.joints, controller.active_joint_indices)
     if scene.gpu_sim_enabled:
         scene.px.gpu_apply_articulation_target_position()

@@ -94,8 +94,8 @@ def pick_render_backend(render_backend: str, rendering: bool) -> str:
 
 
 NO_RENDERING_HINT = (
-    "pictures were asked for, but no Vulkan device can render them ({cause}); install one for the CPU with `make vulkan` "
-    "(Mesa's lavapipe), or use obs_mode='state' and render_mode=None, which need none"
+    "pictures were asked for, but no Vulkan device can render them ({cause}); install one for the CPU with "
+    "`make vulkan` (Mesa's lavapipe), or use obs_mode='state' and render_mode=None, which need none"
 )
 
 

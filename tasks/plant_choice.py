@@ -16,7 +16,8 @@ SEED_SPLITS: dict[str, tuple[int, int]] = {
     "validation": (1_000_000, 2_000_000),
     "held_out": (2_000_000, 3_000_000),
 }
-"""Half-open, disjoint ranges of plant seeds; a choice with a split's name as seed takes a new plant at every reset."""
+"""Half-open, disjoint ranges of plant seeds; a choice with a split's name as seed takes a new plant at every
+reset."""
 
 MAX_SEED = 2**24 - 1
 """The largest plant seed: a saved state holds it as a float32."""
@@ -41,7 +42,8 @@ class PlantChoice:
         if isinstance(self.seed, str):
             if self.seed not in SEED_SPLITS:
                 raise InvalidInputError(
-                    f"plant seed must be an integer from 0 to {MAX_SEED} or one of {', '.join(SEED_SPLITS)}; got {self.seed!r}"
+                    f"plant seed must be an integer from 0 to {MAX_SEED} or one of {', '.join(SEED_SPLITS)}; "
+                    f"got {self.seed!r}"
                 )
         elif isinstance(self.seed, bool) or not 0 <= self.seed <= MAX_SEED:
             raise InvalidInputError(f"plant seed must be an integer from 0 to {MAX_SEED}; got {self.seed!r}")
@@ -73,7 +75,8 @@ class PlantChoice:
         """A choice from what a user may write.
 
         Args:
-            value: None for the default; a preset's name; a mapping with any of this class's fields, which replace the
+            value: None for the default; a preset's name; a mapping with any of this class's fields, which
+            replace the
                 default's.
             default: The task's own plant.
 

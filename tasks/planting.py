@@ -1,4 +1,5 @@
-"""The plants of an environment: grown, put into the scene, moved, and asked for fruits and segmentation ids."""
+"""The plants of an environment: grown, put into the scene, moved, and asked for fruits and segmentation
+ids."""
 
 from collections.abc import Sequence
 from functools import lru_cache

@@ -1,7 +1,7 @@
 """Rewards, penalties and zones of the thesis (Eq. 5-3, 5-4, 5-9, 5-10) as pure functions of tensors.
 
-Every function takes and returns batches of shape (B,). `reach` holds `Reach` values: 0 the asked pose was reached, 1 a
-neighbour pose was taken instead, 2 the asked pose is outside the workspace.
+Every function takes and returns batches of shape (B,). `reach` holds `Reach` values: 0 the asked pose was
+reached, 1 a neighbour pose was taken instead, 2 the asked pose is outside the workspace.
 """
 
 import torch
@@ -13,7 +13,8 @@ from maniskill_tomato.robot.inverse_kinematics import Reach
 def in_forbidden_zone(ee_position_w: Tensor) -> Tensor:
     """Whether the end-effector is where it must not be (third case of Eq. 5-4, second of Eq. 5-10).
 
-    The zone is z < 0.15 m, or a box around the base (|x| < 0.3 m, |y| < 0.3 m, z < 0.25 m), or x > 0.7 m. All bounds are
+    The zone is z < 0.15 m, or a box around the base (|x| < 0.3 m, |y| < 0.3 m, z < 0.25 m), or x > 0.7 m. All
+    bounds are
     strict: a pose exactly on one is outside the zone.
 
     Args:
@@ -32,9 +33,9 @@ def guided_visual_reward(
 ) -> Tensor:
     """R_v of the guided task (Eq. 5-3).
 
-    The cases exclude each other in this order: the asked pose is outside the workspace (-0.1), no tomato is seen (-0.5),
-    tomatoes but not the target (-0.1), the target: V_f, with +0.5 above 0.85, else +0.25 above 0.7, or -0.05 below 0.15. A
-    neighbour pose counts as a view like any other: the camera looked from it.
+    The cases exclude each other in this order: the asked pose is outside the workspace (-0.1), no tomato is
+    seen (-0.5), tomatoes but not the target (-0.1), the target: V_f, with +0.5 above 0.85, else +0.25 above
+    0.7, or -0.05 below 0.15. A neighbour pose counts as a view like any other: the camera looked from it.
 
     Args:
         visible_fraction: V_f of the target (Eq. 4-4). Shape (B,).
@@ -53,7 +54,8 @@ def guided_visual_reward(
 
 
 def guided_pose_penalty(reach: Tensor, forbidden: Tensor) -> Tensor:
-    """P_p of the guided task (Eq. 5-4): -0.3 outside the workspace, -0.1 for a neighbour pose, -1.5 in the forbidden zone.
+    """P_p of the guided task (Eq. 5-4): -0.3 outside the workspace, -0.1 for a neighbour pose, -1.5 in the
+    forbidden zone.
 
     The zone is judged where the end-effector really is, so its penalty adds to that of a neighbour pose.
 
@@ -73,10 +75,11 @@ def guided_pose_penalty(reach: Tensor, forbidden: Tensor) -> Tensor:
 def sparse_visual_reward(
     visible_fraction: Tensor, target_seen: Tensor, any_tomato_seen: Tensor, reach: Tensor
 ) -> Tensor:
-    """R_v of the sparse task (Eq. 5-9): 1 above 0.8, 0.1 between 0.6 and 0.8, -0.1 if no tomato is seen, otherwise 0.
+    """R_v of the sparse task (Eq. 5-9): 1 above 0.8, 0.1 between 0.6 and 0.8, -0.1 if no tomato is seen,
+    otherwise 0.
 
-    The bounds are strict as printed, so exactly 0.6 or 0.8 gives 0. `target_seen` and `reach` are not part of Eq. 5-9; they
-    stand in the signature so that both tasks call their reward alike.
+    The bounds are strict as printed, so exactly 0.6 or 0.8 gives 0. `target_seen` and `reach` are not part of
+    Eq. 5-9; they stand in the signature so that both tasks call their reward alike.
 
     Args:
         visible_fraction: V_f of the target (Eq. 4-4). Shape (B,).

@@ -33,32 +33,36 @@ from maniskill_tomato.tasks.rewards import in_forbidden_zone
 from maniskill_tomato.visibility.caster import VisibilityCaster
 
 START_CANDIDATES = 16
-"""Start poses drawn at a time until one can be reached; the first one that can is taken, so the number does not matter."""
+"""Start poses drawn at a time until one can be reached; the first one that can is taken, so the number does
+not matter."""
 
 MAX_START_DRAWS = 64
 """Draws of `START_CANDIDATES` poses before a start box counts as out of reach."""
 
 
-class TomatoViewpointEnv(BaseEnv):
+class TomatoViewpointEnv(BaseEnv):  # type: ignore[misc]
     """One environment class for all viewpoint tasks; a `ViewpointTaskConfig` tells them apart.
 
     **Options** beside ManiSkill's own:
 
-    - `plant`: a preset's name or a mapping of `PlantChoice` fields, e.g. `{"preset": "full", "seed": "held_out"}` for a new
-      held-out plant at every reset.
+    - `plant`: a preset's name or a mapping of `PlantChoice` fields, e.g. `{"preset": "full", "seed":
+      "held_out"}` for a new held-out plant at every reset.
     - `plant_pose`: `(x, y, yaw)` of the stem in the world frame, in [m, m, rad].
     - `plant_pose_noise`: half ranges of a uniform addition to it at every reset, in [m, m, rad].
     - `motion`: `"kinematic"` puts the joints at the solution, `"dynamic"` drives them there through physics.
     - `rays_per_side`: the visibility query casts this number squared.
-    - `render_backend`: `"auto"` renders on the GPU if there is one, else on the CPU, and not at all where no picture is asked for.
+    - `render_backend`: `"auto"` renders on the GPU if there is one, else on the CPU, and not at all where no
+      picture is asked for.
 
-    `reset(options=...)` also takes `target` (index of a ripe fruit in `Plant.fruits`) and `viewpoint` (x, y, z, roll, pitch, yaw
-    of the start), for all environments being reset.
+    `reset(options=...)` also takes `target` (index of a ripe fruit in `Plant.fruits`) and `viewpoint` (x, y,
+    z, roll, pitch, yaw of the start), for all environments being reset.
 
-    **Observation** (`state`, 9 numbers, world frame): end-effector x, y, z [m], roll, pitch, yaw [rad], target x, y, z [m].
+    **Observation** (`state`, 9 numbers, world frame): end-effector x, y, z [m], roll, pitch, yaw [rad],
+    target x, y, z [m].
     **Action** (`pd_viewpoint`, 6 numbers in [-1, 1]): increments of the first six, 1 meaning 1 m or 1 rad.
-    **Info**, each of shape (num_envs,): `success`, `fail`, `visible_fraction`, `target_id` (segmentation id), `target_seen`,
-    `tomato_seen`, `reachability` (`Reach`), `in_forbidden_zone`, `reward_visual`, `reward_penalty`.
+    **Info**, each of shape (num_envs,): `success`, `fail`, `visible_fraction`, `target_id` (segmentation id),
+    `target_seen`, `tomato_seen`, `reachability` (`Reach`), `in_forbidden_zone`, `reward_visual`,
+    `reward_penalty`.
     """
 
     SUPPORTED_ROBOTS = ["iiwa14_d435", "iiwa14_d435_raw_depth"]
@@ -205,7 +209,8 @@ class TomatoViewpointEnv(BaseEnv):
         self._set_arm(env_idx, viewpoint, qpos)
 
     def _draw_start(self, rngs: list[np.random.RandomState]) -> tuple[Tensor, Tensor]:
-        """Start viewpoints uniform in the task's box, redrawn until reachable, and their joints (Eq. 5-1, 5-2, 5-7, 5-8)."""
+        """Start viewpoints uniform in the task's box, redrawn until reachable, and their joints (Eq. 5-1,
+        5-2, 5-7, 5-8)."""
         low, high = np.array((*self.task.start_position, *self.task.start_rpy)).T
         b = len(rngs)
         viewpoint = torch.zeros(b, 6, device=self.device)
@@ -246,7 +251,8 @@ class TomatoViewpointEnv(BaseEnv):
         values = np.asarray(viewpoint, dtype=np.float64)
         if values.shape != (6,) or not np.isfinite(values).all():
             raise InvalidInputError(
-                f"reset option viewpoint must be six finite numbers (x, y, z [m], roll, pitch, yaw [rad]); got {viewpoint!r}"
+                "reset option viewpoint must be six finite numbers (x, y, z [m], roll, pitch, yaw [rad]); "
+                f"got {viewpoint!r}"
             )
         start = torch.as_tensor(values, dtype=torch.float32, device=self.device).expand(batch, 6)
         ready = torch.as_tensor(Iiwa14D435.keyframes["ready"].qpos, dtype=torch.float64, device=self.device)
@@ -327,7 +333,8 @@ class TomatoViewpointEnv(BaseEnv):
         self._viewpoint = torch.cat([T_w_ee[:, :3, 3], rpy], dim=-1)
 
     def evaluate(self) -> dict[str, Tensor]:
-        """What the camera sees from where it is: V_f, whether that is a success, and the terms of the reward."""
+        """What the camera sees from where it is: V_f, whether that is a success, and the terms of the
+        reward."""
         assert self._caster is not None and self._T_ee_camera is not None
         T_w_links = link_transforms(self.agent.robot.get_qpos())
         seen = self._caster.cast(
@@ -364,7 +371,8 @@ class TomatoViewpointEnv(BaseEnv):
     # ------------------------------------------------------------ observation
 
     def _get_obs_agent(self) -> dict[str, Tensor]:
-        """Nothing in the state modes, whose observation is the thesis's nine numbers; joints and viewpoint beside pictures."""
+        """Nothing in the state modes, whose observation is the thesis's nine numbers; joints and viewpoint
+        beside pictures."""
         if self._obs_mode in ("state", "state_dict"):
             return {}
         return {"qpos": self.agent.robot.get_qpos(), "qvel": self.agent.robot.get_qvel()}
@@ -387,7 +395,8 @@ class TomatoViewpointEnv(BaseEnv):
         return self._target.clone()
 
     def semantic_classes(self, env_index: int = 0) -> dict[int, SemanticClass]:
-        """The semantic class of every segmentation id of an environment; ids that are missing are background."""
+        """The semantic class of every segmentation id of an environment; ids that are missing are
+        background."""
         links = self.agent.robot.get_links()
         robot = {int(link._objs[env_index].entity.per_scene_id): SemanticClass.ROBOT for link in links}
         return robot | self.planting.semantic_classes(env_index)
@@ -395,8 +404,9 @@ class TomatoViewpointEnv(BaseEnv):
     # ------------------------------------------------------------------ state
 
     def get_state_dict(self) -> dict[str, Any]:
-        """ManiSkill's state and the task's own under `task`: viewpoint, reach, target, and pose and seed of the plant."""
-        state = self.scene.get_sim_state()
+        """ManiSkill's state and the task's own under `task`: viewpoint, reach, target, and pose and seed of
+        the plant."""
+        state: dict[str, Any] = self.scene.get_sim_state()
         state["task"] = {
             "viewpoint": self._viewpoint.clone(),
             "reach": self._reach[:, None].float(),
@@ -418,10 +428,11 @@ class TomatoViewpointEnv(BaseEnv):
             for k, v in state["task"].items()
         }
         seeds = [self.planting.seeds[int(i)] for i in indices]
-        if [int(s) for s in task["plant_seed"][:, 0]] != seeds:
+        stored = [int(s) for s in task["plant_seed"][:, 0]]
+        if stored != seeds:
             raise InvalidInputError(
-                f"the state belongs to plants of seed {[int(s) for s in task['plant_seed'][:, 0]]}, but this environment holds "
-                f"{seeds}; make it with plant={{'seed': ...}} or reset it with the seed of that episode"
+                f"the state belongs to plants of seed {stored}, but this environment holds {seeds}; "
+                "make it with plant={'seed': ...} or reset it with the seed of that episode"
             )
         super().set_state_dict({k: v for k, v in state.items() if k != "task"}, env_idx)
         x, y, yaw = task["plant_pose"].unbind(-1)
@@ -462,12 +473,13 @@ def _unflatten(flat: Tensor, like: dict[str, Any], start: int) -> tuple[dict[str
 
 class TomatoViewpointGuidedEnv(TomatoViewpointEnv):
     """**Task Description:**
-    One ripe tomato hangs behind leaves. Move the camera, step by step, to where it is fully visible; the reward (Eq. 5-3, 5-4)
-    grows with the visible fraction V_f. A pose outside the workspace sends the arm home, and the episode goes on.
+    One ripe tomato hangs behind leaves. Move the camera, step by step, to where it is fully visible; the
+    reward (Eq. 5-3, 5-4) grows with the visible fraction V_f. A pose outside the workspace sends the arm
+    home, and the episode goes on.
 
     **Randomizations:**
-    - The end-effector starts uniformly in x [-0.1, 0.2], y [-0.35, 0.1], z [0.65, 1.15] m, roll 0, pitch [0.45 pi, 0.7 pi],
-      yaw [0, 0.25 pi] (Eq. 5-1, 5-2), redrawn while the arm cannot reach the pose.
+    - The end-effector starts uniformly in x [-0.1, 0.2], y [-0.35, 0.1], z [0.65, 1.15] m, roll 0, pitch
+      [0.45 pi, 0.7 pi], yaw [0, 0.25 pi] (Eq. 5-1, 5-2), redrawn while the arm cannot reach the pose.
 
     **Success Conditions:**
     - V_f of the tomato is above 0.85.
@@ -479,13 +491,14 @@ class TomatoViewpointGuidedEnv(TomatoViewpointEnv):
 
 class TomatoViewpointSparseEnv(TomatoViewpointEnv):
     """**Task Description:**
-    Three ripe tomatoes hang behind leaves, and one of them is the target. Move the camera to where it is fully visible; only good
-    views are rewarded (Eq. 5-9, 5-10). A pose outside the workspace ends the episode.
+    Three ripe tomatoes hang behind leaves, and one of them is the target. Move the camera to where it is
+    fully visible; only good views are rewarded (Eq. 5-9, 5-10). A pose outside the workspace ends the
+    episode.
 
     **Randomizations:**
     - The target is one of the three ripe tomatoes.
-    - The end-effector starts uniformly in x [-0.1, 0.2], y [-0.25, 0.25], z [0.65, 1.15] m, roll 0, pitch [0.45 pi, 0.7 pi],
-      yaw [-pi/8, pi/8] (Eq. 5-7, 5-8), redrawn while the arm cannot reach the pose.
+    - The end-effector starts uniformly in x [-0.1, 0.2], y [-0.25, 0.25], z [0.65, 1.15] m, roll 0, pitch
+      [0.45 pi, 0.7 pi], yaw [-pi/8, pi/8] (Eq. 5-7, 5-8), redrawn while the arm cannot reach the pose.
 
     **Success Conditions:**
     - V_f of the target is above 0.8.

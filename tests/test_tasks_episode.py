@@ -29,34 +29,34 @@ BOXES = {
 }
 
 
-def make(env_id: str, **kwargs: Any) -> gym.Env[Any, Any]:
+def make(env_id: str, **kwargs: Any) -> Any:
     return gym.make(
         env_id, num_envs=1, obs_mode="state", reward_mode="dense", render_backend="none", **kwargs
     )
 
 
 @pytest.fixture(scope="module", params=[GUIDED, SPARSE])
-def env(request: pytest.FixtureRequest) -> Iterator[gym.Env[Any, Any]]:
+def env(request: pytest.FixtureRequest) -> Iterator[Any]:
     env = make(request.param)
     yield env
     env.close()
 
 
 @pytest.fixture(scope="module")
-def guided() -> Iterator[gym.Env[Any, Any]]:
+def guided() -> Iterator[Any]:
     env = make(GUIDED)
     yield env
     env.close()
 
 
 @pytest.fixture(scope="module")
-def sparse() -> Iterator[gym.Env[Any, Any]]:
+def sparse() -> Iterator[Any]:
     env = make(SPARSE)
     yield env
     env.close()
 
 
-def test_state_observation_is_the_nine_numbers_of_the_thesis(env: gym.Env[Any, Any]) -> None:
+def test_state_observation_is_the_nine_numbers_of_the_thesis(env: Any) -> None:
     obs, _ = env.reset(seed=3)
     assert obs.shape == (1, 9) and obs.dtype == torch.float32
     base = env.unwrapped
@@ -66,7 +66,7 @@ def test_state_observation_is_the_nine_numbers_of_the_thesis(env: gym.Env[Any, A
     torch.testing.assert_close(obs[0, 6:], base.target_position_w[0])
 
 
-def test_start_poses_fill_the_box_of_the_thesis_and_are_reached(env: gym.Env[Any, Any]) -> None:
+def test_start_poses_fill_the_box_of_the_thesis_and_are_reached(env: Any) -> None:
     low, high = BOXES[env.unwrapped.spec.id]
     starts = torch.stack([env.reset(seed=s)[0][0, :6] for s in range(200)])
     assert (starts >= torch.tensor(low) - 1e-6).all() and (starts <= torch.tensor(high) + 1e-6).all()
@@ -74,7 +74,7 @@ def test_start_poses_fill_the_box_of_the_thesis_and_are_reached(env: gym.Env[Any
     assert (spread[[0, 1, 2, 4, 5]] > 0.85).all()
 
 
-def test_increment_moves_the_end_effector_by_just_that(env: gym.Env[Any, Any]) -> None:
+def test_increment_moves_the_end_effector_by_just_that(env: Any) -> None:
     obs, _ = env.reset(seed=0, options={"viewpoint": [0.15, -0.05, 0.85, 0.0, 1.6, 0.1]})
     action = torch.tensor([0.03, -0.02, 0.05, 0.04, -0.06, 0.08])
     after, _, _, _, info = env.step(action)
@@ -85,7 +85,7 @@ def test_increment_moves_the_end_effector_by_just_that(env: gym.Env[Any, Any]) -
     torch.testing.assert_close(T[:3, :3], rpy_to_matrix(after[0, 3:6].double()), atol=1e-6, rtol=0)
 
 
-def test_actions_are_clipped_to_one_metre_and_one_radian(guided: gym.Env[Any, Any]) -> None:
+def test_actions_are_clipped_to_one_metre_and_one_radian(guided: Any) -> None:
     start = [0.15, -0.05, 0.85, 0.0, 1.6, 0.1]
     results = []
     for yaw in (1.0, 7.0):
@@ -94,7 +94,7 @@ def test_actions_are_clipped_to_one_metre_and_one_radian(guided: gym.Env[Any, An
     torch.testing.assert_close(results[0], results[1])
 
 
-def test_info_has_the_names_and_shapes_that_others_build_on(env: gym.Env[Any, Any]) -> None:
+def test_info_has_the_names_and_shapes_that_others_build_on(env: Any) -> None:
     env.reset(seed=1)
     _, reward, terminated, truncated, info = env.step(np.zeros(6, dtype=np.float32))
     for key in (
@@ -112,7 +112,7 @@ def test_info_has_the_names_and_shapes_that_others_build_on(env: gym.Env[Any, An
     assert "fruit" in target.name
 
 
-def test_reward_is_the_sum_of_its_terms_within_the_task_bounds(env: gym.Env[Any, Any]) -> None:
+def test_reward_is_the_sum_of_its_terms_within_the_task_bounds(env: Any) -> None:
     env.action_space.seed(0)
     for seed in range(30):
         env.reset(seed=seed)
@@ -124,7 +124,7 @@ def test_reward_is_the_sum_of_its_terms_within_the_task_bounds(env: gym.Env[Any,
             assert float(reward) == pytest.approx(total, abs=1e-6)
 
 
-def test_guided_sends_the_arm_home_from_outside_the_workspace(guided: gym.Env[Any, Any]) -> None:
+def test_guided_sends_the_arm_home_from_outside_the_workspace(guided: Any) -> None:
     guided.reset(seed=0, options={"viewpoint": [0.15, -0.05, 0.85, 0.0, 1.6, 0.1]})
     obs, reward, terminated, _, info = guided.step(np.array([1.0, 1.0, 1.0, 0, 0, 0], dtype=np.float32))
     assert int(info["reachability"]) == Reach.UNREACHABLE
@@ -134,7 +134,7 @@ def test_guided_sends_the_arm_home_from_outside_the_workspace(guided: gym.Env[An
     assert float(reward) == pytest.approx(-0.1 - 0.3)
 
 
-def test_sparse_ends_outside_the_workspace_with_the_arm_where_it_was(sparse: gym.Env[Any, Any]) -> None:
+def test_sparse_ends_outside_the_workspace_with_the_arm_where_it_was(sparse: Any) -> None:
     before, _ = sparse.reset(seed=0, options={"viewpoint": [0.15, -0.05, 0.85, 0.0, 1.6, 0.1]})
     after, reward, terminated, _, info = sparse.step(np.array([1.0, 1.0, 1.0, 0, 0, 0], dtype=np.float32))
     assert int(info["reachability"]) == Reach.UNREACHABLE
@@ -144,36 +144,36 @@ def test_sparse_ends_outside_the_workspace_with_the_arm_where_it_was(sparse: gym
 
 
 def overreach(distance: float) -> list[float]:
-    """From (0.4, 0, 0.6), looking along +x, this far beyond the arm's reach along x."""
+    """From (0.55, 0, 0.6), looking along +x, this far beyond the arm's reach along x."""
     # The wrist is 0.126 m behind the flange and 0.82 m from the shoulder (0, 0, 0.36) at full reach.
     limit = math.sqrt(0.82**2 - (0.6 - 0.36) ** 2) + 0.126
-    return [limit + distance - 0.4, 0.0, 0.0, 0.0, 0.0, 0.0]
+    return [limit + distance - 0.55, 0.0, 0.0, 0.0, 0.0, 0.0]
 
 
 def test_pose_just_out_of_reach_becomes_a_neighbour_pose_in_the_guided_task_only(
-    guided: gym.Env[Any, Any], sparse: gym.Env[Any, Any]
+    guided: Any, sparse: Any
 ) -> None:
-    start = {"viewpoint": [0.4, 0.0, 0.6, 0.0, math.pi / 2, 0.0]}
+    start = {"viewpoint": [0.55, 0.0, 0.6, 0.0, math.pi / 2, 0.0]}
     action = np.array(overreach(0.03), dtype=np.float32)
     guided.reset(seed=0, options=start)
     obs, _, _, _, info = guided.step(action)
     assert int(info["reachability"]) == Reach.NEIGHBOUR
     # x is beyond 0.7 m there, so the forbidden zone's penalty comes on top.
     assert float(info["reward_penalty"]) == pytest.approx(-0.1 - 1.5)
-    assert float((obs[0, :3] - torch.tensor([0.4 + action[0], 0.0, 0.6])).norm()) <= 0.05 + 1e-6
+    assert float((obs[0, :3] - torch.tensor([0.55 + action[0], 0.0, 0.6])).norm()) <= 0.05 + 1e-6
     sparse.reset(seed=0, options=start)
     _, _, terminated, _, info = sparse.step(action)
     assert int(info["reachability"]) == Reach.UNREACHABLE and bool(terminated)
 
 
-def test_forbidden_zone_is_told_and_punished(guided: gym.Env[Any, Any]) -> None:
+def test_forbidden_zone_is_told_and_punished(guided: Any) -> None:
     guided.reset(seed=0, options={"viewpoint": [0.65, 0.0, 0.6, 0.0, math.pi / 2, 0.0]})
     _, _, _, _, info = guided.step(np.array([0.1, 0, 0, 0, 0, 0], dtype=np.float32))
     assert bool(info["in_forbidden_zone"])
     assert float(info["reward_penalty"]) == pytest.approx(-1.5)
 
 
-def test_episode_is_truncated_after_thirty_steps(guided: gym.Env[Any, Any]) -> None:
+def test_episode_is_truncated_after_thirty_steps(guided: Any) -> None:
     # Looking straight up the target is never seen.
     guided.reset(seed=0, options={"viewpoint": [0.3, 0.0, 1.0, 0.0, 0.2, 0.0]})
     for step in range(1, 31):
@@ -183,7 +183,7 @@ def test_episode_is_truncated_after_thirty_steps(guided: gym.Env[Any, Any]) -> N
         assert bool(truncated) is (step == 30)
 
 
-def test_success_ends_the_episode(env: gym.Env[Any, Any]) -> None:
+def test_success_ends_the_episode(env: Any) -> None:
     base = env.unwrapped
     threshold = {GUIDED: 0.85, SPARSE: 0.8}[base.spec.id]
     rng = np.random.default_rng(0)
@@ -218,7 +218,7 @@ def sample_view(target: Tensor, rng: np.random.Generator) -> Tensor:
     return torch.tensor([*position, 0.0, math.pi / 2 + elevation, azimuth], dtype=torch.float32)
 
 
-def test_target_differs_by_episode_and_is_a_ripe_fruit(sparse: gym.Env[Any, Any]) -> None:
+def test_target_differs_by_episode_and_is_a_ripe_fruit(sparse: Any) -> None:
     base = sparse.unwrapped
     targets = []
     for seed in range(60):
@@ -228,7 +228,7 @@ def test_target_differs_by_episode_and_is_a_ripe_fruit(sparse: gym.Env[Any, Any]
     assert min(targets.count(t) for t in set(targets)) >= 8
 
 
-def test_target_can_be_chosen_at_reset(sparse: gym.Env[Any, Any]) -> None:
+def test_target_can_be_chosen_at_reset(sparse: Any) -> None:
     ids = set()
     for target in sparse.unwrapped.planting.ripe_fruits[0]:
         _, info = sparse.reset(seed=0, options={"target": target})
@@ -237,7 +237,7 @@ def test_target_can_be_chosen_at_reset(sparse: gym.Env[Any, Any]) -> None:
     assert len(ids) == 3
 
 
-def test_home_looks_at_the_sky(guided: gym.Env[Any, Any]) -> None:
+def test_home_looks_at_the_sky(guided: Any) -> None:
     guided.reset(seed=0)
     _, _, _, _, info = guided.step(np.array([1.0, 1.0, 1.0, 0, 0, 0], dtype=np.float32))
     assert float(info["visible_fraction"]) == 0.0 and not bool(info["success"])

@@ -15,7 +15,7 @@ from maniskill_tomato.tasks.plant_choice import SEED_SPLITS, PlantChoice, PlantP
 GUIDED = "TomatoViewpointGuided-v1"
 
 
-def make(**kwargs: Any) -> gym.Env[Any, Any]:
+def make(**kwargs: Any) -> Any:
     options: dict[str, Any] = {"num_envs": 1, "obs_mode": "state", "render_backend": "none"} | kwargs
     return gym.make(GUIDED, **options)
 
@@ -71,7 +71,7 @@ def env() -> Any:
         {"action": np.zeros(6)},
     ],
 )
-def test_bad_actions_raise_value_error_and_change_nothing(env: gym.Env[Any, Any], action: Any) -> None:
+def test_bad_actions_raise_value_error_and_change_nothing(env: Any, action: Any) -> None:
     env.reset(seed=0)
     before = env.unwrapped.get_state().clone()
     with pytest.raises(ValueError):
@@ -89,7 +89,7 @@ def test_bad_actions_raise_value_error_and_change_nothing(env: gym.Env[Any, Any]
         ({"viewpoint": [3.0, 0, 1, 0, 1.5, 0]}, "cannot reach"),
     ],
 )
-def test_bad_reset_options_are_refused(env: gym.Env[Any, Any], options: dict[str, Any], message: str) -> None:
+def test_bad_reset_options_are_refused(env: Any, options: dict[str, Any], message: str) -> None:
     with pytest.raises(InvalidInputError, match=message):
         env.reset(options=options)
 

@@ -18,7 +18,7 @@ SPARSE = "TomatoViewpointSparse-v1"
 SIZE = {"width": 96, "height": 64}
 
 
-def make(env_id: str, **kwargs: Any) -> gym.Env[Any, Any]:
+def make(env_id: str, **kwargs: Any) -> Any:
     return gym.make(env_id, **({"num_envs": 1, "sensor_configs": dict(SIZE)} | kwargs))
 
 
@@ -74,7 +74,7 @@ def test_visible_fraction_is_nonzero_just_where_the_picture_shows_the_target(env
         present = {classes.get(int(i), SemanticClass.BACKGROUND) for i in ids.unique()}
         assert SemanticClass.LEAF in present
     for fraction, pixels in pairs:
-        # A target of this size covers some 100 to 800 pixels, so 2 % of it is several pixels and 8 pixels are some rays.
+        # A target covers some 100 to 800 pixels: 2 % of it is several pixels, and 8 pixels are some rays.
         assert pixels > 0 or fraction < 0.02
         assert fraction > 0 or pixels < 8
     assert any(f > 0 for f, _ in pairs)
@@ -140,7 +140,7 @@ def test_flatten_wrapper_and_video_recording_work(tmp_path: Path) -> None:
     from mani_skill.utils.wrappers.flatten import FlattenRGBDObservationWrapper
     from mani_skill.utils.wrappers.record import RecordEpisode
 
-    env: gym.Env[Any, Any] = make(GUIDED, obs_mode="rgb+depth", render_mode="rgb_array")
+    env: Any = make(GUIDED, obs_mode="rgb+depth", render_mode="rgb_array")
     env = FlattenRGBDObservationWrapper(env, rgb=True, depth=True, state=True)
     env = RecordEpisode(env, str(tmp_path), save_trajectory=True, save_video=True, max_steps_per_video=3)
     obs, _ = env.reset(seed=0)

@@ -16,7 +16,7 @@ GUIDED = "TomatoViewpointGuided-v1"
 SPARSE = "TomatoViewpointSparse-v1"
 
 
-def make(env_id: str = GUIDED, **kwargs: Any) -> gym.Env[Any, Any]:
+def make(env_id: str = GUIDED, **kwargs: Any) -> Any:
     options: dict[str, Any] = {
         "num_envs": 1,
         "obs_mode": "state",
@@ -26,7 +26,7 @@ def make(env_id: str = GUIDED, **kwargs: Any) -> gym.Env[Any, Any]:
     return gym.make(env_id, **(options | kwargs))
 
 
-def rollout(env: gym.Env[Any, Any], seed: int, steps: int = 12) -> list[torch.Tensor]:
+def rollout(env: Any, seed: int, steps: int = 12) -> list[torch.Tensor]:
     """Observations, rewards and V_f of a random episode."""
     rng = np.random.default_rng(seed)
     obs, info = env.reset(seed=seed)
@@ -128,7 +128,7 @@ def test_async_vector_env_runs_one_environment_per_process() -> None:
         env.close()
 
 
-def _cpu_env() -> gym.Env[Any, Any]:
+def _cpu_env() -> Any:
 
     from mani_skill.utils.wrappers.gymnasium import CPUGymWrapper
 

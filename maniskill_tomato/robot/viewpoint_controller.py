@@ -1,8 +1,9 @@
-"""The viewpoint control mode: an increment of the end-effector's position and roll, pitch, yaw, then move there and look.
+"""The viewpoint control mode: an increment of the end-effector's position and roll, pitch, yaw, then move
+there and look.
 
-The increment is added to where the end-effector is; the closed-form inverse kinematics says whether the arm can take that pose,
-and `outside_workspace` what it does when it cannot. The action's 1 means 1 m or 1 rad, as the thesis's tanh output does
-(section 4-3-2).
+The increment is added to where the end-effector is; the closed-form inverse kinematics says whether the arm
+can take that pose, and `outside_workspace` what it does when it cannot. The action's 1 means 1 m or 1 rad, as
+the thesis's tanh output does (section 4-3-2).
 """
 
 from dataclasses import dataclass
@@ -19,11 +20,12 @@ from maniskill_tomato.robot.kinematics import forward_kinematics
 from maniskill_tomato.robot.rotations import matrix_to_rpy, rpy_to_matrix
 
 
-class ViewpointController(BaseController):
+class ViewpointController(BaseController):  # type: ignore[misc]
     """Turns an action (dx, dy, dz, droll, dpitch, dyaw) in the base frame into joint targets.
 
-    The orientation is an increment of angles whose matrix is singular at pitch = pi/2, the usual viewing direction, so the
-    controller remembers the angles that it asked for (`viewpoint`) instead of reading them back from a matrix.
+    The orientation is an increment of angles whose matrix is singular at pitch = pi/2, the usual viewing
+    direction, so the controller remembers the angles that it asked for (`viewpoint`) instead of reading them
+    back from a matrix.
     """
 
     config: "ViewpointControllerConfig"
@@ -31,7 +33,8 @@ class ViewpointController(BaseController):
     sets_target_qvel = False
 
     viewpoint: Tensor
-    """Where the end-effector is or is heading: x, y, z [m], roll, pitch, yaw [rad], base frame. Shape (num_envs, 6), float32."""
+    """Where the end-effector is or is heading: x, y, z [m], roll, pitch, yaw [rad], base frame. Shape
+    (num_envs, 6), float32."""
     reach: Tensor
     """`Reach` of the pose asked for last. Shape (num_envs,), int64."""
     target_qpos: Tensor
@@ -117,7 +120,8 @@ class ViewpointController(BaseController):
             )
 
     def get_state(self) -> dict[str, Tensor]:
-        """The viewpoint, shape (num_envs, 6), and the reach of the last pose asked for, shape (num_envs, 1)."""
+        """The viewpoint, shape (num_envs, 6), and the reach of the last pose asked for, shape (num_envs,
+        1)."""
         return {"viewpoint": self.viewpoint.clone(), "reach": self.reach[:, None].float()}
 
     def set_state(self, state: dict[str, Tensor]) -> None:
@@ -132,7 +136,7 @@ class ViewpointController(BaseController):
 
 
 @dataclass
-class ViewpointControllerConfig(ControllerConfig):
+class ViewpointControllerConfig(ControllerConfig):  # type: ignore[misc]
     """Options of the viewpoint control mode."""
 
     stiffness: tuple[float, ...]
@@ -142,9 +146,11 @@ class ViewpointControllerConfig(ControllerConfig):
     force_limit: tuple[float, ...]
     """Largest torque of each joint, in [N m]."""
     neighbour_poses: bool = True
-    """Whether the nearest reachable pose within 5 cm and 10 degrees is taken for one that cannot be reached."""
+    """Whether the nearest reachable pose within 5 cm and 10 degrees is taken for one that cannot be
+    reached."""
     outside_workspace: Literal["home", "stay"] = "stay"
-    """An unreachable pose sends the arm to its home configuration (all joints 0), or leaves it where it is."""
+    """An unreachable pose sends the arm to its home configuration (all joints 0), or leaves it where it
+    is."""
     drive_joints: bool = True
     """Whether to hand the targets to the joint drives; a purely kinematic user sets the joints itself."""
     controller_cls = ViewpointController
