@@ -85,7 +85,7 @@ class StemConfig:
 class LeafConfig:
     """Compound, odd-pinnate leaves."""
 
-    length_range: tuple[float, float] = (0.25, 0.36)
+    length_range: tuple[float, float] = (0.26, 0.37)
     """Length of petiole and rachis of a grown leaf, without the terminal leaflet, in [m]; [yjmpc] 15-45 cm
     overall."""
     insertion_deg: float = 59.0
@@ -104,16 +104,15 @@ class LeafConfig:
     """Part of the petiole and rachis that is bare, from the stem to the first leaflets; [looks]."""
     petiole_radius: float = 0.0026
     """Radius of the petiole at the stem, in [m]; [Helios] 2-2.5 mm."""
-    leaflet_length_range: tuple[float, float] = (0.100, 0.135)
-    """Length of the terminal leaflet, in [m]; [Helios] 0.12-0.18, less for a leaf with its lobes spread;
-    [looks]."""
+    leaflet_length_range: tuple[float, float] = (0.118, 0.155)
+    """Length of the terminal leaflet, in [m]; [Helios] 0.12-0.18, [looks]."""
     lateral_scale: float = 0.82
     """Length of the largest lateral leaflets over that of the terminal one; [Helios] 0.7-0.9."""
-    leaflet_aspect: float = 0.62
+    leaflet_aspect: float = 0.68
     """Width over length of a leaflet; [Helios] 0.5-0.6; [looks]."""
     lobes_per_side: float = 3.5
     """Lobes or large teeth on each side of a leaflet; [yjmpc] lobed, uneven; [looks]."""
-    lobe_depth: float = 0.34
+    lobe_depth: float = 0.36
     """Depth of the sinuses near the leaflet's base over its half width; shallower towards the tip; [looks].
     """
     leaflet_curl_range_deg: tuple[float, float] = (25.0, 65.0)
@@ -171,9 +170,9 @@ class TrussConfig:
     """Where on the pedicel the knuckle (abscission zone) sits, from the peduncle; [looks]."""
     sepals: int = 5
     """Sepals of a calyx; five-merous flower."""
-    sepal_length: float = 0.85
+    sepal_length: float = 1.0
     """Length of a sepal over the fruit's radius; [looks]."""
-    sepal_width: float = 0.0062
+    sepal_width: float = 0.0056
     """Width of a sepal, in [m]; [looks]."""
 
     def __post_init__(self) -> None:

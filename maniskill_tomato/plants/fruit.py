@@ -94,7 +94,7 @@ def berry_patch(berry: Berry, centre: Float64, *, picture: bool) -> Patch:
         centre: Its centre, in the plant frame, in [m]. Shape (3,).
         picture: Whether to use the finer mesh.
     """
-    around, down = (48, 28) if picture else (12, 8)
+    around, down = (48, 28) if picture else (12, 7)
 
     def point(phi: Float64, theta: Float64) -> Float64:
         ring = np.sin(theta)

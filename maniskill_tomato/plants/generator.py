@@ -60,7 +60,7 @@ def _grow_leaves(config: PlantConfig, shoot: Shoot, seed: int, fruits: list[Hang
     hidden = choose_clear_directions(hiding, fruits, seed) if hiding else []
     lowest = max(shoot.truss_nodes[0] + 1 - config.leaves_kept_below_truss, 0)
     last = len(shoot.heights) - 1
-    curtains = {shoot.truss_nodes[i] + 1: target for i, target in enumerate(hidden)}
+    curtains = {shoot.truss_nodes[i] + 1: i for i in range(len(hidden))}
     density = config.leaf_density
     leaves = []
     for kind in (Stream.LEAF, Stream.SIDE_LEAF):
@@ -78,17 +78,15 @@ def _grow_leaves(config: PlantConfig, shoot: Shoot, seed: int, fruits: list[Hang
                 vigour *= 0.75
             base = _on_stem(shoot, float(shoot.heights[node]), azimuth)
             if hiding and node in curtains and not side_shoot:
-                leaf = hang_curtain(hiding, config.leaf, seed, node, base, curtains[node])
-                others = [target for target in hidden if target is not curtains[node]]
+                leaf = hang_curtain(hiding, config.leaf, seed, node, base, hidden, curtains[node])
             else:
                 rachis = draw_rachis(config.leaf, rng, base, azimuth, vigour)
                 leaf = draw_leaf(config.leaf, rng, rachis, vigour)
-                others = hidden
+                if hiding:
+                    leaf = leaf.keeping(clear_view(hiding, leaf, hidden))
             keep = [
                 side_shoot or rank < sqrt(density) for rank in rng.random(16).tolist()[: len(leaf.leaflets)]
             ]
-            if hiding:
-                keep = [a and b for a, b in zip(keep, clear_view(hiding, leaf, others), strict=True)]
             leaf = leaf.keeping(keep)
             if leaf.leaflets:
                 leaves.append(leaf)

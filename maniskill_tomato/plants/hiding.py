@@ -8,7 +8,7 @@ import numpy as np
 from maniskill_tomato.plants.config import HidingConfig, LeafConfig
 from maniskill_tomato.plants.draws import Stream, stream, uniform
 from maniskill_tomato.plants.leaf import Leaf, draw_leaf, draw_rachis, leaflet_points
-from maniskill_tomato.plants.leaflet import Leaflet, blade
+from maniskill_tomato.plants.leaflet import Leaflet, coarse_triangles
 from maniskill_tomato.plants.meshing import Float64, cross, normalized
 from maniskill_tomato.plants.truss import Hanging
 
@@ -82,8 +82,7 @@ def uncovered_share(fruit: Hanging, triangles: Float64, direction: Float64) -> f
 
 def blade_triangles(leaflets: tuple[Leaflet, ...]) -> Float64:
     """The coarse triangles of some leaflets, in [m]. Shape (T, 3, 3)."""
-    patches = [blade(leaflet, picture=False) for leaflet in leaflets if not leaflet.small]
-    return np.concatenate([patch.vertices[patch.faces] for patch in patches])
+    return np.concatenate([coarse_triangles(leaflet) for leaflet in leaflets if not leaflet.small])
 
 
 def in_corridor(points: Float64, hidden: HiddenFruit, *, share: float, half_angle_deg: float) -> bool:
@@ -104,19 +103,24 @@ def in_corridor(points: Float64, hidden: HiddenFruit, *, share: float, half_angl
 
 def clear_view(config: HidingConfig, leaf: Leaf, hidden: list[HiddenFruit]) -> list[bool]:
     """For each leaflet whether it may stay, since it blocks no fruit's clear direction."""
+    stalk = leaf.rachis.points(24)
+    if any(in_corridor(stalk, target, share=1.0, half_angle_deg=0.0) for target in hidden):
+        return [False] * len(leaf.leaflets)
     angle = config.clear_half_angle_deg
-    keep = [True] * len(leaf.leaflets)
-    for target in hidden:
-        if in_corridor(leaf.rachis.points(24), target, share=1.0, half_angle_deg=0.0):
-            return [False] * len(leaf.leaflets)
-        for i, leaflet in enumerate(leaf.leaflets):
-            if keep[i] and in_corridor(leaflet_points(leaflet), target, share=1.04, half_angle_deg=angle):
-                keep[i] = False
-    return keep
+    points = [leaflet_points(leaflet) for leaflet in leaf.leaflets]
+    return [
+        not any(in_corridor(p, target, share=1.04, half_angle_deg=angle) for target in hidden) for p in points
+    ]
 
 
 def hang_curtain(
-    config: HidingConfig, leaf_config: LeafConfig, seed: int, node: int, base: Float64, hidden: HiddenFruit
+    config: HidingConfig,
+    leaf_config: LeafConfig,
+    seed: int,
+    node: int,
+    base: Float64,
+    hidden: list[HiddenFruit],
+    which: int,
 ) -> Leaf:
     """A leaf that covers a fruit from the robot's side: the best of a few that are aimed at it.
 
@@ -126,10 +130,12 @@ def hang_curtain(
         seed: The plant's seed.
         node: Its node on the main shoot.
         base: Where the leaf leaves the stem, in [m]. Shape (3,).
-        hidden: The fruit to cover, and its clear direction.
+        hidden: All fruits that are hidden, with their clear directions.
+        which: Index of the one to cover.
     """
-    fruit = hidden.fruit
-    across = hidden.clear - np.array([hidden.clear[0], 0.0, 0.0])
+    own = hidden[which]
+    fruit = own.fruit
+    across = own.clear - np.array([own.clear[0], 0.0, 0.0])
     covered = [view_direction(*view) for view in config.covered_views_deg]
     candidates: list[tuple[float, int, Leaf]] = []
     for attempt in range(config.attempts):
@@ -140,14 +146,15 @@ def hang_curtain(
         target = fruit.centre + np.array([-gap, 0.0, 0.0]) + offset
         rachis = draw_rachis(leaf_config, rng, base, pi, 1.0)
         leaf = draw_leaf(leaf_config, rng, rachis, 1.0, target=target)
+        blocked = [
+            in_corridor(leaflet_points(x), own, share=config.curtain_clear_share, half_angle_deg=0.0)
+            for x in leaf.leaflets[1:]
+        ]
+        leaf = leaf.keeping([True] + [not b for b in blocked])
         triangles = blade_triangles(leaf.leaflets)
-        front = float(np.mean([uncovered_share(fruit, triangles, view) for view in covered]))
-        side = uncovered_share(fruit, triangles, hidden.clear)
-        score = front + 4.0 * max(0.0, config.clear_share - side)
+        score = float(np.mean([uncovered_share(fruit, triangles, view) for view in covered]))
+        for other in hidden:
+            side = uncovered_share(other.fruit, triangles, other.clear)
+            score += 4.0 * max(0.0, config.clear_share - side)
         candidates.append((round(score, 6), attempt, leaf))
-    best = min(candidates, key=lambda candidate: candidate[:2])[2]
-    blocked = [
-        in_corridor(leaflet_points(x), hidden, share=config.curtain_clear_share, half_angle_deg=0.0)
-        for x in best.leaflets
-    ]
-    return best.keeping([i == 0 or not b for i, b in enumerate(blocked)])
+    return min(candidates, key=lambda candidate: candidate[:2])[2]

@@ -8,7 +8,7 @@ from numpy.random import Generator
 
 from maniskill_tomato.plants.config import LeafConfig
 from maniskill_tomato.plants.draws import normal, uniform
-from maniskill_tomato.plants.leaflet import Leaflet, blade, both_sides
+from maniskill_tomato.plants.leaflet import Leaflet, both_sides, coarse_triangles
 from maniskill_tomato.plants.meshing import Float64, Patch, cross, hanging_curve, join, normalized, tube
 from maniskill_tomato.plants.organs import MeshPart
 
@@ -162,7 +162,7 @@ def draw_leaf(
                 up=up,
                 length=length,
                 width=length * config.leaflet_aspect * normal(rng, 1.0, 0.09) * (1.1 if small else 1.0),
-                lobes=config.lobes_per_side - (0.5 if length < 0.075 else 0.0),
+                lobes=config.lobes_per_side - (0.5 if side else 0.0),
                 depth=0.0 if small else config.lobe_depth * normal(rng, 1.0, 0.2),
                 curl=radians(uniform(rng, config.leaflet_curl_range_deg)),
                 fold=config.fold * normal(rng, 1.0, 0.3),
@@ -201,18 +201,20 @@ def draw_leaf(
 
 def leaflet_points(leaflet: Leaflet) -> Float64:
     """Points spread over a leaflet's blade, the same for every level of detail. Shape (N, 3)."""
-    patch = blade(leaflet, picture=False)
-    middles = patch.vertices[patch.faces].mean(1)
-    return np.concatenate([patch.vertices, middles])
+    triangles = coarse_triangles(leaflet)
+    return np.concatenate([triangles.reshape(-1, 3), triangles.mean(1)])
 
 
 def leaf_parts(leaf: Leaf, *, picture: bool) -> tuple[MeshPart, ...]:
     """The triangles of a leaf: upper sides, lower sides, stalks."""
-    count = 24 if picture else 9
+    count = 24 if picture else 8
     part = np.linspace(0.0, 1.0, count)
     radii = leaf.radius * (1.0 - 0.62 * part + 0.5 * np.exp(-part / 0.03))
     stalks: list[Patch] = [tube(leaf.rachis.points(count), radii, 8 if picture else 4, texture_length=0.12)]
     for (start, end), leaflet in zip(leaf.stalks, leaf.leaflets, strict=True):
+        if leaflet.small and not picture:
+            # These sit on the rachis; their stalks are too short to show.
+            continue
         thin = leaf.radius * (0.28 if leaflet.small else 0.42)
         points = np.stack([start, 0.5 * (start + end), end]) if picture else np.stack([start, end])
         stalks.append(tube(points, np.linspace(thin, 0.55 * thin, len(points)), 6 if picture else 3))

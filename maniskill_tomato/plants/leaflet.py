@@ -5,7 +5,7 @@ from math import pi
 
 import numpy as np
 
-from maniskill_tomato.plants.meshing import Float64, Patch, cross, flipped, normalized
+from maniskill_tomato.plants.meshing import Float64, Int64, Patch, cross, flipped, grid_faces, normalized
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,14 +48,16 @@ class Leaflet:
 
 def _half_width(leaflet: Leaflet, t: Float64, side: Float64, *, serrate: bool) -> Float64:
     """Half width along the midrib on one side (+1 left, -1 right), in [m]."""
-    envelope = np.sin(pi * np.clip(t, 0.0, 1.0) ** 0.68) ** 0.82 * (1.0 - 0.18 * t)
+    # Ovate, broadest at 0.28 of its length, drawn out into a point.
+    t = np.clip(t, 0.0, 1.0)
+    envelope = 2.585 * t**0.45 * (1.0 - t) ** 1.15
     lobe_phase = 2 * pi * leaflet.lobes * t**0.9 + np.where(side > 0, leaflet.phases[0], leaflet.phases[1])
-    # A raised cosine to a low power: round lobes and narrow sinuses.
-    sinus = (0.5 + 0.5 * np.cos(lobe_phase)) ** 1.6
+    # A raised cosine to a power: round lobes and narrow sinuses.
+    sinus = (0.5 + 0.5 * np.cos(lobe_phase)) ** 1.7
     depth = leaflet.depth * (1.0 - 0.75 * t)
     outline = envelope * (1.0 - depth * sinus)
     if serrate:
-        outline = outline * (1.0 + 0.030 * np.sin(5.0 * lobe_phase + 1.0) * np.sin(pi * np.clip(t, 0, 1)))
+        outline = outline * (1.0 + 0.016 * np.sin(4.0 * lobe_phase + 1.0) * np.sin(pi * t))
     return np.asarray(0.5 * leaflet.width * (1.0 + side * leaflet.asymmetry) * outline)
 
 
@@ -107,35 +109,48 @@ def _rows(leaflet: Leaflet, *, picture: bool) -> Float64:
     return np.concatenate([[0.0], inner, [1.0]])
 
 
-def blade(leaflet: Leaflet, *, picture: bool) -> Patch:
-    """The upper side of a leaflet's blade."""
+def _cuts(leaflet: Leaflet, *, picture: bool) -> tuple[Float64, Float64, Int64]:
+    """Blade parameters t and s of the mesh's vertices, and its triangles. Shapes (V,), (V,), (F, 3)."""
     rows = _rows(leaflet, picture=picture)
     half_columns = 1 if not picture else (2 if leaflet.small else 4)
     columns = np.linspace(-1.0, 1.0, 2 * half_columns + 1)
     t = np.concatenate([[0.0], np.repeat(rows[1:-1], len(columns)), [1.0]])
     s = np.concatenate([[0.0], np.tile(columns, len(rows) - 2), [0.0]])
-    step = 1e-3
+    width = len(columns)
+    last = 1 + (len(rows) - 3) * width
+    fan = np.arange(width - 1)
+    faces = [
+        np.stack([np.zeros(width - 1, np.int64), 1 + fan, 2 + fan], 1),
+        1 + grid_faces(len(rows) - 2, width)[:, ::-1],
+        np.stack([last + fan, np.full(width - 1, len(t) - 1), last + fan + 1], 1),
+    ]
+    return t, s, np.concatenate(faces).astype(np.int64)
+
+
+def coarse_triangles(leaflet: Leaflet) -> Float64:
+    """Corners of the blade's triangles at training detail, in [m]; no normals, so fast. Shape (F, 3, 3)."""
+    t, s, faces = _cuts(leaflet, picture=False)
+    return np.asarray(_surface(leaflet, t, s, serrate=False)[faces])
+
+
+def blade(leaflet: Leaflet, *, picture: bool) -> Patch:
+    """The upper side of a leaflet's blade."""
+    t, s, faces = _cuts(leaflet, picture=picture)
     vertices = _surface(leaflet, t, s, serrate=picture)
     # Normals of the smooth blade: taken a little inside the margin, and to the side on which the point lies.
-    ti = np.clip(t, 0.04, 0.96)
-    si = np.where(s == 0, 0.0, 0.85 * s)
-    at_midrib = s == 0
-    du = _surface(leaflet, ti + step, si, serrate=False) - _surface(leaflet, ti - step, si, serrate=False)
-    dv = _surface(leaflet, ti, si + step, serrate=False) - _surface(leaflet, ti, si - step, serrate=False)
-    dv = np.where(at_midrib[:, None], cross(leaflet.up, leaflet.direction), dv)
-    normals = normalized(cross(du, dv))
+    step = 1e-3
+    ti, si = np.clip(t, 0.04, 0.96), 0.85 * s
+    around = _surface(
+        leaflet,
+        np.concatenate([ti + step, ti - step, ti, ti]),
+        np.concatenate([si, si, si + step, si - step]),
+        serrate=False,
+    )
+    ahead, behind, left, right = np.split(around, 4)
+    across = np.where((s == 0)[:, None], cross(leaflet.up, leaflet.direction), left - right)
+    normals = normalized(cross(ahead - behind, across))
     uvs = np.stack([0.02 + 0.96 * t, 0.5 + 0.48 * s], 1)
-
-    width = len(columns)
-    first, last = 1, 1 + (len(rows) - 3) * width
-    fan = np.arange(width - 1)
-    faces = [np.stack([np.zeros(width - 1, np.int64), first + fan, first + fan + 1], 1)]
-    for row in range(len(rows) - 3):
-        a = first + row * width + fan
-        faces.append(np.stack([a, a + width, a + width + 1], 1))
-        faces.append(np.stack([a, a + width + 1, a + 1], 1))
-    faces.append(np.stack([last + fan, np.full(width - 1, len(t) - 1), last + fan + 1], 1))
-    return Patch(vertices, normals, uvs, np.concatenate(faces).astype(np.int64))
+    return Patch(vertices, normals, uvs, faces)
 
 
 def both_sides(leaflet: Leaflet, *, picture: bool) -> tuple[Patch, Patch]:

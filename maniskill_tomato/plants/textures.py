@@ -66,11 +66,11 @@ def leaf_texture(variant: int, *, upper: bool, size: int = 256) -> UInt8:
     t, s = np.meshgrid((np.arange(size) + 0.5) / size, 2 * (np.arange(size) + 0.5) / size - 1)
     main, net = _veins(t, s, 3.5)
     patches, speckle = cloud(rng, size, size, 3), cloud(rng, size, size, 24, octaves=2)
-    hues: list[Colour] = [(58, 104, 46), (66, 116, 50), (50, 97, 47), (76, 122, 50)]
+    hues: list[Colour] = [(62, 112, 44), (70, 124, 50), (54, 102, 46), (82, 132, 52)]
     base = np.ones((size, size, 3)) * np.array(hues[variant % len(hues)])
     if not upper:
-        base = 0.45 * base + 0.55 * np.array([146, 168, 120])
-    light: Colour = (128, 164, 84) if upper else (178, 194, 140)
+        base = 0.45 * base + 0.55 * np.array([140, 178, 102])
+    light: Colour = (124, 164, 82) if upper else (176, 200, 136)
     base = base * (1 + 0.13 * patches + 0.07 * speckle)[..., None]
     base = base * (1 - (0.11 if upper else 0.05) * net)[..., None]
     # The blade darkens beside the veins, where it dips, and is fresher between them.
