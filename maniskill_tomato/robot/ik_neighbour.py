@@ -1,6 +1,7 @@
 # mypy: ignore-errors
-# pyright: reportArgumentType=false, reportCallIssue=false, reportIndexIssue=false, reportInvalidTypeForm=false
-# pyright: reportOperatorIssue=false, reportReturnType=false, reportAttributeAccessIssue=false
+# pyright: reportArgumentType=false, reportAttributeAccessIssue=false, reportCallIssue=false
+# pyright: reportGeneralTypeIssues=false, reportIndexIssue=false, reportInvalidTypeForm=false
+# pyright: reportOperatorIssue=false, reportReturnType=false
 # The type checkers are silent here: Warp's stubs describe calls from outside, not the inside of a kernel.
 """The nearest reachable pose to one that is not: least squares in joint space, where the limits are a box.
 
@@ -37,7 +38,9 @@ mat77d = wp.types.matrix(shape=(7, 7), dtype=wp.float64)
 ARM_ANGLES = wp.constant(24)
 ARM_ANGLE_STEP = wp.constant(wp.float64(math.tau / 24.0))
 ITERATIONS = wp.constant(20)
-ROUNDS = wp.constant(6)
+BOX_ITERATIONS = wp.constant(60)
+JUST_INSIDE = wp.constant(wp.float64(0.999))
+HOPELESS = wp.constant(wp.float64(2.5))
 
 
 @wp.struct
@@ -138,27 +141,60 @@ def solved(matrix: mat77d, right: vec7d) -> vec7d:
 
 
 @wp.func
+def beyond(vector: wp.vec3d, radius: wp.float64) -> wp.vec3d:
+    """The part of a vector that lies outside a ball about the origin."""
+    length = wp.length(vector)
+    part = vector
+    if radius > ZERO:
+        part = vector * (wp.max(length - radius, ZERO) / wp.max(length, radius))
+    return part
+
+
+@wp.func
+def curvature(part: wp.vec3d, radius: wp.float64) -> wp.mat33d:
+    """A square root of the Hessian of |beyond(v, radius)|^2 / 2, from that part of the vector v."""
+    length = wp.length(part)
+    root = wp.identity(n=3, dtype=wp.float64)
+    if radius > ZERO:
+        root = wp.mat33d()
+        if length > ZERO:
+            along = part / length
+            across = wp.sqrt(length / (length + radius))
+            root = across * wp.identity(n=3, dtype=wp.float64) + (ONE - across) * wp.outer(along, along)
+    return root
+
+
+@wp.func
 def descended(
-    q: vec7d, position: wp.vec3d, rotation: wp.mat33d, scale_p: wp.float64, scale_r: wp.float64
+    q: vec7d, position: wp.vec3d, rotation: wp.mat33d, allowed: Allowed, radius: wp.float64, iterations: int
 ) -> vec7d:
-    """A local minimum within the joint limits of (scale_p |dp|)^2 + (scale_r angle)^2."""
+    """Joint angles within their limits that locally minimise how far the two ratios exceed a radius.
+
+    The cost is max(|dp| / a - radius, 0)^2 + max(angle / b - radius, 0)^2: D^2 for radius 0.
+    """
+    scale_p = ONE / allowed.distance
+    scale_r = ONE / allowed.angle
     hand = hand_of(q)
-    error_p = scale_p * (position - hand.position)
-    error_r = scale_r * rotation_vector(rotation * wp.transpose(hand.rotation))
+    error_p = beyond(scale_p * (position - hand.position), radius)
+    error_r = beyond(scale_r * rotation_vector(rotation * wp.transpose(hand.rotation)), radius)
     cost = wp.length_sq(error_p) + wp.length_sq(error_r)
     damping = wp.float64(1.0e-2)
-    running = wp.bool(True)
-    for _ in range(ITERATIONS):
+    running = cost > ZERO
+    for _ in range(iterations):
         if running:
             jacobian_p = mat73d()
             jacobian_r = mat73d()
             gradient = vec7d()
             free = vec7d()
+            root_p = curvature(error_p, radius)
+            root_r = curvature(error_r, radius)
             for j in range(7):
                 arm = hand.position - hand.origins[j]
                 jacobian_p[j] = scale_p * wp.cross(hand.axes[j], arm)
                 jacobian_r[j] = scale_r * hand.axes[j]
                 gradient[j] = wp.dot(jacobian_p[j], error_p) + wp.dot(jacobian_r[j], error_r)
+                jacobian_p[j] = root_p * jacobian_p[j]
+                jacobian_r[j] = root_r * jacobian_r[j]
                 free[j] = ONE
                 if (q[j] >= LIMITS[j] and gradient[j] > ZERO) or (q[j] <= -LIMITS[j] and gradient[j] < ZERO):
                     free[j] = ZERO
@@ -172,11 +208,11 @@ def descended(
             for j in range(7):
                 moved[j] = wp.clamp(moved[j], -LIMITS[j], LIMITS[j])
             hand_moved = hand_of(moved)
-            moved_p = scale_p * (position - hand_moved.position)
-            moved_r = scale_r * rotation_vector(rotation * wp.transpose(hand_moved.rotation))
+            moved_p = beyond(scale_p * (position - hand_moved.position), radius)
+            moved_r = beyond(scale_r * rotation_vector(rotation * wp.transpose(hand_moved.rotation)), radius)
             cost_moved = wp.length_sq(moved_p) + wp.length_sq(moved_r)
             if cost_moved < cost:
-                running = cost - cost_moved > wp.float64(1.0e-12) * cost
+                running = cost - cost_moved > wp.float64(1.0e-9) * cost
                 q = moved
                 hand = hand_moved
                 error_p = moved_p
@@ -225,23 +261,14 @@ def nearest_neighbour(
     best = Neighbour()
     best.distance = wp.float64(1.0e30)
     for configuration in range(8):
-        q = least_violating(circle, configuration, q_ref)
-        weight = wp.float64(1.0)
-        searching = wp.bool(True)
-        for _ in range(ROUNDS):
-            if searching:
-                q = descended(
-                    q, position, rotation, weight / allowed.distance, ONE / (weight * allowed.angle)
-                )
-                ratios = pose_ratios(hand_of(q), position, rotation, allowed)
-                largest = wp.max(ratios[0], ratios[1])
-                if largest < ONE - wp.float64(1.0e-9):
-                    searching = wp.bool(False)
-                    if wp.length(ratios) < best.distance:
-                        best.distance = wp.length(ratios)
-                        best.q = q
-                elif weight == ONE and wp.length(ratios) > wp.float64(1.4143):
-                    searching = wp.bool(False)
-                else:
-                    weight *= wp.sqrt((ratios[0] + wp.float64(0.05)) / (ratios[1] + wp.float64(0.05)))
+        q = descended(
+            least_violating(circle, configuration, q_ref), position, rotation, allowed, ZERO, ITERATIONS
+        )
+        ratios = pose_ratios(hand_of(q), position, rotation, allowed)
+        if wp.max(ratios[0], ratios[1]) > ONE and wp.length(ratios) < HOPELESS:
+            q = descended(q, position, rotation, allowed, JUST_INSIDE, BOX_ITERATIONS)
+            ratios = pose_ratios(hand_of(q), position, rotation, allowed)
+        if wp.max(ratios[0], ratios[1]) <= ONE and wp.length(ratios) < best.distance:
+            best.distance = wp.length(ratios)
+            best.q = q
     return best

@@ -1,6 +1,7 @@
 # mypy: ignore-errors
-# pyright: reportArgumentType=false, reportCallIssue=false, reportIndexIssue=false, reportInvalidTypeForm=false
-# pyright: reportOperatorIssue=false, reportReturnType=false, reportAttributeAccessIssue=false
+# pyright: reportArgumentType=false, reportAttributeAccessIssue=false, reportCallIssue=false
+# pyright: reportGeneralTypeIssues=false, reportIndexIssue=false, reportInvalidTypeForm=false
+# pyright: reportOperatorIssue=false, reportReturnType=false
 # The type checkers are silent here: Warp's stubs describe calls from outside, not the inside of a kernel.
 """The best arm angle: exact feasible intervals of the elbow circle, then the cheapest point in them.
 
