@@ -1,10 +1,9 @@
 """The iiwa 14 with a D435 on its flange, as ManiSkill agents."""
 
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 import sapien
 import torch
 from mani_skill.agents.base_agent import BaseAgent, Keyframe
@@ -50,12 +49,12 @@ REST_QPOS = np.deg2rad([0.0, -30.0, 0.0, -115.0, 0.0, 95.0, 0.0])
 class D435CameraConfig(CameraConfig):  # type: ignore[misc]
     """A ManiSkill camera whose intrinsics follow from the D435's stream and the size asked for.
 
-    `gym.make(..., sensor_configs=dict(width=640, height=480))` changes the size and this class the focal length
-    with it; `sensor_configs=dict(d435=dict(calibration="measured"))` takes a real device's numbers. An `intrinsic` or
-    another `fov` given there wins.
+    `gym.make(..., sensor_configs=dict(width=640, height=480))` changes the size and this class the focal
+    length with it; `sensor_configs=dict(d435=dict(calibration="measured"))` takes a real device's numbers. An
+    `intrinsic` or another `fov` given there wins.
     """
 
-    fov: float | None = None
+    fov: Any = None
     """Vertical field of view, in [rad]; filled in where neither this nor `intrinsic` is given."""
     stream: d435.Stream = "color"
     """Which of the D435's pictures this is."""
@@ -63,27 +62,22 @@ class D435CameraConfig(CameraConfig):  # type: ignore[misc]
     """The data sheet's numbers, or those of one real device (colour only)."""
     derived_fov: float | None = None
     """The `fov` that this class filled in; not for users."""
-    derived_intrinsic: npt.NDArray[np.float64] | None = None
+    derived_intrinsic: Any = None
     """The `intrinsic` that this class filled in; not for users."""
 
     def __post_init__(self) -> None:
         """Fills in the intrinsics; ManiSkill calls this again after it has applied the user's changes."""
-        if self.fov is not None and self.fov == self.derived_fov:
-            self.fov = None
-        if self.intrinsic is not None and self.intrinsic is self.derived_intrinsic:
-            self.intrinsic = None
-        if self.intrinsic is not None:
-            self.fov = None
-        elif self.fov is None:
+        fov: Any = None if self.fov == self.derived_fov else self.fov
+        intrinsic: Any = None if self.intrinsic is self.derived_intrinsic else self.intrinsic
+        if intrinsic is None and fov is None:
             intrinsics = self._stream_intrinsics()
-            if (
-                intrinsics.fx == intrinsics.fy
-                and intrinsics.cx == self.width / 2
-                and intrinsics.cy == self.height / 2
-            ):
-                self.fov = self.derived_fov = intrinsics.fov_y
+            if intrinsics.symmetric:
+                fov = self.derived_fov = intrinsics.fov_y
             else:
-                self.intrinsic = self.derived_intrinsic = intrinsics.matrix
+                intrinsic = self.derived_intrinsic = intrinsics.matrix
+        # ManiSkill takes one or the other, and does not say that they exclude each other.
+        self.intrinsic: Any = intrinsic
+        self.fov = fov if intrinsic is None else None
         super().__post_init__()
 
     def _stream_intrinsics(self) -> d435.CameraIntrinsics:
@@ -91,8 +85,8 @@ class D435CameraConfig(CameraConfig):  # type: ignore[misc]
             return d435.color_intrinsics(self.width, self.height, self.calibration)
         if self.calibration != "nominal":
             raise InvalidInputError(
-                f"calibration {self.calibration!r} is known for the colour stream only; leave it 'nominal' for depth, "
-                "or give `intrinsic`"
+                f"calibration {self.calibration!r} is known for the colour stream only; leave it "
+                "'nominal' for depth, or give `intrinsic`"
             )
         return d435.depth_intrinsics(self.width, self.height)
 
@@ -112,19 +106,20 @@ class EEDeltaPoseController(PDEEPoseController):  # type: ignore[misc]
 class Iiwa14D435(BaseAgent):  # type: ignore[misc]
     """KUKA LBR iiwa 14 R820 with a RealSense D435 on its flange.
 
-    Sensor `d435`: the colour camera with depth aligned to it, as the SDK's align gives it. Its default of 160 x 120 px
-    suits learning; the real camera's usual mode of 640 x 480 has the same field of view. All sizes up to 16:9 keep the vertical field of view of
-    42.5 degrees.
+    Its sensor `d435` is the colour camera with depth aligned to it, as the SDK's align gives it. The default
+    of 160 x 120 px suits learning; the real camera's usual mode of 640 x 480 has the same field of view.
+    Every size up to 16:9, square ones too, keeps the vertical field of view of 42.5 degrees.
     """
 
     CONTROL_MODES = ("pd_viewpoint", "pd_joint_pos", "pd_joint_delta_pos", "pd_ee_delta_pose", "pd_ee_pose")
+    """The control modes; the first is the default."""
 
     uid = "iiwa14_d435"
     fix_root_link = True
     disable_self_collisions = False
     ee_link_name = iiwa14.EE_LINK_NAME
 
-    keyframes: ClassVar[dict[str, Any]] = {
+    keyframes: dict[str, Any] = {
         "home": Keyframe(qpos=np.array(iiwa14.HOME_QPOS), pose=sapien.Pose()),
         "ready": Keyframe(qpos=READY_QPOS, pose=sapien.Pose()),
         "rest": Keyframe(qpos=REST_QPOS, pose=sapien.Pose()),
@@ -142,13 +137,13 @@ class Iiwa14D435(BaseAgent):  # type: ignore[misc]
 
     @property
     def _controller_configs(self) -> dict[str, Any]:
-        drives = dict(
+        drives: dict[str, Any] = dict(
             stiffness=STIFFNESS,
             damping=DAMPING,
             force_limit=tuple(iiwa14.TORQUE_LIMITS),
         )
         joints = list(iiwa14.JOINT_NAMES)
-        end_effector = dict(**drives, ee_link=iiwa14.EE_LINK_NAME, urdf_path=self.urdf_path)
+        end_effector: dict[str, Any] = dict(**drives, ee_link=iiwa14.EE_LINK_NAME, urdf_path=self.urdf_path)
         delta_pose = PDEEPoseControllerConfig(
             joints,
             -POSITION_STEP,
@@ -177,13 +172,14 @@ class Iiwa14D435(BaseAgent):  # type: ignore[misc]
         }
 
     @property
-    def _sensor_configs(self) -> list[D435CameraConfig]:
+    def _sensor_configs(self) -> list[Any]:
         return [self._camera("d435", "color", urdf.COLOR_FRAME_NAME)]
 
     def _camera(self, uid: str, stream: d435.Stream, frame: str) -> D435CameraConfig:
+        pose: Any = sapien.Pose()
         return D435CameraConfig(
             uid=uid,
-            pose=sapien.Pose(),
+            pose=pose,
             width=160,
             height=120,
             near=d435.CAMERA_NEAR,
@@ -197,12 +193,12 @@ class Iiwa14D435(BaseAgent):  # type: ignore[misc]
 class Iiwa14D435RawDepth(Iiwa14D435):
     """The same robot whose depth comes from where the D435 measures it.
 
-    Sensors: `d435` as before, and `d435_depth` in the left infrared imager, 15 mm to the right of the colour camera, with
-    the depth stream's wider field of view.
+    Its sensors are `d435` as before, and `d435_depth` in the left infrared imager, 15 mm to the right of the
+    colour camera, with the depth stream's wider field of view.
     """
 
     uid = "iiwa14_d435_raw_depth"
 
     @property
-    def _sensor_configs(self) -> list[D435CameraConfig]:
+    def _sensor_configs(self) -> list[Any]:
         return [*super()._sensor_configs, self._camera("d435_depth", "depth", urdf.DEPTH_FRAME_NAME)]

@@ -1,9 +1,9 @@
 """The Intel RealSense D435: intrinsics of its streams, limits of its depth, where it sits on the flange.
 
-Image coordinates are continuous: (0, 0) is the top-left corner of the first pixel, which covers [0, 1) in both
-directions, as in SAPIEN. RealSense's SDK counts from the centre of that pixel (`from_realsense` converts).
-Camera frames are x forward, y left, z up (`camera_*_frame`, the frame of a SAPIEN camera); optical frames are
-z forward, x right, y down (`camera_*_optical_frame`). `T_a_b` maps points in b to a.
+Image coordinates are continuous: (0, 0) is the top-left corner of the first pixel, which covers [0, 1) in
+both directions, as in SAPIEN. RealSense's SDK counts from the centre of that pixel (`from_realsense`
+converts). Camera frames are x forward, y left, z up (`camera_*_frame`, the frame of a SAPIEN camera); optical
+frames are z forward, x right, y down (`camera_*_optical_frame`). `T_a_b` maps points in b to a.
 """
 
 import math
@@ -81,8 +81,13 @@ class CameraIntrinsics:
         """Vertical field of view between the image's edges, in [rad]."""
         return math.atan(self.cy / self.fy) + math.atan((self.height - self.cy) / self.fy)
 
+    @property
+    def symmetric(self) -> bool:
+        """Whether pixels are square and the principal point is the image's middle, so that a field of view says all."""
+        return self.fx == self.fy and self.cx == self.width / 2 and self.cy == self.height / 2
+
     def scaled(self, width: int, height: int) -> "CameraIntrinsics":
-        """The intrinsics of the same picture resized to `width` x `height` [px], each axis by its own factor."""
+        """The intrinsics of the picture resized to `width` x `height` [px], each axis by its own factor."""
         sx, sy = width / self.width, height / self.height
         return CameraIntrinsics(
             width=width, height=height, fx=self.fx * sx, fy=self.fy * sy, cx=self.cx * sx, cy=self.cy * sy
@@ -122,7 +127,8 @@ class CameraIntrinsics:
         """Viewing directions of image coordinates, in the optical frame and with z = 1.
 
         Args:
-            pixels: Columns u and rows v, in [px]; the centre of pixel (i, j) is (i + 0.5, j + 0.5). Shape (..., 2).
+            pixels: Columns u and rows v, in [px]; pixel (i, j) has its centre at (i + 0.5, j + 0.5). Shape
+                (..., 2).
 
         Returns:
             Directions; multiplied by a depth in [m] they give the point. Shape (..., 3).
@@ -130,21 +136,17 @@ class CameraIntrinsics:
         uv = np.asarray(pixels, dtype=np.float64)
         x = (uv[..., 0] - self.cx) / self.fx
         y = (uv[..., 1] - self.cy) / self.fy
-        return np.stack([x, y, np.ones_like(x)], axis=-1)
+        return np.asarray(np.stack([x, y, np.ones_like(x)], axis=-1))
 
     def pixel_centres(self) -> FloatArray:
         """Image coordinates of every pixel's centre, row by row, in [px]. Shape (height, width, 2)."""
         u, v = np.meshgrid(np.arange(self.width) + 0.5, np.arange(self.height) + 0.5)
-        return np.stack([u, v], axis=-1)
+        return np.asarray(np.stack([u, v], axis=-1), dtype=np.float64)
 
 
 COLOR_FOV_Y: Final = math.radians(42.5)
 """Vertical field of view of the colour imager in its full 16:9 modes and all narrower ones, in [rad] (data
 sheet: 69.4 x 42.5 degrees; one real device measures 42.9)."""
-
-DEPTH_FOV_X: Final = math.radians(90.0)
-"""Horizontal field of view of the whole 1280 x 800 depth imager, in [rad]. The data sheet says 87 +- 3 degrees;
-devices report 89.6 to 90.0 degrees at 848 x 480 and 1280 x 720."""
 
 COLOR_IMAGER: Final = CameraIntrinsics.from_fov(width=1920, height=1080, fov_y=COLOR_FOV_Y)
 """The whole colour imager with the data sheet's field of view and square pixels."""
@@ -162,16 +164,17 @@ MEASURED_COLOR_IMAGER: Final = CameraIntrinsics(
     cx=960.0 + (MEASURED_COLOR_640X480.cx - 320.0) * 2.25,
     cy=540.0 + (MEASURED_COLOR_640X480.cy - 240.0) * 2.25,
 )
-"""The imager of that device, of which 640 x 480 is the centre, reduced 2.25 times (it reports fx = 918.6 px at
-1280 x 720, as this gives)."""
+"""The imager of that device, of which 640 x 480 is the centre, reduced 2.25 times (it reports fx = 918.6 px
+at 1280 x 720, as this gives)."""
 
 DEPTH_IMAGER: Final = CameraIntrinsics(width=1280, height=800, fx=640.0, fy=640.0, cx=640.0, cy=400.0)
-"""The whole depth imager. Its crops give the focal lengths that devices report: 640 px at 1280 x 720 (reported 638 to
-645), 424 px at 848 x 480 (422.8 to 427.3), 384 px at 640 x 480 (382.9 to 384.2)."""
+"""The whole depth imager, 90 degrees wide (data sheet: 87 +- 3, devices report 89.6 to 90.0). Its crops give
+the focal lengths that devices report: 640 px at 1280 x 720 (reported 638 to 645), 424 px at 848 x 480 (422.8
+to 427.3), 384 px at 640 x 480 (382.9 to 384.2)."""
 
 CAMERA_NEAR: Final = 0.01
-"""Near plane of the simulated cameras, in [m]: just outside the front glass, so that a camera does not see its own
-housing. Rays that start at the optical centre must skip this stretch as well."""
+"""Near plane of the simulated cameras, in [m]: just outside the front glass, so that a camera does not see
+its own housing. Rays that start at the optical centre must skip this stretch as well."""
 
 CAMERA_FAR: Final = 20.0
 """Far plane of the simulated cameras, in [m]; ManiSkill's depth is int16 millimetres, which end at 32.8 m."""
@@ -191,8 +194,8 @@ def color_intrinsics(
 ) -> CameraIntrinsics:
     """The colour stream at `width` x `height` [px].
 
-    Pictures of 16:9 and narrower share the vertical field of view (42.5 degrees nominal, 42.9 measured); wider ones
-    lose rows instead of columns.
+    Pictures of 16:9 and narrower share the vertical field of view (42.5 degrees nominal, 42.9 measured);
+    wider ones lose rows instead of columns.
 
     Raises:
         InvalidInputError: Unknown calibration, or a size below 1 pixel.
@@ -206,7 +209,8 @@ def color_intrinsics(
 def depth_intrinsics(width: int = 848, height: int = 480) -> CameraIntrinsics:
     """The depth stream at `width` x `height` [px], seen from the left infrared imager.
 
-    Pictures wider than 16:10 share the horizontal field of view (90 degrees), narrower ones the vertical one (64 degrees).
+    Pictures wider than 16:10 share the horizontal field of view (90 degrees), narrower ones the vertical one
+    (64 degrees).
     """
     return DEPTH_IMAGER.cropped(width, height)
 
@@ -247,15 +251,15 @@ BODY_MASS: Final = 0.072
 """Mass of the camera, in [kg]."""
 
 GLASS_X: Final = 0.0042
-"""The front glass in the frame of `camera_link`: this far in front of the imagers' centres of projection, in [m]."""
+"""Distance of the front glass from the imagers' centres of projection, along x of `camera_link`, in [m]."""
 
 BODY_CENTER: Final = (GLASS_X - BODY_SIZE[0] / 2, -0.0175, 0.0)
-"""Centre of the housing in the frame of `camera_link`, in [m]. RealSense's own URDF centres its collision box on the
-imagers (x = 0), which would put its face 8 mm in front of the glass."""
+"""Centre of the housing in the frame of `camera_link`, in [m]. RealSense's own URDF centres its collision box
+on the imagers (x = 0), which would put its face 8 mm in front of the glass."""
 
 GLASS_TO_FLANGE: Final = 0.050
-"""Distance of the front glass from the flange face along the flange's z axis, in [m]; the printed bracket fills the
-24.95 mm between the flange and the housing's back."""
+"""Distance of the front glass from the flange face along the flange's z axis, in [m]; the printed bracket
+fills the 24.95 mm between the flange and the housing's back."""
 
 R_FLANGE_CAMERA: Final = np.array([[0.0, 0.0, -1.0], [0.0, 1.0, 0.0], [1.0, 0.0, 0.0]])
 """Camera axes in the flange frame: forward is the flange's z, left its y, up its -x."""
@@ -283,9 +287,8 @@ T_frame_optical: Final = _transform((0.0, 0.0, 0.0), R_CAMERA_OPTICAL)
 
 
 def _product(*transforms: FloatArray) -> FloatArray:
-    result = np.linalg.multi_dot(transforms)
-    result.setflags(write=False)
-    return result
+    product = np.linalg.multi_dot(transforms)
+    return _transform(tuple(product[:3, 3]), product[:3, :3])
 
 
 T_flange_camera_depth: Final = _product(T_flange_camera, T_camera_infra1)

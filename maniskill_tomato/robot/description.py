@@ -3,7 +3,7 @@
 import logging
 from functools import lru_cache
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 import numpy.typing as npt
@@ -34,7 +34,7 @@ def urdf_path() -> str:
 def _load(name: str) -> LinkMesh:
     import trimesh
 
-    scene = trimesh.load(asset_path(f"iiwa14/meshes/{name}.glb"), force="scene")
+    scene: Any = trimesh.load_scene(asset_path(f"iiwa14/meshes/{name}.glb"), process=False)
     vertices: list[npt.NDArray[np.float64]] = []
     faces: list[npt.NDArray[np.int64]] = []
     count = 0
@@ -65,8 +65,9 @@ def link_meshes() -> dict[str, LinkMesh]:
     """Every triangle that one sees of the robot, from the files that SAPIEN renders.
 
     Returns:
-        For each of `iiwa14.LINK_NAMES`: vertices in the link frame, in [m], float32, shape (V, 3); and faces, int32, shape
-        (F, 3), counter-clockwise from outside. `link_ee` holds the camera bracket and the D435's housing.
+        For each of `iiwa14.LINK_NAMES`: vertices in the link frame, in [m], float32, shape (V, 3); and faces,
+        int32, shape (F, 3), counter-clockwise from outside. `link_ee` holds the camera bracket and the D435's
+        housing.
 
     Raises:
         FileNotFoundError: The package was installed without its assets.

@@ -5,8 +5,6 @@ import struct
 from collections.abc import Sequence
 from typing import Any
 
-import numpy as np
-
 from maniskill_tomato.robot.meshes import MATERIALS, Part
 
 _ARRAY_BUFFER, _ELEMENT_BUFFER = 34962, 34963

@@ -1,8 +1,8 @@
 """The shapes one sees of the arm and its camera, modelled from scratch in the look of the real ones.
 
-Each shell of the arm joins two joints, one about z and one about y, so it is a tube that swells into the housing of the
-joint beside it. Lengths are in [m]; the shells are modelled where they stand in the home configuration, with the origin
-in the centre of the joint they swell around.
+Each shell of the arm joins two joints, one about z and one about y, so it is a tube that swells into the
+housing of the joint beside it. Lengths are in [m]; the shells are modelled where they stand in the home
+configuration, with the origin in the centre of the joint they swell around.
 """
 
 from collections.abc import Callable, Sequence
@@ -142,7 +142,9 @@ def _base() -> list[Part]:
     ]
 
 
-def _bent(*, seam_height: float, seam_radius: float, face: float, reach: float, radius: float) -> solids.Solid:
+def _bent(
+    *, seam_height: float, seam_radius: float, face: float, reach: float, radius: float
+) -> solids.Solid:
     """The shell between a seam about z and a seam about y, where the two axes meet in the origin.
 
     Args:
@@ -166,14 +168,16 @@ def _bent(*, seam_height: float, seam_radius: float, face: float, reach: float, 
     )
     dome = solids.ellipsoid([0.0, reach - side * 0.050, 0.0], [0.90 * radius, 0.050, 0.90 * radius])
     body = solids.blend(tube, solids.blend(drum, dome, radius=0.02), radius=0.05)
-    notch = solids.cylinder([0.0, face + side * SEAM, 0.0], [0.0, face - side * 0.4, 0.0], radius + 0.020)
+    # The neighbour swings here; the wrist's is short and wide, so it needs more room.
+    clearance = 0.020 if abs(face) < 0.05 else 0.032
+    notch = solids.cylinder([0.0, face + side * SEAM, 0.0], [0.0, face - side * 0.4, 0.0], radius + clearance)
     return solids.common(
         solids.cut(body, notch), solids.half_space([0.0, 0.0, seam_height - up * SEAM], [0.0, 0.0, up])
     )
 
 
 def _shell_link(index: int) -> list[Part]:
-    """Links 1 to 6. Odd ones carry the housing at their upper end, even ones at their lower end, under a cap."""
+    """Links 1 to 6. Odd ones have their housing at the upper end, even ones at the lower end, with a cap."""
     odd = index % 2 == 1
     tube_joint, housing_joint = (index, index + 1) if odd else (index + 1, index)
     seam_height = float(_HEIGHTS[tube_joint - 1] - _HEIGHTS[housing_joint - 1])
@@ -189,7 +193,9 @@ def _shell_link(index: int) -> list[Part]:
     else:
         parts.append(_seam(radius).placed(_TO_Y, [0.0, face, 0.0]))
         side = float(np.sign(reach - face))
-        bore = solids.cylinder([0.0, reach - side * 0.045, 0.0], [0.0, reach + side * 0.1, 0.0], 0.72 * radius)
+        bore = solids.cylinder(
+            [0.0, reach - side * 0.045, 0.0], [0.0, reach + side * 0.1, 0.0], 0.72 * radius
+        )
         parts.append(_shell(solids.common(solids.grown(solid, 0.0022), bore), low, high, "orange", 0.0155))
     frame = np.array([0.0, _FACES[index - 1], _HEIGHTS[index - 1] - _HEIGHTS[housing_joint - 1]])
     return [part.placed(np.eye(3), -frame) for part in parts]
@@ -224,9 +230,16 @@ def _stadium(profile: Sequence[Sequence[float]], material: str, stretch: float) 
 
 
 def _bracket() -> list[Part]:
-    """The printed part between the flange and the back of the camera: a disc, a post, a bar along the housing."""
+    """The printed part between the flange and the back of the camera."""
     back = d435.GLASS_TO_FLANGE - d435.BODY_SIZE[0]
-    disc = [(0.0, -0.0015), (0.0310, -0.0015), (0.0340, 0.0005), (0.0340, 0.006), (0.0330, 0.007), (0.0, 0.007)]
+    disc = [
+        (0.0, -0.0015),
+        (0.0310, -0.0015),
+        (0.0340, 0.0005),
+        (0.0340, 0.006),
+        (0.0330, 0.007),
+        (0.0, 0.007),
+    ]
     post = [
         (0.0130, 0.006),
         (0.0105, 0.010),

@@ -1,8 +1,8 @@
 """Solids as signed distance functions, and the triangles on their surface.
 
-A solid is a function of points (N, 3) in [m] that returns distances (N,) in [m], negative inside. Distances need only be
-right near the surface. Blends of simple solids give the cast, bulging shells of a robot arm, which are hard to write
-down as surfaces.
+A solid is a function of points (N, 3) in [m] that returns distances (N,) in [m], negative inside. Distances
+need only be right near the surface. Blends of simple solids give the cast, bulging shells of a robot arm,
+which are hard to write down as surfaces.
 """
 
 from collections.abc import Callable, Sequence
@@ -31,23 +31,6 @@ def _axial(points: FloatArray, start: FloatArray, end: FloatArray) -> tuple[Floa
     return height, np.linalg.norm(rel - height[:, None] * axis, axis=1), length
 
 
-def round_cone(start: Sequence[float], end: Sequence[float], r_start: float, r_end: float) -> Solid:
-    """The hull of a sphere of radius `r_start` at `start` and one of `r_end` at `end`, in [m]."""
-    a, b = _vector(start), _vector(end)
-
-    def solid(points: FloatArray) -> FloatArray:
-        height, radial, length = _axial(points, a, b)
-        slope = (r_start - r_end) / length
-        cosine = np.sqrt(max(1.0 - slope**2, 0.0))
-        along = height * cosine - radial * slope
-        side = radial * cosine + height * slope - r_start
-        at_start = np.hypot(radial, height) - r_start
-        at_end = np.hypot(radial, height - length) - r_end
-        return np.where(along < 0, at_start, np.where(along > length * cosine, at_end, side))
-
-    return solid
-
-
 def cylinder(start: Sequence[float], end: Sequence[float], radius: float, rounding: float = 0.0) -> Solid:
     """A cylinder between two points whose rims are rounded with the radius `rounding`, in [m]."""
     a, b = _vector(start), _vector(end)
@@ -57,20 +40,7 @@ def cylinder(start: Sequence[float], end: Sequence[float], radius: float, roundi
         dr = radial - (radius - rounding)
         dh = np.abs(height - length / 2) - (length / 2 - rounding)
         outside = np.hypot(np.maximum(dr, 0), np.maximum(dh, 0))
-        return outside + np.minimum(np.maximum(dr, dh), 0) - rounding
-
-    return solid
-
-
-def cone(start: Sequence[float], end: Sequence[float], r_start: float, r_end: float) -> Solid:
-    """A truncated cone with flat ends: radius `r_start` at `start`, `r_end` at `end`, in [m]."""
-    a, b = _vector(start), _vector(end)
-
-    def solid(points: FloatArray) -> FloatArray:
-        height, radial, length = _axial(points, a, b)
-        slope = (r_end - r_start) / length
-        side = (radial - r_start - slope * height) / np.hypot(1.0, slope)
-        return np.maximum(side, np.abs(height - length / 2) - length / 2)
+        return np.asarray(outside + np.minimum(np.maximum(dr, dh), 0) - rounding)
 
     return solid
 
@@ -78,7 +48,7 @@ def cone(start: Sequence[float], end: Sequence[float], r_start: float, r_end: fl
 def leaning_tube(
     start: Sequence[float], end: Sequence[float], r_start: float, r_end: float, straight: float
 ) -> Solid:
-    """A tube that leaves `start` along z and drifts to a round `end`, changing its radius smoothly on the way.
+    """A tube that leaves `start` along z, drifts to a round `end` and changes its radius smoothly on the way.
 
     Args:
         start: Centre of the first end, in [m].
@@ -112,7 +82,8 @@ def box(center: Sequence[float], size: Sequence[float], rounding: float = 0.0) -
 
     def solid(points: FloatArray) -> FloatArray:
         d = np.abs(points - c) - half
-        return np.linalg.norm(np.maximum(d, 0), axis=1) + np.minimum(d.max(axis=1), 0) - rounding
+        outside = np.linalg.norm(np.maximum(d, 0), axis=1)
+        return np.asarray(outside + np.minimum(d.max(axis=1), 0) - rounding)
 
     return solid
 
@@ -125,7 +96,7 @@ def ellipsoid(center: Sequence[float], radii: Sequence[float]) -> Solid:
         rel = points - c
         k0 = np.linalg.norm(rel / r, axis=1)
         k1 = np.linalg.norm(rel / r**2, axis=1)
-        return k0 * (k0 - 1.0) / np.maximum(k1, 1e-9)
+        return np.asarray(k0 * (k0 - 1.0) / np.maximum(k1, 1e-9))
 
     return solid
 
@@ -159,7 +130,7 @@ def common(*solids: Solid) -> Solid:
     """What the solids have in common; its edges stay sharp."""
 
     def solid(points: FloatArray) -> FloatArray:
-        return np.max([s(points) for s in solids], axis=0)
+        return np.asarray(np.max([s(points) for s in solids], axis=0))
 
     return solid
 
@@ -168,7 +139,7 @@ def cut(body: Solid, *tools: Solid) -> Solid:
     """`body` without the `tools`; the edges stay sharp."""
 
     def solid(points: FloatArray) -> FloatArray:
-        return np.max([body(points), *(-t(points) for t in tools)], axis=0)
+        return np.asarray(np.max([body(points), *(-t(points) for t in tools)], axis=0))
 
     return solid
 
@@ -178,7 +149,7 @@ def _gradient(solid: Solid, points: FloatArray) -> FloatArray:
     stacked = np.concatenate([points + o for o in offsets] + [points - o for o in offsets])
     values = solid(stacked).reshape(2, 3, len(points))
     gradient = (values[0] - values[1]).T
-    return gradient / np.maximum(np.linalg.norm(gradient, axis=1, keepdims=True), 1e-12)
+    return np.asarray(gradient / np.maximum(np.linalg.norm(gradient, axis=1, keepdims=True), 1e-12))
 
 
 def triangulate(
@@ -193,8 +164,8 @@ def triangulate(
         step: Width of the grid's cells, about the length of the triangles' sides, in [m].
 
     Returns:
-        Vertices (V, 3) in [m], unit normals (V, 3), faces (F, 3) counter-clockwise from outside. Vertices on sharp
-        edges are repeated, once for each side.
+        Vertices (V, 3) in [m], unit normals (V, 3), faces (F, 3) counter-clockwise from outside. Vertices on
+        sharp edges are repeated, once for each side.
     """
     low, high = _vector(lower) - step, _vector(upper) + step
     counts = np.ceil((high - low) / step).astype(np.int64) + 1
@@ -242,7 +213,7 @@ def _crossings(solid: Solid, a: FloatArray, b: FloatArray, da: FloatArray) -> Fl
 
 
 def _place_vertices(solid: Solid, points: FloatArray, corner_of: IntArray, count: int) -> FloatArray:
-    """One vertex a cell: nearest to the tangent planes at the cell's crossings, near their mean where undetermined."""
+    """One vertex a cell, nearest to the tangent planes where the surface crosses the cell's edges."""
     normals = _gradient(solid, points)
     weight = np.zeros(count)
     mean = np.zeros((count, 3))
@@ -276,7 +247,7 @@ def _split_quads(vertices: FloatArray, quads: IntArray) -> IntArray:
     faces: IntArray = split.reshape(-1, 3)
     q = vertices[faces]
     area = np.linalg.norm(np.cross(q[:, 1] - q[:, 0], q[:, 2] - q[:, 0]), axis=1)
-    return faces[area > 1e-9]
+    return np.asarray(faces[area > 1e-9])
 
 
 def _with_normals(
@@ -319,14 +290,14 @@ def _with_normals(
 def revolve(
     profile: Sequence[Sequence[float]], segments: int = 36, stretch: float = 0.0
 ) -> tuple[FloatArray, FloatArray, IntArray]:
-    """The surface swept by a profile turning about the z axis; edges of the profile above 30 degrees stay sharp.
+    """The surface swept by a profile turning about the z axis; its edges above 30 degrees stay sharp.
 
     Args:
-        profile: Radius and height of each point, in [m], such that the outside is to the right when walking along
-            it. Shape (P, 2).
+        profile: Radius and height of each point, in [m], such that the outside is to the right when walking
+            along it. Shape (P, 2).
         segments: Number of facets around the axis, even.
-        stretch: How far the two halves are moved apart, each along its own direction of x, in [m]: circles become
-            stadiums.
+        stretch: How far the two halves are moved apart, each along its own direction of x, in [m]: circles
+            become stadiums.
 
     Returns:
         Vertices (V, 3) in [m], unit normals (V, 3), faces (F, 3) counter-clockwise from outside.

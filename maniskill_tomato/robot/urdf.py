@@ -116,29 +116,35 @@ def _drum(y_low: float, y_high: float, radius: float, z: float = 0.0) -> Primiti
     )
 
 
+def _ball(y: float, z: float, radius: float) -> Primitive:
+    return Primitive(kind="sphere", center=(0.0, y, z), radius=radius)
+
+
 COLLISION_SHAPES: Final[dict[str, tuple[Primitive, ...]]] = {
     "link_0": (
-        _tube(0.0, 0.1455, 0.095),
-        Primitive(kind="box", center=(-0.105, 0.0, 0.040), size=(0.110, 0.110, 0.075)),
+        _tube(0.0, 0.018, 0.112),
+        _tube(0.0, 0.1455, 0.099),
+        Primitive(kind="box", center=(-0.110, 0.0, 0.0405), size=(0.120, 0.112, 0.075)),
     ),
-    "link_1": (_tube(0.0, 0.105, 0.080), _drum(-0.112, -0.012, 0.090, 0.2125)),
-    "link_2": (_drum(0.002, 0.120, 0.090), _tube(0.105, 0.226, 0.075, y=0.010)),
-    "link_3": (_tube(0.002, 0.095, 0.074), _drum(0.0125, 0.106, 0.084, 0.192)),
-    "link_4": (_drum(-0.115, -0.002, 0.084), _tube(0.095, 0.2055, 0.067, y=-0.0105)),
-    "link_5": (
-        _tube(0.002, 0.075, 0.066),
-        Primitive(kind="box", center=(0.0, -0.072, 0.105), size=(0.080, 0.070, 0.090)),
-        _drum(-0.122, -0.0727, 0.062, 0.1925),
+    "link_1": (_tube(0.0, 0.120, 0.083), _ball(-0.045, 0.125, 0.088), _drum(-0.128, -0.010, 0.096, 0.2125)),
+    "link_2": (_drum(0.0, 0.140, 0.096), _ball(0.055, 0.080, 0.088), _tube(0.100, 0.226, 0.077, y=0.010)),
+    "link_3": (_tube(0.0, 0.100, 0.077), _ball(0.045, 0.115, 0.083), _drum(0.0105, 0.123, 0.090, 0.192)),
+    "link_4": (
+        _drum(-0.136, 0.0, 0.090),
+        _ball(-0.050, 0.080, 0.081),
+        _tube(0.090, 0.2055, 0.068, y=-0.0105),
     ),
-    "link_6": (_drum(0.002, 0.132, 0.062), _tube(0.045, 0.089, 0.049, y=0.0707)),
-    "link_7": (_tube(0.002, 0.034, 0.049),),
+    "link_5": (_tube(0.0, 0.074, 0.068), _ball(-0.062, 0.105, 0.064), _drum(-0.138, -0.0707, 0.068, 0.1925)),
+    "link_6": (_drum(0.0, 0.138, 0.067), _ball(0.0707, 0.025, 0.066), _tube(0.030, 0.089, 0.051, y=0.0707)),
+    "link_7": (_tube(0.0, 0.035, 0.050),),
     "link_ee": (
         _tube(0.0, 0.007, 0.034),
-        Primitive(kind="box", center=(0.0, 0.0, 0.0155), size=(0.020, 0.060, 0.017)),
+        Primitive(kind="box", center=(0.0, 0.0, 0.0145), size=(0.024, 0.068, 0.021)),
     ),
     CAMERA_LINK_NAME: (Primitive(kind="box", center=d435.BODY_CENTER, size=d435.BODY_SIZE),),
 }
-"""Collision shapes of each link: inside or flush with its visible shell, and clear of the links two joints away."""
+"""Collision shapes of each link. Neighbours overlap, which no simulator checks; they hold the visible shells
+to 17 mm."""
 
 
 def _numbers(values: npt.ArrayLike) -> str:
@@ -164,7 +170,8 @@ def _inertial(inertial: Inertial) -> list[str]:
         "    <inertial>",
         f"      {_origin(inertial.com)}",
         f'      <mass value="{inertial.mass!r}"/>',
-        f'      <inertia ixx="{ixx!r}" ixy="{ixy!r}" ixz="{ixz!r}" iyy="{iyy!r}" iyz="{iyz!r}" izz="{izz!r}"/>',
+        f'      <inertia ixx="{ixx!r}" ixy="{ixy!r}" ixz="{ixz!r}" iyy="{iyy!r}" iyz="{iyz!r}" '
+        f'izz="{izz!r}"/>',
         "    </inertial>",
     ]
 
@@ -220,8 +227,10 @@ def _revolute_joint(index: int) -> list[str]:
         f'    <child link="{iiwa14.LINK_NAMES[index + 1]}"/>',
         f"    {_origin(iiwa14.JOINT_ORIGINS[index])}",
         f'    <axis xyz="{_numbers(iiwa14.JOINT_AXES[index])}"/>',
-        f'    <limit lower="{_numbers(iiwa14.JOINT_LOWER[index])}" upper="{_numbers(iiwa14.JOINT_UPPER[index])}" '
-        f'effort="{_numbers(iiwa14.TORQUE_LIMITS[index])}" velocity="{_numbers(iiwa14.VELOCITY_LIMITS[index])}"/>',
+        f'    <limit lower="{_numbers(iiwa14.JOINT_LOWER[index])}" '
+        f'upper="{_numbers(iiwa14.JOINT_UPPER[index])}" '
+        f'effort="{_numbers(iiwa14.TORQUE_LIMITS[index])}" '
+        f'velocity="{_numbers(iiwa14.VELOCITY_LIMITS[index])}"/>',
         "  </joint>",
     ]
 
@@ -238,7 +247,7 @@ def _camera() -> list[str]:
         f"meshes/{CAMERA_LINK_NAME}.glb",
     )
     lines += _fixed_joint(iiwa14.EE_LINK_NAME, CAMERA_LINK_NAME, d435.T_flange_camera)
-    # RealSense's URDF roots the camera in its tripod thread; ours hangs on the flange, so the thread is a leaf.
+    # RealSense's URDF roots the camera in its tripod thread; ours hangs on the flange, so that is a leaf.
     lines += _link("camera_bottom_screw_frame")
     lines += _fixed_joint(CAMERA_LINK_NAME, "camera_bottom_screw_frame", d435.T_camera_screw)
     for name, transform in (
