@@ -24,6 +24,7 @@ from maniskill_tomato.robot import ik_neighbour, ik_select, ik_solve
 from maniskill_tomato.robot.iiwa14 import NUM_JOINTS
 from maniskill_tomato.robot.ik_chain import vec7d
 from maniskill_tomato.robot.kinematics import LARGEST_KEPT_BATCH, RecordedLaunch
+from maniskill_tomato.warp_runtime import start_warp
 
 
 class Reach(IntEnum):
@@ -87,7 +88,7 @@ class InverseKinematics:
             device: The torch device of the inputs and results.
             config: Options, the defaults if None.
         """
-        wp.init()
+        start_warp()
         self.device = torch.device(device)
         if self.device.type == "cuda" and self.device.index is None:
             self.device = torch.device("cuda", torch.cuda.current_device())

@@ -15,8 +15,7 @@ import warp as wp
 from maniskill_tomato.errors import InvalidInputError
 from maniskill_tomato.robot.iiwa14 import LINK_NAMES, NUM_JOINTS
 from maniskill_tomato.robot.ik_chain import link_transforms_kernel
-
-wp.config.log_level = wp.LOG_WARNING
+from maniskill_tomato.warp_runtime import start_warp
 
 LARGEST_KEPT_BATCH = 4096
 """Buffers of larger batches are not kept between calls."""
@@ -51,7 +50,7 @@ class _LinkTransformsLaunch:
     """The kernel's launch for one batch size, with its tensors."""
 
     def __init__(self, batch: int, device: torch.device):
-        wp.init()
+        start_warp()
         self.qpos = torch.zeros(batch, NUM_JOINTS, dtype=torch.float64, device=device)
         self.transforms = torch.zeros(batch, len(LINK_NAMES), 4, 4, dtype=torch.float64, device=device)
         arrays = [wp.from_torch(self.qpos), wp.from_torch(self.transforms, dtype=wp.mat44d)]
