@@ -12,10 +12,12 @@ x right, y down.
 
 import warp as wp
 
+from maniskill_tomato.robot.d435 import CAMERA_NEAR
+
 wp.set_module_options({"enable_backward": False})
 
-NEAR = wp.constant(0.01)
-"""Depth of the near clipping plane in [m], the one ManiSkill gives its cameras by default."""
+NEAR = wp.constant(CAMERA_NEAR)
+"""Depth in [m] from which on something is seen, as in the rendered images."""
 FAR = wp.constant(100.0)
 """Depth in [m] beyond which a target is not looked for."""
 SURFACE_GAP = wp.constant(2.0e-5)

@@ -68,13 +68,17 @@ class SegmentedPlant:
         self._intrinsics = intrinsics
         backend = parse_sim_and_render_backend("cpu", "cpu")
         set_shader_pack(PREBUILT_SHADER_CONFIGS["minimal"])
-        scene = sapien.Scene([sapien.physx.PhysxCpuSystem(), sapien.render.RenderSystem(backend.render_device)])
+        scene = sapien.Scene(
+            [sapien.physx.PhysxCpuSystem(), sapien.render.RenderSystem(backend.render_device)]
+        )
         wrapped = ManiSkillScene([scene], device=torch.device("cpu"), backend=backend)
         actors = build_plant_actors(wrapped, plant, scene_idxs=[0], pose=sapien.Pose(), name_prefix="")
         self._scene = scene
         entities = [actor._objs[0] for actor in actors]
         self._ids = [entity.per_scene_id for entity in entities]
-        self._bodies = [e.find_component_by_type(sapien.render.RenderBodyComponent) for e in entities]
+        self._bodies: list[Any] = [
+            e.find_component_by_type(sapien.render.RenderBodyComponent) for e in entities
+        ]
         self._image = _add_camera(scene, intrinsics.width, intrinsics.height)
         self._silhouette = _add_camera(scene, _SILHOUETTE_SIZE, _SILHOUETTE_SIZE)
 
@@ -157,7 +161,7 @@ def compare(
     views_per_plant: int = 10,
     rays_per_side: int = 16,
     seed: int = 0,
-    on_plant: Callable[[int], None] | None = None,
+    on_plant: Callable[[int], object] | None = None,
 ) -> list[ComparedView]:
     """Judges random views of random plants by rays and by rendered images.
 
