@@ -19,8 +19,16 @@ class LearnerEnv(Protocol):
     """
 
     num_envs: int
-    single_observation_space: gym.Space[Any]
-    single_action_space: gym.Space[Any]
+
+    @property
+    def single_observation_space(self) -> gym.Space[Any]:
+        """Space of one environment's observation."""
+        ...
+
+    @property
+    def single_action_space(self) -> gym.Space[Any]:
+        """Space of one environment's action."""
+        ...
 
     def reset(self, *, seed: int | list[int] | None = None) -> tuple[Tensor, dict[str, Any]]:
         """Starts an episode everywhere."""
