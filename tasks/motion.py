@@ -31,7 +31,7 @@ def move_duration(start_qpos: Tensor, target_qpos: Tensor) -> float:
         start_qpos: Joint positions, in [rad]. Shape (num_envs, 7).
         target_qpos: Likewise. Shape (num_envs, 7).
     """
-    limits = torch.as_tensor(VELOCITY_LIMITS, dtype=start_qpos.dtype, device=start_qpos.device)
+    limits = torch.tensor(VELOCITY_LIMITS, dtype=start_qpos.dtype, device=start_qpos.device)
     shares = (target_qpos - start_qpos).abs() / (SPEED_FRACTION * limits)
     return PEAK_TO_MEAN_SPEED * float(shares.max())
 

@@ -15,6 +15,7 @@ from torch import Tensor
 from maniskill_tomato.plants.generator import generate_plant
 from maniskill_tomato.plants.organs import Plant, SemanticClass
 from maniskill_tomato.plants.rendering import build_plant_actors
+from maniskill_tomato.tasks import scene_mask
 from maniskill_tomato.tasks.plant_choice import PlantChoice
 
 
@@ -40,6 +41,7 @@ class Planting:
         """
         self.plants = [grow(choice, seed) for seed in seeds]
         self.seeds = list(seeds)
+        self._scene = scene
         self._device = device
         num_envs = len(self.plants)
         self.position_w = torch.zeros(num_envs, 3, device=device)
@@ -110,10 +112,11 @@ class Planting:
         self.T_world_plant[env_idx] = T
         half = 0.5 * self.yaw
         quat_wxyz = torch.stack([half.cos(), 0.0 * half, 0.0 * half, half.sin()], dim=-1)
-        for env_indices, actors in self._actors:
-            pose = Pose.create_from_pq(self.position_w[env_indices], quat_wxyz[env_indices])
-            for actor in actors:
-                _set_pose_of_all(actor, pose)
+        with scene_mask.only(self._scene, None):
+            for env_indices, actors in self._actors:
+                pose = Pose.create_from_pq(self.position_w[env_indices], quat_wxyz[env_indices])
+                for actor in actors:
+                    actor.set_pose(pose)
 
     def fruit_position_w(self, fruit: Tensor) -> Tensor:
         """Centre of one fruit per environment in the world frame, in [m].
@@ -132,17 +135,6 @@ class Planting:
     def semantic_classes(self, env_index: int) -> dict[int, SemanticClass]:
         """The semantic class of every organ of an environment's plant, by segmentation id."""
         return dict(self._organ_classes[env_index])
-
-
-def _set_pose_of_all(actor: Actor, pose: Pose) -> None:
-    """Sets an actor's pose in all its scenes, whichever of them are being reset."""
-    scene = actor.scene
-    mask = scene._reset_mask
-    scene._reset_mask = torch.ones_like(mask)
-    try:
-        actor.set_pose(pose)
-    finally:
-        scene._reset_mask = mask
 
 
 def ripe_fruit_at_random(planting: Planting, env_index: int, rng: np.random.RandomState) -> int:

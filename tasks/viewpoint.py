@@ -24,7 +24,7 @@ from maniskill_tomato.robot.inverse_kinematics import InverseKinematics, Reach
 from maniskill_tomato.robot.kinematics import link_transforms
 from maniskill_tomato.robot.rotations import matrix_to_rpy
 from maniskill_tomato.robot.viewpoint_controller import ViewpointController, pose_matrix
-from maniskill_tomato.tasks import MAX_EPISODE_STEPS, options, scenery
+from maniskill_tomato.tasks import MAX_EPISODE_STEPS, options, scene_mask, scenery
 from maniskill_tomato.tasks.config import ViewpointTaskConfig, guided_task, sparse_task
 from maniskill_tomato.tasks.motion import drive_to
 from maniskill_tomato.tasks.plant_choice import PlantChoice, PlantPose
@@ -202,11 +202,17 @@ class TomatoViewpointEnv(BaseEnv):  # type: ignore[misc]
         if "target" in options:
             targets = [self._checked_target(i, options["target"]) for i in indices]
         self._target[env_idx] = torch.as_tensor(targets, device=self.device)
+        self._look_up_target()
         if "viewpoint" in options:
             viewpoint, qpos = self._checked_start(options["viewpoint"], len(indices))
         else:
             viewpoint, qpos = self._draw_start(rngs)
         self._set_arm(env_idx, viewpoint, qpos)
+
+    def _look_up_target(self) -> None:
+        rows = torch.arange(self.num_envs, device=self.device)
+        self._target_id = self.planting.fruit_segmentation_id[rows, self._target]
+        self._target_position_w = self.planting.fruit_position_w(self._target)
 
     def _draw_start(self, rngs: list[np.random.RandomState]) -> tuple[Tensor, Tensor]:
         """Start viewpoints uniform in the task's box, redrawn until reachable, and their joints (Eq. 5-1,
@@ -345,12 +351,11 @@ class TomatoViewpointEnv(BaseEnv):  # type: ignore[misc]
         forbidden = in_forbidden_zone(self._viewpoint[:, :3])
         unreachable = self._reach == Reach.UNREACHABLE
         fail = unreachable if self.task.outside_workspace == "end" else torch.zeros_like(unreachable)
-        rows = torch.arange(self.num_envs, device=self.device)
         return {
             "success": (fraction > self.task.full_visibility) & ~fail,
             "fail": fail,
             "visible_fraction": fraction,
-            "target_id": self.planting.fruit_segmentation_id[rows, self._target],
+            "target_id": self._target_id.clone(),
             "target_seen": target_seen,
             "tomato_seen": seen.any_visible,
             "reachability": self._reach.clone(),
@@ -387,7 +392,7 @@ class TomatoViewpointEnv(BaseEnv):  # type: ignore[misc]
     @property
     def target_position_w(self) -> Tensor:
         """Centre of the target fruit in the world frame, in [m]. Shape (num_envs, 3)."""
-        return self.planting.fruit_position_w(self._target)
+        return self._target_position_w.clone()
 
     @property
     def target_fruit(self) -> Tensor:
@@ -434,7 +439,15 @@ class TomatoViewpointEnv(BaseEnv):  # type: ignore[misc]
                 f"the state belongs to plants of seed {stored}, but this environment holds {seeds}; "
                 "make it with plant={'seed': ...} or reset it with the seed of that episode"
             )
-        super().set_state_dict({k: v for k, v in state.items() if k != "task"}, env_idx)
+        robot = self.agent.robot
+        arm = torch.as_tensor(state["articulations"][robot.name], device=self.device).reshape(
+            len(indices), -1
+        )
+        # The base never moves, and to set its pose again would shift it by rounding.
+        qpos, qvel = arm[:, -2 * robot.max_dof :].float().split(robot.max_dof, dim=-1)
+        with scene_mask.only(self.scene, indices):
+            robot.set_qvel(qvel)
+            self._put_joints(qpos)
         x, y, yaw = task["plant_pose"].unbind(-1)
         self.planting.place(indices, x, y, yaw)
         self._viewpoint, self._reach, self._target = (
@@ -445,6 +458,7 @@ class TomatoViewpointEnv(BaseEnv):  # type: ignore[misc]
         self._viewpoint[indices] = task["viewpoint"].float()
         self._reach[indices] = task["reach"][:, 0].long()
         self._target[indices] = task["target"][:, 0].long()
+        self._look_up_target()
 
     def set_state(self, state: Any, env_idx: Tensor | None = None) -> None:
         """Takes back the flat vector that `get_state` gave. Shape (b, D)."""

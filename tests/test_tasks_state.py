@@ -115,24 +115,27 @@ def test_vector_wrapper_resets_by_itself_and_hands_out_final_observations() -> N
 
 
 def test_async_vector_env_runs_one_environment_per_process() -> None:
-    env = gym.vector.AsyncVectorEnv([_cpu_env, _cpu_env], context="forkserver")
+    def cpu_env() -> Any:
+        # A worker process knows nothing of this file, so everything is imported here.
+        import gymnasium
+        from mani_skill.utils.wrappers.gymnasium import CPUGymWrapper
+
+
+        return CPUGymWrapper(
+            gymnasium.make("TomatoViewpointGuided-v1", num_envs=1, obs_mode="state", render_backend="none")
+        )
+
+    env = gym.vector.AsyncVectorEnv([cpu_env, cpu_env], context="forkserver")
     try:
         obs, _ = env.reset(seed=[0, 1])
         assert obs.shape == (2, 9)
-        obs, reward, terminated, truncated, _ = env.step(np.zeros((2, 6), dtype=np.float32))
-        assert reward.shape == terminated.shape == truncated.shape == (2,)
         alone = make()
         torch.testing.assert_close(torch.as_tensor(obs[1:]), alone.reset(seed=1)[0], atol=1e-6, rtol=0)
         alone.close()
+        obs, reward, terminated, truncated, _ = env.step(np.zeros((2, 6), dtype=np.float32))
+        assert reward.shape == terminated.shape == truncated.shape == (2,)
     finally:
         env.close()
-
-
-def _cpu_env() -> Any:
-
-    from mani_skill.utils.wrappers.gymnasium import CPUGymWrapper
-
-    return CPUGymWrapper(make())
 
 
 def test_stable_baselines3_learns_on_the_task_through_gymnasium() -> None:
@@ -140,7 +143,15 @@ def test_stable_baselines3_learns_on_the_task_through_gymnasium() -> None:
     from mani_skill.utils.wrappers.gymnasium import CPUGymWrapper
 
     env = CPUGymWrapper(make())
-    model = stable_baselines3.TD3("MlpPolicy", env, learning_starts=50, batch_size=32, seed=0, device="cpu")
+    model = stable_baselines3.TD3(
+        "MlpPolicy",
+        env,
+        learning_starts=50,
+        batch_size=32,
+        seed=0,
+        device="cpu",
+        policy_kwargs={"net_arch": [32, 32]},
+    )
     model.learn(120)
     action, _ = model.predict(env.reset(seed=0)[0], deterministic=True)
     assert action.shape == (6,) and np.abs(action).max() <= 1.0

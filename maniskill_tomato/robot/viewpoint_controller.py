@@ -61,7 +61,7 @@ class ViewpointController(BaseController):  # type: ignore[misc]
     def reset(self) -> None:
         """Takes the arm as it stands as the pose reached, with the angles nearest to those of before."""
         mask = self.scene._reset_mask
-        self.reach[mask] = Reach.REACHABLE
+        self.reach = torch.where(mask, int(Reach.REACHABLE), self.reach)
         self.observe(mask)
 
     def observe(self, mask: Tensor | None = None) -> None:
@@ -74,10 +74,10 @@ class ViewpointController(BaseController):  # type: ignore[misc]
         T_base_ee = forward_kinematics(qpos.double())
         rpy = matrix_to_rpy(T_base_ee[:, :3, :3], self.viewpoint[:, 3:].double())
         viewpoint = torch.cat([T_base_ee[:, :3, 3], rpy], dim=-1).float()
-        if mask is None:
-            self.viewpoint, self.target_qpos = viewpoint, qpos
-        else:
-            self.viewpoint[mask], self.target_qpos[mask] = viewpoint[mask], qpos[mask]
+        if mask is not None:
+            viewpoint = torch.where(mask[:, None], viewpoint, self.viewpoint)
+            qpos = torch.where(mask[:, None], qpos, self.target_qpos)
+        self.viewpoint, self.target_qpos = viewpoint, qpos
 
     def go_to(self, viewpoint: Tensor) -> None:
         """Asks for absolute viewpoints; `viewpoint`, `reach` and `target_qpos` then say what comes of it.
