@@ -167,7 +167,9 @@ def _bent(
         [0.0, face - side * 0.05, 0.0], [0.0, reach - side * 0.012, 0.0], radius, rounding=0.036
     )
     dome = solids.ellipsoid([0.0, reach - side * 0.050, 0.0], [0.90 * radius, 0.050, 0.90 * radius])
-    body = solids.blend(tube, solids.blend(drum, dome, radius=0.02), radius=0.05)
+    body = solids.blend(
+        tube, solids.blend(drum, dome, radius=0.02), radius=min(0.05, 0.36 * abs(seam_height))
+    )
     # The neighbour swings here; the wrist's is short and wide, so it needs more room.
     clearance = 0.020 if abs(face) < 0.05 else 0.032
     notch = solids.cylinder([0.0, face + side * SEAM, 0.0], [0.0, face - side * 0.4, 0.0], radius + clearance)

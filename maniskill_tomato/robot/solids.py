@@ -232,7 +232,9 @@ def _place_vertices(solid: Solid, points: FloatArray, corner_of: IntArray, count
     eigenvalues, eigenvectors = np.linalg.eigh(ata / weight[:, None, None])
     inverse = np.where(eigenvalues > 0.05, 1.0 / np.maximum(eigenvalues, 1e-9), 0.0)
     projected = np.einsum("nij,ni->nj", eigenvectors, atb / weight[:, None])
-    return np.asarray(mean + np.einsum("nij,nj->ni", eigenvectors, inverse * projected))
+    placed: FloatArray = mean + np.einsum("nij,nj->ni", eigenvectors, inverse * projected)
+    # Tangent planes meet a little outside of a round surface.
+    return placed - solid(placed)[:, None] * _gradient(solid, placed)
 
 
 def _split_quads(vertices: FloatArray, quads: IntArray) -> IntArray:
