@@ -33,9 +33,15 @@ def make_render_material(name: str) -> sapien.render.RenderMaterial:
     return result
 
 
-def _make_shape(
+def make_render_shape(
     part: MeshPart, materials: dict[str, sapien.render.RenderMaterial]
 ) -> sapien.render.RenderShapeTriangleMesh:
+    """A SAPIEN shape of a mesh part; needs a Vulkan device.
+
+    Args:
+        part: What to show.
+        materials: Materials made so far, by name; a missing one is made and added.
+    """
     import numpy as np
     import sapien.render
 
@@ -80,6 +86,6 @@ def build_plant_actors(
         builder.initial_pose = initial_pose
         if scene.can_render():
             # ManiSkill's own builders hand over meshes made in memory in this way.
-            builder._procedural_shapes.extend(_make_shape(part, materials) for part in organ.parts)
+            builder._procedural_shapes.extend(make_render_shape(part, materials) for part in organ.parts)
         actors.append(builder.build_kinematic(f"{name_prefix}{organ.name}"))
     return actors
