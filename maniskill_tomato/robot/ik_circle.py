@@ -71,9 +71,6 @@ SMALLEST_REACH = wp.constant(
 LARGEST_REACH = wp.constant(wp.float64(iiwa14.SHOULDER_TO_ELBOW + iiwa14.ELBOW_TO_WRIST))
 """Distance of the wrist from the shoulder with the arm stretched, in [m]."""
 
-SINGULAR = wp.constant(wp.float64(10.0))
-"""A joint counts as singular within this many tolerances."""
-
 COS_LIMIT_26 = wp.constant(wp.float64(math.cos(iiwa14.JOINT_UPPER[1])))
 """Cosine of the limit that joints 2 and 6 share."""
 
@@ -94,10 +91,10 @@ class ElbowCircle:
     terms: terms_type
     """Rows (a, b, c) of the functions a cos(psi) + b sin(psi) + c, named by `Q1_Y` ... `Q6_COS`."""
     shoulder_sum: wp.mat22d
-    """Rows (a, b) of sine and cosine of q1 + q3 where q2 = 0, up to a factor."""
+    """Rows (a, b) of sine and cosine of q1 + q3, both times 1 + cos(q2)."""
     shoulder_sum_offset: wp.vec2d
     wrist_sum: wp.mat22d
-    """Rows (a, b) of sine and cosine of q5 + q7 where q6 = 0, up to a factor."""
+    """Rows (a, b) of sine and cosine of q5 + q7, both times 1 + cos(q6)."""
     wrist_sum_offset: wp.vec2d
 
 
@@ -128,7 +125,13 @@ def term(first: wp.vec3d, second: wp.vec3d, constant: wp.vec3d, k: wp.vec3d) -> 
 
 @wp.func
 def elbow_circle(
-    x: wp.vec3d, y: wp.vec3d, z: wp.vec3d, p: wp.vec3d, q_ref: vec7d, tolerance: wp.float64
+    x: wp.vec3d,
+    y: wp.vec3d,
+    z: wp.vec3d,
+    p: wp.vec3d,
+    q_ref: vec7d,
+    tolerance: wp.float64,
+    stretch: wp.float64,
 ) -> ElbowCircle:
     """The circle for a pose of the hand, with psi = 0 where the elbow of the reference stands.
 
@@ -137,6 +140,8 @@ def elbow_circle(
         p: Position of the end effector, in [m].
         q_ref: The reference, in [rad].
         tolerance: How far outside the reachable shell the wrist may lie, in [m]; it is moved onto it.
+        stretch: How near to full reach the wrist must be for the arm to count as stretched, in [m]. There an error
+            of the distance grows to its square root in q4, and from there in q2 and q6, which may be at limits.
     """
     circle = ElbowCircle()
     to_wrist = p - HAND * z - wp.vec3d(ZERO, ZERO, SHOULDER_HEIGHT)
@@ -145,7 +150,9 @@ def elbow_circle(
         return circle
     circle.reachable = 1
     # The half-angle form keeps its digits near the stretched arm, where acos loses half of them.
-    far = wp.max(LARGEST_REACH * LARGEST_REACH - distance * distance, ZERO)
+    far = wp.float64(0.0)
+    if distance < LARGEST_REACH - stretch:
+        far = LARGEST_REACH * LARGEST_REACH - distance * distance
     near = distance * distance - (UPPER_ARM - FOREARM) * (UPPER_ARM - FOREARM)
     q4 = wp.min(TWO * wp.atan2(wp.sqrt(far), wp.sqrt(near)), LIMITS[3])
     circle.q4 = q4
@@ -181,7 +188,7 @@ def elbow_circle(
     circle.terms[Q7_Y] = term(-sd * n, -sd * m, cd * e, y)
     circle.terms[Q7_X] = term(sd * n, sd * m, -cd * e, x)
 
-    # Where q2 = 0: x3.y - v.x = 2 sin(q1 + q3), x3.x + v.y = 2 cos(q1 + q3); the wrist likewise.
+    # x3.y - v.x = (1 + cos(q2)) sin(q1 + q3), x3.x + v.y = (1 + cos(q2)) cos(q1 + q3); the wrist likewise.
     circle.shoulder_sum = wp.mat22d(cg * n[1] - m[0], cg * m[1] + n[0], cg * n[0] + m[1], cg * m[0] - n[1])
     circle.shoulder_sum_offset = wp.vec2d(-sg * e[1], -sg * e[0])
     circle.wrist_sum = wp.mat22d(
@@ -231,14 +238,14 @@ def feasible_configurations(values: values_type, tolerance: wp.float64) -> int:
 
 
 @wp.func
-def split_sum(
+def shared_sum(
     total: wp.float64, ref_a: wp.float64, ref_b: wp.float64, limit_a: wp.float64, limit_b: wp.float64
 ) -> wp.vec2d:
     """Two angles with the sum `total` (up to full turns), within their limits and nearest to a reference."""
     best = wp.vec2d(ZERO, ZERO)
     best_cost = wp.float64(1.0e30)
     for turn in range(-1, 2):
-        goal = wrap(total) + TWO_PI * wp.float64(turn)
+        goal = total + TWO_PI * wp.float64(turn)
         low = wp.max(-limit_a, goal - limit_b)
         high = wp.min(limit_a, goal + limit_b)
         if low <= high:
@@ -252,49 +259,40 @@ def split_sum(
 
 
 @wp.func
+def limited_pair(a: wp.float64, b: wp.float64, limit_a: wp.float64, limit_b: wp.float64) -> wp.vec2d:
+    """Two angles put on their limits if beyond, the one taking over what the other is short of."""
+    first = wp.clamp(a, -limit_a, limit_a)
+    second = wp.clamp(b + a - first, -limit_b, limit_b)
+    return wp.vec2d(wp.clamp(a + b - second, -limit_a, limit_a), second)
+
+
+@wp.func
 def unlimited_angles(
-    circle: ElbowCircle,
-    values: values_type,
-    c: wp.float64,
-    s: wp.float64,
-    configuration: int,
-    q_ref: vec7d,
-    tolerance: wp.float64,
+    circle: ElbowCircle, values: values_type, c: wp.float64, s: wp.float64, configuration: int
 ) -> vec7d:
     """The joint angles at the arm angle with this cosine and sine, whether within the limits or not.
 
-    Where q2 = 0 only q1 + q3 is defined, where q6 = 0 only q5 + q7: they are shared out as near to the
-    reference as the limits allow.
+    q3 and q7 come from the sums q1 + q3 and q5 + q7, which keep their digits where q2 or q6 is near zero and the
+    two angles of a sum lose them.
     """
     sign_2 = wp.float64(1 - 2 * (configuration & 1))
     sign_4 = wp.float64(1 - (configuration & 2))
     sign_6 = wp.float64(1 - ((configuration >> 1) & 2))
+    at = wp.vec2d(c, s)
+    shoulder = sign_4 * (circle.shoulder_sum * at + circle.shoulder_sum_offset)
+    wrist = sign_4 * (circle.wrist_sum * at + circle.wrist_sum_offset)
     q = vec7d()
+    q[0] = wp.atan2(sign_2 * values[Q1_Y], sign_2 * values[Q1_X])
+    q[1] = sign_2 * wp.atan2(
+        wp.sqrt(values[Q1_Y] * values[Q1_Y] + values[Q1_X] * values[Q1_X]), values[Q2_COS]
+    )
+    q[2] = wrap(wp.atan2(shoulder[0], shoulder[1]) - q[0])
     q[3] = sign_4 * circle.q4
-    r2 = wp.sqrt(values[Q1_Y] * values[Q1_Y] + values[Q1_X] * values[Q1_X])
-    r6 = wp.sqrt(values[Q5_Y] * values[Q5_Y] + values[Q5_X] * values[Q5_X])
-    q[1] = sign_2 * wp.atan2(r2, values[Q2_COS])
-    q[5] = sign_6 * wp.atan2(r6, values[Q6_COS])
-    if r2 > SINGULAR * tolerance:
-        q[0] = wp.atan2(sign_2 * values[Q1_Y], sign_2 * values[Q1_X])
-        q[2] = wp.atan2(sign_2 * sign_4 * values[Q3_Y], sign_2 * sign_4 * values[Q3_X])
-    else:
-        sums = circle.shoulder_sum * wp.vec2d(c, s) + circle.shoulder_sum_offset
-        shared = split_sum(
-            wp.atan2(sign_4 * sums[0], sign_4 * sums[1]), q_ref[0], q_ref[2], LIMITS[0], LIMITS[2]
-        )
-        q[0] = shared[0]
-        q[2] = shared[1]
-    if r6 > SINGULAR * tolerance:
-        q[4] = wp.atan2(sign_4 * sign_6 * values[Q5_Y], sign_4 * sign_6 * values[Q5_X])
-        q[6] = wp.atan2(sign_6 * values[Q7_Y], sign_6 * values[Q7_X])
-    else:
-        sums = circle.wrist_sum * wp.vec2d(c, s) + circle.wrist_sum_offset
-        shared = split_sum(
-            wp.atan2(sign_4 * sums[0], sign_4 * sums[1]), q_ref[4], q_ref[6], LIMITS[4], LIMITS[6]
-        )
-        q[4] = shared[0]
-        q[6] = shared[1]
+    q[4] = wp.atan2(sign_4 * sign_6 * values[Q5_Y], sign_4 * sign_6 * values[Q5_X])
+    q[5] = sign_6 * wp.atan2(
+        wp.sqrt(values[Q5_Y] * values[Q5_Y] + values[Q5_X] * values[Q5_X]), values[Q6_COS]
+    )
+    q[6] = wrap(wp.atan2(wrist[0], wrist[1]) - q[4])
     return q
 
 
@@ -308,14 +306,19 @@ def joint_angles(
     q_ref: vec7d,
     tolerance: wp.float64,
 ) -> vec7d:
-    """The joint angles at a feasible arm angle, with what the tolerance let through put on the limits."""
-    q = unlimited_angles(circle, values, c, s, configuration, q_ref, tolerance)
-    # What one joint is short of the other takes over, which near a singularity keeps the hand in place.
-    over_0 = q[0] - wp.clamp(q[0], -LIMITS[0], LIMITS[0])
-    over_2 = q[2] - wp.clamp(q[2], -LIMITS[2], LIMITS[2])
-    over_4 = q[4] - wp.clamp(q[4], -LIMITS[4], LIMITS[4])
-    over_6 = q[6] - wp.clamp(q[6], -LIMITS[6], LIMITS[6])
-    q += vec7d(over_2, ZERO, over_0, ZERO, over_6, ZERO, over_4)
+    """The joint angles at a feasible arm angle, with what the tolerance let through put on the limits.
+
+    Where q2 = 0 only q1 + q3 is defined, where q6 = 0 only q5 + q7: they are shared out as near to the
+    reference as the limits allow.
+    """
+    q = unlimited_angles(circle, values, c, s, configuration)
+    shoulder = limited_pair(q[0], q[2], LIMITS[0], LIMITS[2])
+    if wp.abs(values[Q1_Y]) + wp.abs(values[Q1_X]) <= tolerance:
+        shoulder = shared_sum(wrap(q[0] + q[2]), q_ref[0], q_ref[2], LIMITS[0], LIMITS[2])
+    wrist = limited_pair(q[4], q[6], LIMITS[4], LIMITS[6])
+    if wp.abs(values[Q5_Y]) + wp.abs(values[Q5_X]) <= tolerance:
+        wrist = shared_sum(wrap(q[4] + q[6]), q_ref[4], q_ref[6], LIMITS[4], LIMITS[6])
+    q = vec7d(shoulder[0], q[1], shoulder[1], q[3], wrist[0], q[5], wrist[1])
     for j in range(7):
         q[j] = wp.clamp(q[j], -LIMITS[j], LIMITS[j])
     return q

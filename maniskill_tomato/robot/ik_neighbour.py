@@ -233,7 +233,7 @@ class Neighbour:
 
 
 @wp.func
-def least_violating(circle: ElbowCircle, configuration: int, q_ref: vec7d) -> vec7d:
+def least_violating(circle: ElbowCircle, configuration: int) -> vec7d:
     """The angles of a configuration on the circle that break the limits least, put on the limits."""
     best = vec7d()
     best_violation = wp.float64(1.0e30)
@@ -241,7 +241,7 @@ def least_violating(circle: ElbowCircle, configuration: int, q_ref: vec7d) -> ve
         psi = wp.float64(k) * ARM_ANGLE_STEP
         c = wp.cos(psi)
         s = wp.sin(psi)
-        q = unlimited_angles(circle, evaluate(circle, c, s), c, s, configuration, q_ref, ZERO)
+        q = unlimited_angles(circle, evaluate(circle, c, s), c, s, configuration)
         violation = wp.float64(0.0)
         for j in range(7):
             within = wp.clamp(q[j], -LIMITS[j], LIMITS[j])
@@ -255,15 +255,13 @@ def least_violating(circle: ElbowCircle, configuration: int, q_ref: vec7d) -> ve
 
 @wp.func
 def nearest_neighbour(
-    circle: ElbowCircle, position: wp.vec3d, rotation: wp.mat33d, q_ref: vec7d, allowed: Allowed
+    circle: ElbowCircle, position: wp.vec3d, rotation: wp.mat33d, allowed: Allowed
 ) -> Neighbour:
     """The nearest pose within the allowed distance and angle, and joint angles that reach it."""
     best = Neighbour()
     best.distance = wp.float64(1.0e30)
     for configuration in range(8):
-        q = descended(
-            least_violating(circle, configuration, q_ref), position, rotation, allowed, ZERO, ITERATIONS
-        )
+        q = descended(least_violating(circle, configuration), position, rotation, allowed, ZERO, ITERATIONS)
         ratios = pose_ratios(hand_of(q), position, rotation, allowed)
         if wp.max(ratios[0], ratios[1]) > ONE and wp.length(ratios) < HOPELESS:
             q = descended(q, position, rotation, allowed, JUST_INSIDE, BOX_ITERATIONS)

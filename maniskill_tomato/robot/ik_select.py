@@ -35,7 +35,6 @@ from maniskill_tomato.robot.ik_circle import (
     Q6_COS,
     Q7_X,
     Q7_Y,
-    SINGULAR,
     ElbowCircle,
     evaluate,
     feasible_configurations,
@@ -114,7 +113,7 @@ def cheapest_configuration(
     best.cost = NO_COST
     r2 = wp.sqrt(values[Q1_Y] * values[Q1_Y] + values[Q1_X] * values[Q1_X])
     r6 = wp.sqrt(values[Q5_Y] * values[Q5_Y] + values[Q5_X] * values[Q5_X])
-    singular = r2 <= SINGULAR * tolerance or r6 <= SINGULAR * tolerance
+    singular = r2 <= tolerance or r6 <= tolerance
     q2 = wp.atan2(r2, values[Q2_COS])
     q6 = wp.atan2(r6, values[Q6_COS])
     cost_1 = two_costs(0, values[Q1_Y], values[Q1_X], q_ref[0], weights)

@@ -22,6 +22,8 @@ INVALID = wp.constant(wp.int64(-1))
 
 STRICT = wp.constant(wp.float64(2.0e-11))
 """Tolerance of the first attempt: what rounding does to a pose at the edge of the workspace."""
+ROUNDING = wp.constant(wp.float64(1.0e-15))
+"""What rounding does to the distance of shoulder and wrist, in [m]."""
 LARGEST_SKEW = wp.constant(wp.float64(1.0e-3))
 """How far R^T R may be from the identity, in every element."""
 
@@ -34,15 +36,21 @@ class Solution:
 
 @wp.func
 def exact_solution(
-    position: wp.vec3d, rotation: wp.mat33d, q_ref: vec7d, weights: Weights, tolerance: wp.float64
+    position: wp.vec3d,
+    rotation: wp.mat33d,
+    q_ref: vec7d,
+    weights: Weights,
+    tolerance: wp.float64,
+    stretch: wp.float64,
 ) -> Solution:
     """The cheapest joint angles that reach a pose to within a few tolerances."""
     solution = Solution()
     x = wp.vec3d(rotation[0, 0], rotation[1, 0], rotation[2, 0])
     y = wp.vec3d(rotation[0, 1], rotation[1, 1], rotation[2, 1])
     z = wp.vec3d(rotation[0, 2], rotation[1, 2], rotation[2, 2])
-    circle = elbow_circle(x, y, z, position, q_ref, tolerance)
-    if circle.reachable == 1:
+    circle = elbow_circle(x, y, z, position, q_ref, tolerance, stretch)
+    # A second attempt with the arm taken as stretched is no other unless it is.
+    if circle.reachable == 1 and (stretch == ZERO or circle.q4 == ZERO):
         choice = sampled_choice(circle, q_ref, weights, tolerance)
         if choice.cost < NO_COST:
             psi = refined_psi(circle, choice, q_ref, weights, tolerance)
@@ -107,9 +115,13 @@ def solve_kernel(
         outcome = INVALID
     else:
         rotation = nearest_rotation(rotation)
-        solution = exact_solution(position, rotation, q_ref, weights, STRICT)
+        solution = exact_solution(position, rotation, q_ref, weights, STRICT, ZERO)
         if solution.found == 0:
-            solution = exact_solution(position, rotation, q_ref, weights, tolerance)
+            solution = exact_solution(position, rotation, q_ref, weights, STRICT, ROUNDING)
+        if solution.found == 0:
+            solution = exact_solution(position, rotation, q_ref, weights, tolerance, ZERO)
+        if solution.found == 0:
+            solution = exact_solution(position, rotation, q_ref, weights, tolerance, tolerance)
         if solution.found == 1:
             outcome = REACHABLE
             q = solution.q
@@ -119,15 +131,15 @@ def solve_kernel(
             z = wp.vec3d(rotation[0, 2], rotation[1, 2], rotation[2, 2])
             # The wrist of a neighbour pose is at most this far away.
             wrist_shift = allowed.distance + TWO * HAND * wp.sin(HALF * allowed.angle)
-            circle = elbow_circle(x, y, z, position, q_ref, wrist_shift)
+            circle = elbow_circle(x, y, z, position, q_ref, wrist_shift, ZERO)
             if circle.reachable == 1:
-                neighbour = nearest_neighbour(circle, position, rotation, q_ref, allowed)
+                neighbour = nearest_neighbour(circle, position, rotation, allowed)
                 if neighbour.distance < NO_COST:
                     outcome = NEIGHBOUR
                     q = neighbour.q
                     hand = hand_of(q)
                     # The pose found is reachable, maybe also nearer to the reference.
-                    solution = exact_solution(hand.position, hand.rotation, q_ref, weights, STRICT)
+                    solution = exact_solution(hand.position, hand.rotation, q_ref, weights, STRICT, ZERO)
                     if solution.found == 1:
                         q = solution.q
     qpos[i] = q
