@@ -14,8 +14,9 @@ export PYTHON
 BIN := .venv/bin
 STAMP := .venv/.installed-from
 
-# An environment that was made in another folder (a moved or copied checkout) is made anew.
-ifneq "$(shell cat $(STAMP) 2>/dev/null)" "$(CURDIR)"
+# An environment that was made in another folder (a moved or copied checkout) is made anew, and a PYTHON named on the
+# command line is compared with the environment's.
+ifneq "$(shell cat $(STAMP) 2>/dev/null)$(if $(filter command line,$(origin PYTHON)),named)" "$(CURDIR)"
 $(STAMP): FORCE
 endif
 

@@ -55,7 +55,8 @@ if ! ((dry_run)); then
         say "nothing to install: ${answer##*$'\n'}"
         exit 0
     fi
-    say "${answer##*$'\n'}"
+    answer="${answer##*$'\n'}"
+    say "${answer%%;*}"
 fi
 
 [[ -r $os_release ]] || fail "cannot read $os_release, so the distribution is unknown" \
@@ -221,10 +222,13 @@ say "on ${name:-$id} this runs:"
 plan | sed 's/^/    /'
 log="$(mktemp)"
 trap 'rm -f "$log"' EXIT
-run() {
-    if ! "${sudo[@]}" "$@" >"$log" 2>&1; then
-        tail -n 15 "$log" >&2
-        return 1
+run() { "${sudo[@]}" "$@" >>"$log" 2>&1; }
+# Shows what apt complained about, and takes away the source that this run added.
+undo() {
+    grep -E '^(W|E|Err)[:0-9]' "$log" | tail -n 15 >&2 || tail -n 15 "$log" >&2
+    if [[ -n $new_file ]]; then
+        "${sudo[@]}" rm -f "$new_file"
+        say "took $new_file away again" >&2
     fi
 }
 if [[ -n $new_file ]]; then
@@ -232,15 +236,18 @@ if [[ -n $new_file ]]; then
         "Run this script as a user who may."
 fi
 if ! run "${update[@]}"; then
-    if [[ -n $new_file ]]; then
-        "${sudo[@]}" rm -f "$new_file"
-        fail "apt-get update failed (above), so $new_file was taken away again" \
-            "Check the network, and that your mirror carries $backports; then run this script again."
-    fi
-    fail "apt-get update failed (above)" "Check the network and $apt_dir; then run this script again."
+    undo
+    fail "apt-get update failed (above)" \
+        "Check the network and $apt_dir${new_file:+, and that your mirror carries $backports}; then run this script again."
 fi
-run "${install[@]}" || fail "apt-get install failed (above)" \
-    "If another apt is running, wait for it. If packages conflict, 'apt-get -f install' may repair them. Then run this again."
+# apt-get update also succeeds when it could fetch nothing; the installation then fails.
+if ! run "${install[@]}"; then
+    undo
+    fail "apt-get install failed (above)" \
+        "Check the network and $apt_dir${new_file:+, and that your mirror carries $backports}." \
+        "If another apt is running, wait for it; if packages conflict, 'apt-get -f install' may repair them." \
+        "Then run this script again."
+fi
 
 status=0
 answer="$(check_device)" || status=$?
@@ -248,7 +255,10 @@ version_now="$(dpkg-query -W -f '${Version}' mesa-vulkan-drivers 2>/dev/null || 
 case $status in
     0) say "installed Mesa $version_now; ${answer##*$'\n'}" ;;
     2) say "installed Mesa $version_now; not checked, for ${answer##*$'\n'}" ;;
-    *) fail "Mesa $version_now is installed, but: ${answer##*$'\n'}" \
-        "Mesa 23.3 or newer has the feature: Debian 12 with backports, Debian 13, Ubuntu 24.04 or newer." \
-        "VK_ICD_FILENAMES or VK_DRIVER_FILES, if set, must not hide the driver (now: '${VK_ICD_FILENAMES:-}${VK_DRIVER_FILES:-}')." ;;
+    *)
+        answer="${answer##*$'\n'no: }"
+        fail "Mesa $version_now is installed, but ${answer%%;*}" \
+            "Mesa 23.3 or newer has the feature: Debian 12 with backports, Debian 13, Ubuntu 24.04 or newer." \
+            "VK_ICD_FILENAMES or VK_DRIVER_FILES, if set, must not hide the driver (now: '${VK_ICD_FILENAMES:-}${VK_DRIVER_FILES:-}')."
+        ;;
 esac

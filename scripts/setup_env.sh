@@ -26,8 +26,6 @@ new_enough() { "$1" -c 'import sys; sys.exit(sys.version_info < (3, 11))' 2>/dev
 find_python() {
     local candidate
     if [[ -n ${PYTHON:-} ]]; then
-        command -v "$PYTHON" >/dev/null || fail "PYTHON=$PYTHON is not a command" "Give the path of a Python 3.11 or newer."
-        new_enough "$PYTHON" || fail "PYTHON=$PYTHON is Python $(version_of "$PYTHON"), but 3.11 or newer is needed"
         echo "$PYTHON"
         return
     fi
@@ -41,6 +39,13 @@ find_python() {
         "On Debian 12 or newer and Ubuntu 24.04 or newer:  sudo apt-get install python3 python3-venv" \
         "Elsewhere, name one:  make venv PYTHON=/path/to/python3.11"
 }
+
+# Refused before anything is removed.
+if [[ -n ${PYTHON:-} ]]; then
+    found="$(version_of "$PYTHON" || true)"
+    [[ -n $found ]] || fail "PYTHON=$PYTHON does not run" "Give the name or path of a Python 3.11 or newer."
+    new_enough "$PYTHON" || fail "PYTHON=$PYTHON is Python $found" "Give the name or path of a Python 3.11 or newer."
+fi
 
 if [[ -e $venv ]]; then
     why=""

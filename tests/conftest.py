@@ -31,7 +31,7 @@ def rendering_problem() -> str | None:
     if result.returncode == 0:
         return None
     output = (result.stdout + result.stderr).strip().splitlines()
-    return output[-1] if output else f"the probe ended with status {result.returncode}"
+    return output[-1].removeprefix("no: ") if output else f"the probe ended with status {result.returncode}"
 
 
 def rendering_required() -> bool:
@@ -53,4 +53,4 @@ def pytest_runtest_setup(item: pytest.Item) -> None:
     if item.get_closest_marker("render") is not None and (problem := rendering_problem()) is not None:
         if rendering_required():
             pytest.fail(f"rendering is required here, but {problem}", pytrace=False)
-        pytest.skip(f"{problem} (needs Vulkan)")
+        pytest.skip(problem)

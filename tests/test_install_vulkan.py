@@ -1,7 +1,9 @@
 """The Vulkan installer's decisions, on made-up machines: which packages, from where, and what it says."""
 
 import os
+import re
 import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -199,3 +201,27 @@ def test_a_machine_that_renders_is_left_alone() -> None:
     result = subprocess.run(["bash", str(SCRIPT)], capture_output=True, text=True, timeout=300)
     assert result.returncode == 0, result.stderr
     assert result.stdout.startswith("vulkan: nothing to install:")
+
+
+@pytest.mark.render
+def test_a_hidden_driver_is_reported_as_no_device() -> None:
+    environment = {**os.environ, "VK_ICD_FILENAMES": os.devnull, "VK_DRIVER_FILES": os.devnull}
+    script = SCRIPT.parent / "check_vulkan.py"
+    result = subprocess.run(
+        [sys.executable, str(script)], env=environment, capture_output=True, text=True, timeout=60
+    )
+    assert result.returncode == 1
+    assert result.stdout.startswith("no: the Vulkan loader found no driver")
+    assert "`make vulkan`" in result.stdout
+
+
+@pytest.mark.render
+def test_every_device_is_listed_with_the_feature_that_sapien_needs() -> None:
+    script = SCRIPT.parent / "check_vulkan.py"
+    result = subprocess.run([sys.executable, str(script)], capture_output=True, text=True, timeout=60)
+    assert result.returncode == 0, result.stdout
+    *devices, verdict = result.stdout.splitlines()
+    assert any(
+        re.search(r": Vulkan 1\.\d+\.\d+, has descriptorBindingPartiallyBound$", line) for line in devices
+    )
+    assert verdict == "yes: there is a Vulkan device that SAPIEN can use"
