@@ -256,7 +256,8 @@ case $status in
     0) say "installed Mesa $version_now; ${answer##*$'\n'}" ;;
     2) say "installed Mesa $version_now; not checked, for ${answer##*$'\n'}" ;;
     *)
-        answer="${answer##*$'\n'no: }"
+        answer="${answer##*$'\n'}"
+        answer="${answer#no: }"
         fail "Mesa $version_now is installed, but ${answer%%;*}" \
             "Mesa 23.3 or newer has the feature: Debian 12 with backports, Debian 13, Ubuntu 24.04 or newer." \
             "VK_ICD_FILENAMES or VK_DRIVER_FILES, if set, must not hide the driver (now: '${VK_ICD_FILENAMES:-}${VK_DRIVER_FILES:-}')."
