@@ -91,7 +91,7 @@ def test_depth_points_of_the_target_lie_on_the_target() -> None:
     for target in base.planting.ripe_fruits[0]:
         env.reset(seed=0, options={"target": target})
         x, y, z = base.target_position_w[0].tolist()
-        options = {"target": target, "viewpoint": [x - 0.4, y, z, 0.0, math.pi / 2, 0.0]}
+        options = {"target": target, "viewpoint": [x - 0.3, y, z, 0.0, math.pi / 2, 0.0]}
         obs, info = env.reset(seed=0, options=options)
         data, params = obs["sensor_data"]["d435"], obs["sensor_param"]["d435"]
         mask = data["segmentation"][0, ..., 0] == int(info["target_id"])

@@ -120,10 +120,8 @@ def test_async_vector_env_runs_one_environment_per_process() -> None:
         import gymnasium
         from mani_skill.utils.wrappers.gymnasium import CPUGymWrapper
 
-
-        return CPUGymWrapper(
-            gymnasium.make("TomatoViewpointGuided-v1", num_envs=1, obs_mode="state", render_backend="none")
-        )
+        env_id = "maniskill_tomato.tasks:TomatoViewpointGuided-v1"
+        return CPUGymWrapper(gymnasium.make(env_id, num_envs=1, obs_mode="state", render_backend="none"))
 
     env = gym.vector.AsyncVectorEnv([cpu_env, cpu_env], context="forkserver")
     try:
