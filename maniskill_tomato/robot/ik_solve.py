@@ -31,6 +31,8 @@ LARGEST_SKEW = wp.constant(wp.float64(1.0e-3))
 @wp.struct
 class Solution:
     found: wp.int32
+    stretched: wp.int32
+    """1 if the arm was taken as stretched; exact elbow angles near zero are then worth another attempt."""
     q: vec7d
 
 
@@ -49,8 +51,9 @@ def exact_solution(
     y = wp.vec3d(rotation[0, 1], rotation[1, 1], rotation[2, 1])
     z = wp.vec3d(rotation[0, 2], rotation[1, 2], rotation[2, 2])
     circle = elbow_circle(x, y, z, position, q_ref, tolerance, stretch)
-    # A second attempt with the arm taken as stretched is no other unless it is.
-    if circle.reachable == 1 and (stretch == ZERO or circle.q4 == ZERO):
+    if circle.reachable == 1:
+        if stretch > ZERO and circle.q4 == ZERO:
+            solution.stretched = 1
         choice = sampled_choice(circle, q_ref, weights, tolerance)
         if choice.cost < NO_COST:
             psi = refined_psi(circle, choice, q_ref, weights, tolerance)
@@ -115,13 +118,13 @@ def solve_kernel(
         outcome = INVALID
     else:
         rotation = nearest_rotation(rotation)
-        solution = exact_solution(position, rotation, q_ref, weights, STRICT, ZERO)
-        if solution.found == 0:
-            solution = exact_solution(position, rotation, q_ref, weights, STRICT, ROUNDING)
-        if solution.found == 0:
-            solution = exact_solution(position, rotation, q_ref, weights, tolerance, ZERO)
+        solution = exact_solution(position, rotation, q_ref, weights, STRICT, ROUNDING)
+        if solution.found == 0 and solution.stretched == 1:
+            solution = exact_solution(position, rotation, q_ref, weights, STRICT, ZERO)
         if solution.found == 0:
             solution = exact_solution(position, rotation, q_ref, weights, tolerance, tolerance)
+        if solution.found == 0 and solution.stretched == 1:
+            solution = exact_solution(position, rotation, q_ref, weights, tolerance, ZERO)
         if solution.found == 1:
             outcome = REACHABLE
             q = solution.q
