@@ -17,8 +17,6 @@ The target counts as not visible (V = 0) where its bounding sphere lies behind t
 holds the camera. It has no silhouette then, and T is that of such a sphere straight ahead.
 """
 
-import os
-import sys
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -36,6 +34,7 @@ from maniskill_tomato.robot.iiwa14 import LINK_NAMES
 from maniskill_tomato.visibility import kernels
 from maniskill_tomato.visibility.lattice import ray_lattice
 from maniskill_tomato.visibility.meshes import PlantMeshCache, PlantMeshes, build_mesh
+from maniskill_tomato.warp_runtime import start_warp
 
 LinkMeshes = Mapping[str, tuple[NDArray[Any], NDArray[Any]]]
 """Vertices in the link frame, in [m], Shape (V, 3), and faces, Shape (F, 3), by link name."""
@@ -113,9 +112,9 @@ class VisibilityCaster:
             raise InvalidInputError(f"rays_per_side must be at least 2, got {rays_per_side}")
         if cached_plants < 1:
             raise InvalidInputError(f"cached_plants must be at least 1, got {cached_plants}")
-        _start_warp()
+        start_warp()
         self._device = torch.device(device)
-        self._warp_device = str(wp.device_from_torch(self._device))
+        self._warp_device = str(wp.device_from_torch(str(self._device)))
         self._is_cuda = self._device.type == "cuda"
         self._cache = PlantMeshCache(self._warp_device, cached_plants)
         self._shown = [self._cache.get(plant) for plant in plants]
@@ -153,9 +152,8 @@ class VisibilityCaster:
         if not 0 <= env_index < self.num_envs:
             raise InvalidInputError(f"env_index must be from 0 to {self.num_envs - 1}, got {env_index}")
         meshes = self._cache.get(plant)
-        if self._is_cuda:
-            # A mesh must outlive the casts that are still under way with it.
-            torch.cuda.current_stream(self._device).synchronize()
+        # A new mesh is built in Warp's stream, and an old one must outlive the casts still under way with it.
+        self._finish_work()
         self._shown[env_index] = meshes
         if len(meshes.fruits) > self._fruit_meshes.shape[1]:
             self._record(len(meshes.fruits))
@@ -313,6 +311,12 @@ class VisibilityCaster:
         # A recorded launch keeps addresses, not arrays: what they point to must stay alive with it.
         self._launched_with = [inputs for _, _, inputs in calls]
         self._launches = [command.launch for command in commands]
+        self._finish_work()
+
+    def _finish_work(self) -> None:
+        """Waits for what is under way on a GPU, in Warp's stream and in torch's."""
+        if self._is_cuda:
+            wp.synchronize_device(self._warp_device)
 
     def _check_targets(self) -> None:
         for env, (target, count) in enumerate(zip(self._targets.tolist(), self._num_fruits, strict=True)):
@@ -335,24 +339,3 @@ class VisibilityCaster:
             f"{n} must have shape {tuple(s)}, got {tuple(t.shape)}" for n, t, s in wanted if t.shape != s
         ]
         return InvalidInputError("; ".join(wrong))
-
-
-def _start_warp() -> None:
-    """Starts Warp without its greeting, its notes on loaded kernels and its warning where there is no GPU."""
-    if wp.config.log_level != wp.LOG_INFO:
-        wp.init()
-        return
-    wp.config.log_level = wp.LOG_WARNING
-    if torch.cuda.is_available():
-        wp.init()
-        return
-    # Warp's native library writes this warning to the process's standard error, past Python's streams.
-    sys.stderr.flush()
-    kept = os.dup(2)
-    try:
-        with open(os.devnull, "wb") as nowhere:
-            os.dup2(nowhere.fileno(), 2)
-        wp.init()
-    finally:
-        os.dup2(kept, 2)
-        os.close(kept)

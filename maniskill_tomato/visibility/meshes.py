@@ -13,18 +13,17 @@ from maniskill_tomato.plants.organs import Plant, SemanticClass
 FRUIT_CLASSES = (SemanticClass.FRUIT_RIPE, SemanticClass.FRUIT_TURNING, SemanticClass.FRUIT_GREEN)
 
 
-def build_mesh(vertices: Any, faces: NDArray[Any], device: str) -> Any:
+def build_mesh(vertices: NDArray[Any], faces: NDArray[Any], device: str) -> Any:
     """A Warp mesh with its bounding volume hierarchy.
 
     Args:
-        vertices: Positions in [m], as an array of Shape (V, 3) or a Warp array of vec3 to share.
+        vertices: Positions, in [m]. Shape (V, 3).
         faces: Vertex indices. Shape (F, 3).
         device: A Warp device name.
     """
-    if isinstance(vertices, np.ndarray):
-        vertices = wp.array(np.ascontiguousarray(vertices, dtype=np.float32), dtype=wp.vec3, device=device)
+    points = wp.array(np.ascontiguousarray(vertices, dtype=np.float32), dtype=wp.vec3, device=device)
     indices = wp.array(np.ascontiguousarray(faces, dtype=np.int32).ravel(), dtype=wp.int32, device=device)
-    return wp.Mesh(points=vertices, indices=indices, bvh_constructor="sah")
+    return wp.Mesh(points=points, indices=indices)
 
 
 class PlantMeshes:
@@ -38,12 +37,9 @@ class PlantMeshes:
         is_fruit = np.array([organ.semantic_class in FRUIT_CLASSES for organ in plant.organs])
         fruit_last = np.argsort(is_fruit[plant.organ_of_face], kind="stable")
         self.first_fruit_face = int(np.count_nonzero(~is_fruit[plant.organ_of_face]))
-        points = wp.array(np.ascontiguousarray(plant.vertices), dtype=wp.vec3, device=device)
-        self.whole = build_mesh(points, plant.faces[fruit_last], device)
-        self.fruits = [
-            build_mesh(points, plant.faces[plant.organ_of_face == fruit.organ_index], device)
-            for fruit in plant.fruits
-        ]
+        self.whole = build_mesh(plant.vertices, plant.faces[fruit_last], device)
+        organs = [plant.organs[fruit.organ_index] for fruit in plant.fruits]
+        self.fruits = [build_mesh(organ.vertices, organ.faces, device) for organ in organs]
         self.spheres = np.array([(*fruit.centre, fruit.radius) for fruit in plant.fruits], dtype=np.float32)
         """Centre in the plant frame and radius of each fruit, in [m]. Shape (F, 4)."""
         self.is_ripe = np.array([fruit.ripeness == "ripe" for fruit in plant.fruits], dtype=np.int32)
