@@ -1,8 +1,10 @@
 """Generated tomato plants: counts, shape, determinism, botany, and how leaves hide fruits."""
 
+import ast
 import dataclasses
 import hashlib
 import time
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -14,8 +16,10 @@ from maniskill_tomato.plants.config import (
     PRESETS,
     FruitConfig,
     HidingConfig,
+    LeafConfig,
     PlantConfig,
     StemConfig,
+    TrussConfig,
     make_config,
     make_full_config,
 )
@@ -420,6 +424,21 @@ def test_a_configuration_of_ones_own_grows() -> None:
     plant = generate_plant(config, 0)
     assert plant.preset == "cluster"
     assert len(plant.fruits) == 8
+
+
+@pytest.mark.parametrize(
+    "config", [StemConfig(), LeafConfig(), TrussConfig(), FruitConfig(), HidingConfig(), PlantConfig()]
+)
+def test_the_plants_page_lists_every_parameter_with_its_default(
+    config: StemConfig | LeafConfig | TrussConfig | FruitConfig | HidingConfig | PlantConfig,
+) -> None:
+    page = (Path(__file__).parents[1] / "docs" / "plants.md").read_text(encoding="utf-8")
+    section = page.split(f"### {type(config).__name__}\n")[1].split("\n### ")[0]
+    for item in dataclasses.fields(config):
+        (row,) = [line for line in section.splitlines() if line.startswith(f"| `{item.name}` |")]
+        value = getattr(config, item.name)
+        if not dataclasses.is_dataclass(value):
+            assert ast.literal_eval(row.split("`")[3]) == value
 
 
 @pytest.mark.parametrize("name", MATERIALS)

@@ -9,29 +9,13 @@ comparing renders with photos.
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field
 from math import isfinite
 
 from maniskill_tomato.errors import InvalidInputError
+from maniskill_tomato.plants.checks import check_positive, check_ranges
 
 MAX_LEAF_DENSITY = 2.0
-
-
-def _check_positive(config: object, *names: str) -> None:
-    for name in names:
-        value = getattr(config, name)
-        if not (isfinite(value) and value > 0):
-            raise InvalidInputError(f"{type(config).__name__}.{name} must be positive, got {value}")
-
-
-def _check_ranges(config: object) -> None:
-    """Refuses every (low, high) pair of a config that is not ascending."""
-    for item in fields(config):  # type: ignore[arg-type]
-        value = getattr(config, item.name)
-        if item.name.endswith("_range") and not (len(value) == 2 and value[0] <= value[1]):
-            raise InvalidInputError(
-                f"{type(config).__name__}.{item.name} must be (low, high) with low <= high, got {value}"
-            )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -65,10 +49,12 @@ class StemConfig:
     """Amplitude of the stem's slow sideways wander on its string, in [m]; [looks]."""
     zigzag: float = 0.0022
     """Sideways step of the axis at each node, away from the leaf, in [m]; [looks]."""
+    node_swelling: float = 0.26
+    """Thickening of the stem at a node over its radius; [looks]."""
 
     def __post_init__(self) -> None:
-        _check_positive(self, "height", "base_radius", "internode_length", "lower_internode_length")
-        _check_positive(self, "divergence_mean_deg", "nodes_below_first_truss", "leaves_per_truss")
+        check_positive(self, "height", "base_radius", "internode_length", "lower_internode_length")
+        check_positive(self, "divergence_mean_deg", "nodes_below_first_truss", "leaves_per_truss")
         if not 0 < self.tip_radius_ratio <= 1:
             raise InvalidInputError(
                 f"StemConfig.tip_radius_ratio must be in (0, 1], got {self.tip_radius_ratio}"
@@ -102,6 +88,14 @@ class LeafConfig:
     """
     petiole_fraction: float = 0.30
     """Part of the petiole and rachis that is bare, from the stem to the first leaflets; [looks]."""
+    leaflet_angle_deg: float = 66.0
+    """Angle of a lateral leaflet to the rachis before it droops, in [deg]; [looks]."""
+    leaflet_angle_spread_deg: float = 7.0
+    """Standard deviation of that angle, in [deg]; [Helios] leaflet yaw 10."""
+    leaflet_roll_spread_deg: float = 13.0
+    """Standard deviation of a leaflet's roll about its midrib, in [deg]; [Helios] +-20."""
+    leaflet_stalk: float = 0.016
+    """Length of a lateral leaflet's own stalk, in [m]; [looks]."""
     petiole_radius: float = 0.0026
     """Radius of the petiole at the stem, in [m]; [Helios] 2-2.5 mm."""
     leaflet_length_range: tuple[float, float] = (0.118, 0.155)
@@ -132,10 +126,12 @@ class LeafConfig:
     """Length of a small leaflet over that of the terminal one; [looks]."""
     young_leaves: int = 5
     """Leaves below the apex that are still growing; [looks]."""
+    youngest_size: float = 0.34
+    """Size of the youngest leaf relative to a grown one; [looks]."""
 
     def __post_init__(self) -> None:
-        _check_ranges(self)
-        _check_positive(self, "leaflet_aspect", "lateral_scale", "petiole_radius", "lobes_per_side")
+        check_ranges(self)
+        check_positive(self, "leaflet_aspect", "lateral_scale", "petiole_radius", "lobes_per_side")
         if not 1 <= self.pairs_range[0] <= self.pairs_range[1] <= 4:
             raise InvalidInputError(f"LeafConfig.pairs_range must lie in 1 to 4, got {self.pairs_range}")
 
@@ -164,21 +160,33 @@ class TrussConfig:
     """Radius at the peduncle's tip over that at its base; [airobotsight] 1.9 of 3.3 mm."""
     pedicel_length_range: tuple[float, float] = (0.024, 0.034)
     """Length of a pedicel from peduncle to calyx, in [m]; [looks]."""
+    pedicel_angle_deg: float = 62.0
+    """Angle of a pedicel to the peduncle where it leaves, in [deg]; [looks]."""
+    pedicel_angle_spread_deg: float = 9.0
+    """Standard deviation of that angle, in [deg]; [looks]."""
+    fruit_drop: float = 0.045
+    """How far a single fruit hangs below its truss's node, in [m]; places the nodes for `fruit_heights`."""
     pedicel_radius: float = 0.0015
     """Radius of a pedicel, in [m]; [Helios] 1.5 mm."""
     knuckle_fraction: float = 0.55
     """Where on the pedicel the knuckle (abscission zone) sits, from the peduncle; [looks]."""
+    knuckle_swelling: float = 0.75
+    """Thickening of the pedicel at its knuckle over its radius; [looks]."""
     sepals: int = 5
     """Sepals of a calyx; five-merous flower."""
     sepal_length: float = 1.0
     """Length of a sepal over the fruit's radius; [looks]."""
     sepal_width: float = 0.0056
-    """Width of a sepal, in [m]; [looks]."""
+    """Width of a sepal on a fruit of 30 mm radius, in [m]; [looks]."""
+    sepal_curl: float = 0.95
+    """Mean upward curl of a sepal towards its tip, in [rad]; [looks]."""
+    sepal_curl_spread: float = 0.45
+    """Standard deviation of that curl, in [rad]; [looks]."""
 
     def __post_init__(self) -> None:
-        _check_ranges(self)
-        _check_positive(self, "base_length", "pedicel_spacing", "base_radius", "pedicel_radius", "sepals")
-        _check_positive(self, "sepal_length", "sepal_width")
+        check_ranges(self)
+        check_positive(self, "base_length", "pedicel_spacing", "base_radius", "pedicel_radius", "sepals")
+        check_positive(self, "sepal_length", "sepal_width")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -189,6 +197,8 @@ class FruitConfig:
     """Equatorial radius of a grown fruit, in [m]; truss tomatoes are 50-65 mm across."""
     oblateness_range: tuple[float, float] = (0.86, 0.95)
     """Height over width; slightly flattened round type; [looks]."""
+    ribs_range: tuple[int, int] = (5, 7)
+    """Number of ribs, as many as locules show; truss tomatoes have few."""
     rib_depth_range: tuple[float, float] = (0.004, 0.018)
     """Depth of the ribs at the shoulder over the radius; [looks]."""
     shoulder_dent: float = 0.14
@@ -207,7 +217,7 @@ class FruitConfig:
     """Ripeness from which a fruit leaves green."""
 
     def __post_init__(self) -> None:
-        _check_ranges(self)
+        check_ranges(self)
         if not 0 < self.turning_above < self.ripe_above <= 1:
             raise InvalidInputError(
                 "FruitConfig must have 0 < turning_above < ripe_above <= 1, "
@@ -245,6 +255,15 @@ class HidingConfig:
     """Angle of the clear direction to the robot's side, in [deg]."""
     clear_elevation_range_deg: tuple[float, float] = (-36.0, -10.0)
     """Elevation of the clear direction, in [deg]; negative is from below, where leaves hang open."""
+    truss_spread_deg: float = 10.0
+    """Standard deviation of a truss's direction about that of the leaf above it, in [deg]; it hangs under the
+    leaf."""
+    truss_lean: float = 0.8
+    """Truss's angle to the robot's side after it has leaned to the aisle, over the angle before; [practice].
+    """
+    plant_turn_spread_deg: float = 9.0
+    """Standard deviation of the direction of the leaf above the middle fruit about the robot's side, in
+    [deg]."""
     clear_half_angle_deg: float = 8.0
     """Half angle by which the corridor free of other leaves widens away from the fruit, in [deg]."""
     clear_share: float = 0.95
@@ -253,8 +272,8 @@ class HidingConfig:
     """Radius over the fruit's radius of the corridor that the covering leaf's side leaflets keep free."""
 
     def __post_init__(self) -> None:
-        _check_ranges(self)
-        _check_positive(self, "attempts", "clear_half_angle_deg")
+        check_ranges(self)
+        check_positive(self, "attempts", "clear_half_angle_deg")
         if not self.covered_views_deg:
             raise InvalidInputError("HidingConfig.covered_views_deg must name at least one view")
 
@@ -266,9 +285,13 @@ class PlantConfig:
     name: str = "full"
     """Name of the preset, kept in `Plant.preset`."""
     stem: StemConfig = field(default_factory=StemConfig)
+    """Numbers of the main shoot."""
     leaf: LeafConfig = field(default_factory=LeafConfig)
+    """Numbers of the leaves."""
     truss: TrussConfig = field(default_factory=TrussConfig)
+    """Numbers of the trusses."""
     fruit: FruitConfig = field(default_factory=FruitConfig)
+    """Numbers of the fruits."""
     fruits_per_truss: tuple[int, ...] = (6, 6, 5, 4, 2)
     """Fruits of each truss from the lowest up; ~8 on cocktail, 6-7 on plum trusses before pruning;
     [practice]."""
@@ -287,7 +310,7 @@ class PlantConfig:
     leaves."""
 
     def __post_init__(self) -> None:
-        _check_ranges(self)
+        check_ranges(self)
         if not (isfinite(self.leaf_density) and 0 <= self.leaf_density <= MAX_LEAF_DENSITY):
             raise InvalidInputError(
                 f"leaf_density must be a number from 0 (no leaves) to {MAX_LEAF_DENSITY:g}, "

@@ -73,10 +73,11 @@ def draw_berry(config: FruitConfig, rng: Generator, truss: int, position: int) -
     tilt = radians(normal(rng, 0.0, config.tilt_spread_deg))
     around = 2 * pi * rng.random()
     axis = np.array([sin(tilt) * cos(around), sin(tilt) * sin(around), cos(tilt)])
+    low, high = config.ribs_range
     return Berry(
         radius=uniform(rng, config.radius_range) * grown,
         oblateness=uniform(rng, config.oblateness_range),
-        ribs=5 + int(3 * rng.random()),
+        ribs=low + int((high + 1 - low) * rng.random()),
         rib_depth=uniform(rng, config.rib_depth_range),
         rib_phase=2 * pi * rng.random(),
         dent=config.shoulder_dent * normal(rng, 1.0, 0.15),

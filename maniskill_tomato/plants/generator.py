@@ -40,10 +40,12 @@ def _grow_trusses(config: PlantConfig, shoot: Shoot, seed: int) -> list[Truss]:
             continue
         rng = stream(seed, Stream.TRUSS, k)
         if config.hiding:
-            azimuth = float(shoot.azimuths[node + 1]) + radians(normal(rng, 0.0, 10.0))
+            azimuth = float(shoot.azimuths[node + 1]) + radians(
+                normal(rng, 0.0, config.hiding.truss_spread_deg)
+            )
             # Trusses lean to the aisle, so the outer ones turn back part of the way.
             aside = (azimuth - pi + pi) % (2 * pi) - pi
-            azimuth = pi + 0.8 * aside
+            azimuth = pi + config.hiding.truss_lean * aside
         else:
             azimuth = pi + radians(normal(rng, 0.0, config.truss.azimuth_spread_deg, 2.0))
         height = float(shoot.heights[node]) + 0.012
@@ -71,7 +73,8 @@ def _grow_leaves(config: PlantConfig, shoot: Shoot, seed: int, fruits: list[Hang
             # Drawn first, so that the foliage of a lower density is part of that of a higher one.
             if rng.random() >= share:
                 continue
-            vigour = min(1.0, 0.34 + 0.66 * (last - node) / max(config.leaf.young_leaves, 1))
+            youngest = config.leaf.youngest_size
+            vigour = min(1.0, youngest + (1.0 - youngest) * (last - node) / max(config.leaf.young_leaves, 1))
             azimuth = float(shoot.azimuths[node])
             if side_shoot:
                 azimuth += radians(40.0) * (1.0 if rng.random() < 0.5 else -1.0)

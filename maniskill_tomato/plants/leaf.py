@@ -150,7 +150,7 @@ def draw_leaf(
         direction = _droop(cos(spread) * tangent + sin(spread) * left, pull)
         # The upper side turns to the sky and outward from the stem.
         sky = cross(tangent, left) + np.array([0.0, 0.0, 0.35])
-        roll = radians(normal(rng, 0.0, 13.0))
+        roll = radians(normal(rng, 0.0, config.leaflet_roll_spread_deg))
         up = normalized(sky - direction * float(sky @ direction))
         up = cos(roll) * up + sin(roll) * cross(direction, up)
         base = point + stalk * direction
@@ -176,7 +176,7 @@ def draw_leaf(
         )
         stalks.append((point, base + 0.02 * length * direction))
 
-    add(1.0, 0.0, terminal_length, 0.0, 0.012 * size, droop)
+    add(1.0, 0.0, terminal_length, 0.0, 0.75 * config.leaflet_stalk * size, droop)
     bare = config.petiole_fraction
     for pair in range(pairs):
         fraction = bare + (0.90 - bare) * ((pair + 0.35) / max(pairs - 0.4, 1))
@@ -186,14 +186,15 @@ def draw_leaf(
             length = terminal_length * config.lateral_scale * shape * normal(rng, 1.0, 0.09)
             offset = normal(rng, 0.0, 0.018)
             pull = uniform(rng, config.leaflet_droop_range)
-            add(min(fraction + offset, 0.97), side, length, normal(rng, 66.0, 7.0), 0.016 * size, pull)
+            angle = normal(rng, config.leaflet_angle_deg, config.leaflet_angle_spread_deg)
+            add(min(fraction + offset, 0.97), side, length, angle, config.leaflet_stalk * size, pull)
         if pair + 1 < pairs:
             gap = (0.90 - bare) / max(pairs - 0.4, 1)
             for k in range(config.intercalary_per_gap):
                 for side in (1.0, -1.0):
                     at = fraction + gap * (k + 1) / (config.intercalary_per_gap + 1) + normal(rng, 0.0, 0.012)
                     length = terminal_length * config.intercalary_scale * normal(rng, 1.0, 0.25)
-                    add(at, side, length, normal(rng, 72.0, 9.0), 0.004, 0.3)
+                    add(at, side, length, normal(rng, config.leaflet_angle_deg + 6.0, 9.0), 0.004, 0.3)
     return Leaf(
         rachis, config.petiole_radius * (0.55 + 0.45 * vigour), tuple(leaflets), tuple(stalks), variant
     )

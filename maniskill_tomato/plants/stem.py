@@ -72,7 +72,7 @@ def grow_shoot(config: PlantConfig, seed: int) -> Shoot:
         # The internodes stretch so that each fruit hangs at its height; a fruit hangs a little under its
         # node.
         spread = np.array([2 * rng.random() - 1 for _ in truss_nodes]) * config.fruit_height_spread
-        drop = 0.045
+        drop = config.truss.fruit_drop
         targets = np.array(config.fruit_heights) + spread + drop
         knots = np.concatenate([[0.0], heights[list(truss_nodes)]])
         values = np.concatenate([[0.0], targets])
@@ -81,7 +81,9 @@ def grow_shoot(config: PlantConfig, seed: int) -> Shoot:
     if config.hiding:
         # The leaf above the middle fruit points to the robot's side, as a grower turns a plant on its string.
         middle = truss_nodes[len(truss_nodes) // 2] + 1
-        azimuths = azimuths - azimuths[middle] + pi + radians(normal(rng, 0.0, 9.0))
+        azimuths = (
+            azimuths - azimuths[middle] + pi + radians(normal(rng, 0.0, config.hiding.plant_turn_spread_deg))
+        )
     else:
         azimuths = azimuths + start
     inside = heights < stem.height - 0.02
@@ -98,7 +100,7 @@ def stem_patch(shoot: Shoot, *, picture: bool) -> Patch:
     """The stem as a tube that swells at each node."""
     height = shoot.config.stem.height
     offsets = np.array([-0.009, -0.003, 0.003, 0.009]) if picture else np.array([-0.008, 0.0, 0.010])
-    swell = np.array([0.0, 0.22, 0.26, 0.0]) if picture else np.array([0.0, 0.26, 0.0])
+    swell = shoot.config.stem.node_swelling * np.array([0.0, 0.85, 1.0, 0.0] if picture else [0.0, 1.0, 0.0])
     z = (shoot.heights[:, None] + offsets).ravel()
     bulge = np.tile(swell, len(shoot.heights))
     inner = (z > 0.012) & (z < height - 0.012)

@@ -112,7 +112,7 @@ def draw_truss(
         tangent = tangents[at]
         left = normalized(cross(UP, np.array([cos(azimuth), sin(azimuth), 0.0])))
         side = first_side * (-1.0) ** i
-        spread = radians(normal(rng, 62.0, 9.0))
+        spread = radians(normal(rng, config.pedicel_angle_deg, config.pedicel_angle_spread_deg))
         outward = np.array([cos(azimuth), sin(azimuth), 0.0]) * normal(rng, 0.30, 0.15)
         starts.append(curve[at])
         directions.append(normalized(cos(spread) * tangent + sin(spread) * side * left + outward))
@@ -134,7 +134,9 @@ def draw_truss(
         reach = float(np.sqrt(((seat - p) ** 2).sum()))
         handle = max(0.4 * n, 0.45 * reach)
         control = np.stack([p, p + handle * d, seat + handle * berry.axis, seat])
-        curls = np.array([normal(rng, 0.95, 0.45) for _ in range(config.sepals)])
+        curls = np.array(
+            [normal(rng, config.sepal_curl, config.sepal_curl_spread) for _ in range(config.sepals)]
+        )
         fruits.append(Hanging(berry, centre, control, 2 * pi * rng.random(), curls))
     return Truss(base, azimuth, start, end, length, tuple(fruits))
 
@@ -201,7 +203,11 @@ def truss_parts(config: TrussConfig, truss: Truss, *, picture: bool) -> tuple[Me
         points = 15 if picture else 5
         part = np.linspace(0.0, 1.0, points)
         # The knuckle is a ring; towards the calyx the stalk widens into a small disc.
-        thick = 1.0 + 0.75 * np.exp(-(((part - knuckle) / 0.07) ** 2)) + 1.1 * np.exp(-((1 - part) / 0.09))
+        thick = (
+            1.0
+            + config.knuckle_swelling * np.exp(-(((part - knuckle) / 0.07) ** 2))
+            + 1.1 * np.exp(-((1 - part) / 0.09))
+        )
         stalks.append(
             tube(
                 bezier(hanging.pedicel, points),
