@@ -1,5 +1,4 @@
-"""Exploration: the thesis's two schemes and autoregressive noise, each with its own sample for every
-environment."""
+"""Exploration: the thesis's two schemes and look-at goals, each with its own sample for every environment."""
 
 from collections.abc import Sequence
 from typing import Protocol
@@ -8,16 +7,32 @@ import torch
 from torch import Tensor
 
 from maniskill_tomato.learning.presets import EPSILON_GREEDY_HIGH, EPSILON_GREEDY_LOW, TrainConfig
+from maniskill_tomato.robot.iiwa14 import BASE_TO_SHOULDER, WRIST_TO_EE
+
+GOAL_DISTANCE = (0.25, 0.6)
+"""Distances of look-at goals from the target, in [m]; nearer the D435 sees no depth."""
+
+GOAL_DRAWS = 16
+
+WRIST_REACH = (0.45, 0.8)
+"""Distances of the wrist's centre from the shoulder that the arm reaches with a margin, in [m]; it can at
+most reach 0.82."""
+
+GOAL_TOLERANCE = 0.25
+"""A goal is reached when every component is this near, in units of the action scale."""
 
 
 class Exploration(Protocol):
     """Turns what the policy would do into what is tried."""
 
-    def explore(self, policy_actions: Tensor, step: int, episode_starts: Tensor) -> Tensor:
+    def explore(
+        self, policy_actions: Tensor, observations: Tensor, step: int, episode_starts: Tensor
+    ) -> Tensor:
         """The actions to take.
 
         Args:
             policy_actions: In units of the action scale. Shape (N, action_dim).
+            observations: What the policy saw, in the environment's units. Shape (N, observation_dim).
             step: Environment steps taken before this one.
             episode_starts: True where this is the first step of an episode. Shape (N,).
 
@@ -63,7 +78,9 @@ class EpsilonGreedy:
     def amount(self, step: int) -> float:
         return epsilon_greedy_schedule(step, self._exploration_steps)
 
-    def explore(self, policy_actions: Tensor, step: int, episode_starts: Tensor) -> Tensor:
+    def explore(
+        self, policy_actions: Tensor, observations: Tensor, step: int, episode_starts: Tensor
+    ) -> Tensor:
         count, device = len(policy_actions), policy_actions.device
         explores = torch.rand(count, 1, generator=self._generator, device=device) < 1.0 - self.amount(step)
         uniform = torch.rand(policy_actions.shape, generator=self._generator, device=device)
@@ -85,16 +102,22 @@ class DecayingGaussian:
     def amount(self, step: int) -> float:
         return decaying_schedule(step, self._exploration_steps)
 
-    def explore(self, policy_actions: Tensor, step: int, episode_starts: Tensor) -> Tensor:
+    def explore(
+        self, policy_actions: Tensor, observations: Tensor, step: int, episode_starts: Tensor
+    ) -> Tensor:
         noise = torch.randn(policy_actions.shape, generator=self._generator, device=policy_actions.device)
         return (policy_actions + self.amount(step) * self._noise * noise).clamp_(-1.0, 1.0)
 
 
-class Autoregressive:
-    """Noise that remembers: n' = rho n + sqrt(1 - rho^2) sigma N(0, 1), fresh at every episode.
+class LookAtGoals:
+    """Some episodes walk between random viewpoints that look at the target; the others follow the policy with
+    noise.
 
-    Sigma falls linearly over the schedule. During the first `warmup_steps` the policy is not asked: each
-    episode keeps one random direction and the noise is added to it.
+    A random walk in six dimensions soon looks away from the target and then learns nothing about views of it.
+    So an episode is, with a probability that falls linearly from 1 to `goal_share`, led through goals:
+    positions around the target on the robot's side, at the distances of `GOAL_DISTANCE`, with the tool axis
+    towards the target. Only the observation is used for it. Gaussian noise, falling linearly from `noise` to
+    `noise_end`, is added to both kinds.
     """
 
     def __init__(
@@ -102,46 +125,85 @@ class Autoregressive:
         exploration_steps: int,
         noise: float,
         noise_end: float,
-        correlation: float,
+        goal_share: float,
+        action_scale: Sequence[float],
         warmup_steps: int,
         generator: torch.Generator | None = None,
+        device: torch.device | str = "cpu",
     ) -> None:
         self._exploration_steps = exploration_steps
         self._noise = noise
         self._noise_end = noise_end
-        self._correlation = correlation
+        self._goal_share = goal_share
         self._warmup_steps = warmup_steps
+        self._scale = torch.tensor(action_scale, device=device)
         self._generator = generator
-        self._state: Tensor | None = None
-        self._direction: Tensor | None = None
+        self._led: Tensor | None = None
+        self._goals = torch.zeros(0, 6, device=device)
 
     def amount(self, step: int) -> float:
         remaining = decaying_schedule(step, self._exploration_steps)
         return self._noise_end + remaining * (self._noise - self._noise_end)
 
-    def explore(self, policy_actions: Tensor, step: int, episode_starts: Tensor) -> Tensor:
-        shape, device = policy_actions.shape, policy_actions.device
-        fresh = torch.randn(shape, generator=self._generator, device=device)
-        if self._state is None or self._state.shape != shape:
-            self._state = fresh
-        else:
-            rho = self._correlation
-            kept = rho * self._state + (1.0 - rho * rho) ** 0.5 * fresh
-            self._state = torch.where(episode_starts[:, None], fresh, kept)
-        base = self._warmup(policy_actions, episode_starts) if step < self._warmup_steps else policy_actions
-        return (base + self.amount(step) * self._state).clamp_(-1.0, 1.0)
+    def goal_share(self, step: int) -> float:
+        """Probability that an episode which starts at `step` is led: 1 in the warm-up, then falling
+        linearly."""
+        if step < self._warmup_steps:
+            return 1.0
+        remaining = decaying_schedule(step, self._exploration_steps)
+        return self._goal_share + remaining * (1.0 - self._goal_share)
 
-    def _warmup(self, policy_actions: Tensor, episode_starts: Tensor) -> Tensor:
-        """One direction per episode, uniform within [-1, 1] on every axis."""
-        fresh = (
-            2.0 * torch.rand(policy_actions.shape, generator=self._generator, device=policy_actions.device)
-            - 1.0
-        )
-        if self._direction is None or self._direction.shape != policy_actions.shape:
-            self._direction = fresh
+    def explore(
+        self, policy_actions: Tensor, observations: Tensor, step: int, episode_starts: Tensor
+    ) -> Tensor:
+        count, device = len(policy_actions), policy_actions.device
+        drawn = torch.rand(count, generator=self._generator, device=device) < self.goal_share(step)
+        goals = draw_look_at_goals(observations[:, 6:9], self._generator)
+        if self._led is None or len(self._led) != count:
+            self._led, self._goals = drawn, goals
         else:
-            self._direction = torch.where(episode_starts[:, None], fresh, self._direction)
-        return self._direction
+            self._led = torch.where(episode_starts, drawn, self._led)
+            arrived = (((self._goals - observations[:, :6]) / self._scale).abs() < GOAL_TOLERANCE).all(dim=-1)
+            self._goals = torch.where((episode_starts | arrived)[:, None], goals, self._goals)
+        towards = ((self._goals - observations[:, :6]) / self._scale).clamp_(-1.0, 1.0)
+        base = torch.where(self._led[:, None], towards, policy_actions)
+        noise = torch.randn(base.shape, generator=self._generator, device=device)
+        return (base + self.amount(step) * noise).clamp_(-1.0, 1.0)
+
+
+def draw_look_at_goals(targets: Tensor, generator: torch.Generator | None = None) -> Tensor:
+    """Random viewpoints (x, y, z, roll 0, pitch, yaw) that look at `targets` from the robot's side.
+
+    Directions are uniform on the half sphere with x < 0, distances uniform in `GOAL_DISTANCE`, redrawn up to
+    `GOAL_DRAWS` times until the goal is outside the zone that the thesis forbids and the arm can probably
+    reach it: the centre of its wrist lies between `WRIST_REACH` of its shoulder.
+
+    Args:
+        targets: Target positions in the world frame, in [m]. Shape (N, 3).
+        generator: Source of the draws.
+
+    Returns:
+        In [m] and [rad], world frame. Shape (N, 6).
+    """
+    shape, device = (GOAL_DRAWS, *targets.shape), targets.device
+    directions = torch.randn(shape, generator=generator, device=device)
+    directions[..., 0] = -directions[..., 0].abs()
+    directions = directions / directions.norm(dim=-1, keepdim=True).clamp(min=1e-6)
+    near, far = GOAL_DISTANCE
+    distances = near + (far - near) * torch.rand((*shape[:2], 1), generator=generator, device=device)
+    positions = targets + distances * directions
+    looks = -directions
+    wrists = positions - WRIST_TO_EE * looks - torch.tensor((0.0, 0.0, BASE_TO_SHOULDER), device=device)
+    reach = wrists.norm(dim=-1)
+    allowed = (positions[..., 0] <= 0.7) & (positions[..., 2] >= 0.25)
+    good = allowed & (reach > WRIST_REACH[0]) & (reach < WRIST_REACH[1])
+    first = good.int().argmax(dim=0)
+    rows = torch.arange(len(targets), device=device)
+    position, look = positions[first, rows], looks[first, rows]
+    # With roll 0 the tool's z axis is (sin pitch cos yaw, sin pitch sin yaw, cos pitch).
+    pitch = torch.arccos(look[:, 2].clamp(-1.0, 1.0))
+    yaw = torch.atan2(look[:, 1], look[:, 0])
+    return torch.cat((position, torch.stack((torch.zeros_like(pitch), pitch, yaw), dim=-1)), dim=-1)
 
 
 def make_exploration(
@@ -152,11 +214,13 @@ def make_exploration(
         return EpsilonGreedy(config.exploration_steps, config.action_scale, generator, device)
     if config.exploration == "decaying-gaussian":
         return DecayingGaussian(config.exploration_steps, config.exploration_noise, generator)
-    return Autoregressive(
+    return LookAtGoals(
         config.exploration_steps,
         config.exploration_noise,
         config.exploration_noise_end,
-        config.exploration_correlation,
+        config.exploration_goal_share,
+        config.action_scale,
         config.learning_starts,
         generator,
+        device,
     )

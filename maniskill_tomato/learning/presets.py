@@ -38,7 +38,7 @@ EPSILON_GREEDY_HIGH = (0.1, 0.1, 0.1, 0.43, 0.17, 0.26)
 """Upper ends of Eq. 5-6 in the order of `ACTION_NAMES`. [m], [rad]."""
 
 PresetName = Literal["td3", "thesis-guided", "thesis-sparse"]
-ExplorationName = Literal["epsilon-greedy", "decaying-gaussian", "autoregressive"]
+ExplorationName = Literal["epsilon-greedy", "decaying-gaussian", "look-at-goals"]
 
 _AT_LEAST_ONE = (
     "batch_size",
@@ -128,9 +128,9 @@ class TrainConfig:
     exploration_noise: float = 0.1
     """Standard deviation of the noise at the start, in units of the action scale."""
     exploration_noise_end: float = 0.0
-    """Standard deviation at the end of the schedule (autoregressive only), in units of the action scale."""
-    exploration_correlation: float = 0.0
-    """Correlation of the noise of one step with the next (autoregressive only)."""
+    """Standard deviation at the end of the schedule (look-at goals only), in units of the action scale."""
+    exploration_goal_share: float = 0.0
+    """Share of episodes led through look-at goals at the end of the schedule (look-at goals only)."""
 
     # Running.
     num_envs: int = 1
@@ -147,7 +147,7 @@ class TrainConfig:
                 raise InvalidInputError(f"{name} must be above 0, got {value}")
         if self.total_episodes is None and self.total_timesteps is None and self.max_minutes is None:
             raise InvalidInputError("set at least one of total_episodes, total_timesteps and max_minutes")
-        for name in ("gamma", "exploration_correlation"):
+        for name in ("gamma", "exploration_goal_share"):
             if not 0.0 <= getattr(self, name) < 1.0:
                 raise InvalidInputError(f"{name} must be in [0, 1), got {getattr(self, name)}")
         for name in ("tau", "actor_learning_rate", "critic_learning_rate"):
@@ -199,15 +199,16 @@ class TrainConfig:
 
 PRESETS: dict[PresetName, TrainConfig] = {
     "td3": TrainConfig(
-        total_timesteps=60_000,
+        total_timesteps=15_000,
         reward="potential",
-        gamma=0.95,
-        tau=0.005,
+        step_cost=0.05,
+        gamma=0.9,
+        tau=0.01,
         batch_size=256,
         buffer_size=100_000,
         learning_starts=1500,
-        updates_per_step=1.0,
-        actor_learning_rate=5e-4,
+        updates_per_step=0.5,
+        actor_learning_rate=1e-3,
         critic_learning_rate=1e-3,
         twin_critics=True,
         policy_frequency=2,
@@ -218,12 +219,12 @@ PRESETS: dict[PresetName, TrainConfig] = {
         critic_action_layer=0,
         actor_output_init="small",
         normalize_observations=True,
-        action_scale=(0.25, 0.25, 0.25, 0.35, 0.35, 0.35),
-        exploration="autoregressive",
-        exploration_steps=15_000,
-        exploration_noise=0.5,
+        action_scale=(0.35, 0.35, 0.35, 0.6, 0.6, 0.6),
+        exploration="look-at-goals",
+        exploration_steps=10_000,
+        exploration_noise=0.3,
         exploration_noise_end=0.1,
-        exploration_correlation=0.7,
+        exploration_goal_share=0.1,
     ),
     "thesis-guided": TrainConfig(
         total_episodes=240, buffer_size=1000, exploration="epsilon-greedy", exploration_steps=1200

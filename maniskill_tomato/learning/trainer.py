@@ -151,7 +151,9 @@ class Trainer:
         """Steps until the end; returns why it ended."""
         episode_starts = torch.ones(self._env.num_envs, dtype=torch.bool, device=observations.device)
         while (reason := stop.reason or self._end_reason()) is None:
-            actions = self._exploration.explore(self._agent.policy(observations), self._step, episode_starts)
+            actions = self._exploration.explore(
+                self._agent.policy(observations), observations, self._step, episode_starts
+            )
             next_observations, rewards, terminations, truncations, info = self._env.step(
                 actions * self._scale
             )
@@ -273,3 +275,26 @@ class Trainer:
             "config": self._config.to_dict(),
         }
         write_atomically(self._run_dir / "config.json", (json.dumps(content, indent=2) + "\n").encode())
+
+
+def check_run_dir(run_dir: Path) -> None:
+    """Accepts a folder for a new run.
+
+    Raises:
+        InvalidInputError: It already holds a run, or is a file.
+    """
+    if run_dir.exists() and not run_dir.is_dir():
+        raise InvalidInputError(f"{run_dir} is a file; choose another --out")
+    if (run_dir / "config.json").exists():
+        raise InvalidInputError(f"{run_dir} already holds a run; choose another --out or pass --overwrite")
+
+
+def clear_run(run_dir: Path) -> None:
+    """Removes what an earlier run wrote into `run_dir`, and nothing else."""
+    if not (run_dir / "config.json").is_file():
+        return
+    for name in ("config.json", "episodes.csv", "history.npz", "policy.pt"):
+        (run_dir / name).unlink(missing_ok=True)
+    for pattern in ("checkpoints/step_*.pt", "tensorboard/events.out.tfevents.*"):
+        for path in run_dir.glob(pattern):
+            path.unlink()

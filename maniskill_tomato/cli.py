@@ -1,0 +1,281 @@
+"""The command `maniskill-tomato`: train, evaluate, demonstrate.
+
+Examples:
+    maniskill-tomato train TomatoViewpointGuided-v1
+    maniskill-tomato train TomatoViewpointSparse-v1 --preset thesis-sparse --seed 3
+    maniskill-tomato eval TomatoViewpointGuided-v1 --policy runs/demo/training/policy.pt --episodes 100
+    maniskill-tomato demo
+"""
+
+import dataclasses
+import logging
+import sys
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any
+
+import tyro
+
+from maniskill_tomato.errors import InvalidInputError, TomatoError
+from maniskill_tomato.learning.presets import PRESETS, PresetName, TrainConfig
+from maniskill_tomato.tasks import TASK_IDS
+
+# PyTorch and ManiSkill take seconds to import, so that every command imports what it needs when it runs.
+
+THESIS_WINDOWS: dict[str, tuple[int, int]] = {"thesis-guided": (12, 75), "thesis-sparse": (30, 180)}
+"""Moving-average windows of the thesis's training curves, in episodes and steps (Fig. 5-1 to 5-4, 5-14 to
+5-17)."""
+
+EnvId = Annotated[
+    str, tyro.conf.Positional, tyro.conf.arg(metavar="ENV_ID", help=f"One of {', '.join(TASK_IDS)}.")
+]
+
+
+@dataclass(frozen=True, kw_only=True)
+class PlantOptions:
+    """Another plant than the task's own."""
+
+    plant: str | None = None
+    """Preset of the plant: one_tomato, three_tomatoes or full."""
+    plant_seed: str | None = None
+    """Its seed, or train, validation or held_out for a new plant of that split in every episode."""
+    plant_pose: tuple[float, float, float] | None = None
+    """Where it stands: x [m], y [m], yaw [rad]."""
+
+    def env_options(self) -> dict[str, Any]:
+        """The options for `gymnasium.make`."""
+        plant: dict[str, Any] = {}
+        if self.plant is not None:
+            plant["preset"] = self.plant
+        if self.plant_seed is not None:
+            plant["seed"] = int(self.plant_seed) if self.plant_seed.isdigit() else self.plant_seed
+        options: dict[str, Any] = {"plant": plant} if plant else {}
+        if self.plant_pose is not None:
+            options["plant_pose"] = self.plant_pose
+        return options
+
+
+@dataclass(frozen=True, kw_only=True)
+class Train:
+    """Train a policy; the other options start from the preset's values."""
+
+    env_id: EnvId
+    """Id of the task."""
+    preset: PresetName = "td3"
+    """Named configuration: a good default, or the thesis's Table 5-1 or 5-2."""
+    seed: int = 0
+    """Seed of everything that is random."""
+    out: Path | None = None
+    """Folder of the run; by default one below runs/ named after the task, the preset, the seed and the
+    time."""
+    overwrite: bool = False
+    """Replace a run that the folder already holds."""
+    plants: PlantOptions = PlantOptions()
+    """Another plant."""
+    config: TrainConfig = PRESETS["td3"]
+    """The training configuration."""
+
+    def run(self) -> None:
+        """Trains and says where the policy is."""
+        out = self.out
+        if out is None:
+            name = f"{self.env_id}-{self.preset}-seed{self.seed}-{time.strftime('%Y%m%d-%H%M%S')}"
+            out = Path("runs") / name
+        result = train(self.env_id, self.config, out, self.seed, self.plants.env_options(), self.overwrite)
+        print(f"trained {result.steps} steps in {result.seconds:.0f} s ({result.stop_reason})")
+        print(f"policy  {result.policy_path}")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Eval:
+    """Evaluate a policy: metrics.json, plots, a film and report.html."""
+
+    env_id: EnvId
+    """Id of the task."""
+    policy: str | None = None
+    """File of the policy, or `random`; by default the one that ships with the package."""
+    episodes: int = 100
+    """How many episodes."""
+    seed: int = 1000
+    """Seed of the first episode; the others follow."""
+    out: Path = Path("runs/eval")
+    """Folder of the results."""
+    baseline: bool = True
+    """Also run random actions, to compare."""
+    video: bool = True
+    """Film the first episodes where this machine can render."""
+    allow_other_task: bool = False
+    """Accept a policy that was trained on another task."""
+    plants: PlantOptions = PlantOptions()
+    """Another plant."""
+
+    def run(self) -> None:
+        """Evaluates and says where the report is."""
+        from maniskill_tomato.evaluation.evaluate import EvaluationConfig, evaluate
+        from maniskill_tomato.learning.envs import check_env_id
+        from maniskill_tomato.learning.policy import Policy, RandomPolicy, load_policy
+
+        check_env_id(self.env_id)
+        path: Path | None = None
+        policy: Policy | RandomPolicy = RandomPolicy(self.seed)
+        if self.policy != "random":
+            path = Path(self.policy) if self.policy else shipped_policy(self.env_id)
+            policy = load_policy(path, env_id=None if self.allow_other_task else self.env_id)
+        run_dir = path.parent if path is not None and (path.parent / "history.npz").is_file() else None
+        config = EvaluationConfig(
+            env_id=self.env_id,
+            episodes=self.episodes,
+            seed=self.seed,
+            out=self.out,
+            env_options=self.plants.env_options(),
+            baseline=self.baseline,
+            video=self.video,
+            title="Where to look: evaluation",
+            training_run=run_dir,
+        )
+        result = evaluate(config, policy, path)
+        print(summary(result.metrics))
+        if result.left_out:
+            print(result.left_out)
+        print(f"metrics {self.out / 'metrics.json'}")
+        print(f"report  {result.report}")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Demo:
+    """Train the guided task, evaluate the policy and write a report with a film."""
+
+    out: Path = Path("runs/demo")
+    """Folder of the demo; an earlier demo in it is replaced."""
+    minutes: float = 6.0
+    """Longest training time, in [min]; it usually ends sooner."""
+    episodes: int = 100
+    """Evaluation episodes."""
+    seed: int = 0
+    """Seed of the training."""
+    video: bool = True
+    """Film the first episodes where this machine can render."""
+
+    def run(self) -> None:
+        """Runs all three parts and names the results."""
+        from maniskill_tomato.evaluation.evaluate import EvaluationConfig, evaluate
+        from maniskill_tomato.learning.policy import load_policy
+
+        env_id = "TomatoViewpointGuided-v1"
+        print(f"1/2 training on {env_id}, at most {self.minutes:g} minutes")
+        config = dataclasses.replace(PRESETS["td3"], max_minutes=self.minutes)
+        trained = train(env_id, config, self.out / "training", self.seed, {}, overwrite=True)
+        print(f"    {trained.steps} steps in {trained.seconds:.0f} s ({trained.stop_reason})")
+        print(f"2/2 evaluating {self.episodes} episodes")
+        evaluation = EvaluationConfig(
+            env_id=env_id,
+            episodes=self.episodes,
+            seed=1000,
+            out=self.out,
+            video=self.video,
+            title="Where to look: a policy that uncovers a hidden tomato",
+            training_run=trained.run_dir,
+        )
+        result = evaluate(evaluation, load_policy(trained.policy_path), trained.policy_path)
+        print(summary(result.metrics))
+        if result.left_out:
+            print(result.left_out)
+        print(f"report  {result.report}")
+        print(f"video   {result.video or 'none, see above' if self.video else 'not wanted'}")
+        print(f"policy  {trained.policy_path}")
+
+
+def train(
+    env_id: str, config: TrainConfig, out: Path, seed: int, env_options: dict[str, Any], overwrite: bool
+) -> Any:
+    """Trains in `out`; returns the `TrainResult`."""
+    from maniskill_tomato.learning.envs import check_env_id, make_learner_env
+    from maniskill_tomato.learning.trainer import Trainer, check_run_dir, clear_run
+
+    check_env_id(env_id)
+    if overwrite:
+        clear_run(out)
+    check_run_dir(out)
+    env = make_learner_env(env_id, config.num_envs, **env_options)
+    try:
+        return Trainer(env, env_id, config, out, seed).run()
+    finally:
+        env.close()
+
+
+def shipped_policy(env_id: str) -> Path:
+    """The trained policy that ships with the package.
+
+    Raises:
+        InvalidInputError: None ships for this task.
+    """
+    from maniskill_tomato.assets import asset_path
+
+    try:
+        return asset_path(f"policies/{env_id}.pt")
+    except FileNotFoundError as error:
+        raise InvalidInputError(
+            f"no policy for {env_id} ships with this version; train one with `maniskill-tomato train {env_id}` and "
+            "give its policy.pt with --policy"
+        ) from error
+
+
+def summary(metrics: dict[str, Any]) -> str:
+    """One line with the figures that matter."""
+    low, high = metrics["success_rate_interval_95"]
+    return (
+        f"success {metrics['success_rate']:.0%} of {metrics['episodes']} episodes "
+        f"(95 % interval {low:.0%} to {high:.0%}), "
+        f"{metrics['mean_steps']:.1f} steps, largest V_f {metrics['mean_max_visible_fraction']:.2f} on average"
+    )
+
+
+def parse(argv: Sequence[str]) -> Train | Eval | Demo:
+    """The command that the arguments describe; `train` options default to those of its `--preset`."""
+    preset = _asked_preset(argv)
+    train_default = Train(env_id=tyro.MISSING, preset=preset, config=PRESETS[preset])
+    commands: Any = (
+        Annotated[Train, tyro.conf.subcommand("train", default=train_default)]
+        | Annotated[Eval, tyro.conf.subcommand("eval")]
+        | Annotated[Demo, tyro.conf.subcommand("demo")]
+    )
+    command: Train | Eval | Demo = tyro.cli(
+        commands,
+        prog="maniskill-tomato",
+        description="Active perception for tomato harvesting: train, evaluate, demonstrate.",
+        args=list(argv),
+        config=(tyro.conf.OmitArgPrefixes,),
+    )
+    return command
+
+
+def _asked_preset(argv: Sequence[str]) -> PresetName:
+    """The value of `--preset`, or the default where there is none or tyro will refuse it."""
+    for index, argument in enumerate(argv):
+        value = argument.removeprefix("--preset=")
+        if argument == "--preset" and index + 1 < len(argv):
+            value = argv[index + 1]
+        for name in PRESETS:
+            if value == name and argument.startswith("--preset"):
+                return name
+    return "td3"
+
+
+def main(argv: Sequence[str] | None = None) -> None:
+    """Runs the command; errors made on purpose end with one line and exit status 2."""
+    logging.basicConfig(level=logging.WARNING, format="%(message)s", stream=sys.stderr)
+    logging.getLogger("maniskill_tomato").setLevel(logging.INFO)
+    try:
+        parse(sys.argv[1:] if argv is None else argv).run()
+    except TomatoError as error:
+        print(f"error: {error}", file=sys.stderr)
+        raise SystemExit(2) from None
+    except KeyboardInterrupt:
+        print("stopped", file=sys.stderr)
+        raise SystemExit(130) from None
+
+
+if __name__ == "__main__":
+    main()

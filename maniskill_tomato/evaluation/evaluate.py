@@ -1,0 +1,226 @@
+"""An evaluation from policy to report: episodes, metrics, plots, pictures, film, page."""
+
+import logging
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, cast
+
+import imageio.v2 as imageio
+import numpy as np
+
+from maniskill_tomato import rendering
+from maniskill_tomato.evaluation import plots
+from maniskill_tomato.evaluation.metrics import make_metrics, write_metrics
+from maniskill_tomato.evaluation.report import Picture, ReportInput, write_report
+from maniskill_tomato.evaluation.rollout import ActingPolicy, Episode, run_episodes
+from maniskill_tomato.learning.envs import make_env
+from maniskill_tomato.learning.history import load_history
+from maniskill_tomato.learning.policy import Policy, RandomPolicy
+
+logger = logging.getLogger(__name__)
+
+LEFT_OUT = (
+    "Left out because this machine cannot render: the film, and the first and last views of the camera. {hint}. "
+    "Then run this evaluation again."
+)
+
+
+@dataclass(frozen=True, kw_only=True)
+class EvaluationConfig:
+    """What to evaluate and what to write."""
+
+    env_id: str
+    episodes: int
+    seed: int
+    out: Path
+    """Folder of the results."""
+    env_options: dict[str, Any] = field(default_factory=dict)
+    """Options for `gymnasium.make` beside the defaults, for instance another plant."""
+    baseline: bool = True
+    """Also run uniformly random actions from the same seeds."""
+    video: bool = True
+    """Film the first episodes where the machine can render."""
+    films: int = 3
+    """How many episodes to film."""
+    title: str = "Evaluation"
+    training_run: Path | None = None
+    """A run whose training curves the report shows."""
+    training_windows: tuple[int, int] | None = None
+    """Moving-average windows of those curves, in episodes and steps."""
+    show_progress: bool = True
+
+
+@dataclass(frozen=True, kw_only=True)
+class EvaluationResult:
+    """What an evaluation wrote."""
+
+    metrics: dict[str, Any]
+    report: Path
+    video: Path | None
+    left_out: str | None
+    """Which pictures are missing and how to get them; None if none are."""
+
+
+def evaluate(
+    config: EvaluationConfig, policy: ActingPolicy, policy_path: Path | None = None
+) -> EvaluationResult:
+    """Evaluates `policy` and writes metrics.json, trajectories.npz, plots, pictures, a film and report.html.
+
+    Args:
+        config: What to evaluate and where to write.
+        policy: Chooses the actions, without exploration.
+        policy_path: Its file, for the record.
+
+    Returns:
+        Metrics and the paths of what was written.
+    """
+    start = time.perf_counter()
+    episodes, baseline, threshold = _run(config, policy)
+    description = _describe(policy, policy_path)
+    metrics = make_metrics(
+        config.env_id,
+        episodes,
+        seed=config.seed,
+        success_threshold=threshold,
+        policy=description,
+        wall_seconds=time.perf_counter() - start,
+        baseline=baseline,
+    )
+    config.out.mkdir(parents=True, exist_ok=True)
+    write_metrics(config.out / "metrics.json", metrics)
+    write_trajectories(config.out / "trajectories.npz", episodes)
+    evaluation, training = _plot(config, episodes, threshold)
+    views: list[Picture] = []
+    video = left_out = None
+    if config.video:
+        if rendering.rendering_available():
+            video, views = _film(config, policy)
+        else:
+            left_out = LEFT_OUT.format(hint=rendering.NO_RENDERING_HINT.capitalize())
+    report = config.out / "report.html"
+    facts = {key.replace("_", " "): str(value) for key, value in description.items() if key != "path"}
+    facts["evaluation time"] = f"{metrics['wall_seconds']:.0f} s"
+    content = ReportInput(
+        title=config.title,
+        metrics=metrics,
+        facts=facts,
+        training=training,
+        evaluation=evaluation,
+        views=views,
+        video=video,
+        policy=policy_path,
+        left_out=left_out,
+    )
+    write_report(report, content)
+    return EvaluationResult(metrics=metrics, report=report, video=video, left_out=left_out)
+
+
+def write_trajectories(path: Path, episodes: Sequence[Episode]) -> None:
+    """Writes every view of every episode as arrays.
+
+    `first_view[i]` is the row of episode i's start view in `viewpoints` (x, y, z [m], roll, pitch, yaw [rad])
+    and `visible_fraction`; `target[i]` is its target's position [m].
+    """
+    lengths = np.array([len(e.visible_fraction) for e in episodes])
+    np.savez_compressed(
+        path,
+        seed=np.array([e.seed for e in episodes]),
+        first_view=np.concatenate(([0], np.cumsum(lengths)[:-1])),
+        target=np.stack([e.target for e in episodes]),
+        viewpoints=np.concatenate([e.viewpoints for e in episodes]),
+        visible_fraction=np.concatenate([e.visible_fraction for e in episodes]),
+    )
+
+
+def _run(config: EvaluationConfig, policy: ActingPolicy) -> tuple[list[Episode], list[Episode] | None, float]:
+    """The policy's episodes, the baseline's if wanted, and the task's threshold of V_f."""
+    env = make_env(config.env_id, **config.env_options)
+    try:
+        threshold = float(cast(Any, env.unwrapped).task.full_visibility)
+        episodes = run_episodes(env, policy, config.episodes, config.seed, config.show_progress)
+        baseline = None
+        if config.baseline:
+            logger.info("the same episodes with random actions, to compare")
+            random = RandomPolicy(config.seed)
+            baseline = run_episodes(env, random, config.episodes, config.seed, config.show_progress)
+    finally:
+        env.close()
+    return episodes, baseline, threshold
+
+
+def _plot(
+    config: EvaluationConfig, episodes: Sequence[Episode], threshold: float
+) -> tuple[list[Picture], list[Picture]]:
+    """Plots of the evaluation and, where a run is given, of its training."""
+    out = config.out
+    plots.plot_steps(episodes, out / "steps.png")
+    plots.plot_visible_fraction(episodes, threshold, out / "visible_fraction.png")
+    plots.plot_trajectories(episodes, out / "trajectories.png")
+    evaluation = [
+        Picture(path=out / "steps.png", caption="Steps that each episode took (thesis Fig. 5-6)."),
+        Picture(
+            path=out / "visible_fraction.png",
+            caption="Visible fraction of the target at the start and at its best in each episode (thesis Fig. 5-7).",
+        ),
+        Picture(
+            path=out / "trajectories.png",
+            caption="Way of the end-effector in the first episodes, with the viewing direction at the first, "
+            "middle and last pose (thesis Fig. 5-8).",
+        ),
+    ]
+    if config.training_run is None:
+        return evaluation, []
+    path = out / "training_curves.png"
+    plots.plot_training_curves(load_history(config.training_run), path, config.training_windows)
+    caption = (
+        "Loss and reward of each episode, reward and visible fraction of each step (thesis Fig. 5-1 to 5-4)."
+    )
+    return evaluation, [Picture(path=path, caption=caption)]
+
+
+def _film(config: EvaluationConfig, policy: ActingPolicy) -> tuple[Path, list[Picture]]:
+    """Films the first episodes; returns the film and the first and last view of the first one."""
+    from maniskill_tomato.evaluation.video import film_episodes, make_film_options
+
+    count = min(config.films, config.episodes)
+    logger.info("filming %d episodes", count)
+    options = {"render_backend": rendering.render_backend(), **make_film_options(), **config.env_options}
+    env = make_env(config.env_id, **options)
+    path = config.out / "video.mp4"
+    try:
+        films = film_episodes(env, policy, [config.seed + i for i in range(count)], path)
+    finally:
+        env.close()
+    first = films[0]
+    start, end = first.first_visible_fraction, first.last_visible_fraction
+    steps = "1 step" if first.steps == 1 else f"{first.steps} steps"
+    pictures: list[Picture] = []
+    for name, image, caption in (
+        ("first_view", first.first_wrist, f"First view of the wrist camera, V_f {start:.2f}."),
+        ("last_view", first.last_wrist, f"Last view, after {steps}, V_f {end:.2f} (thesis Fig. 5-9)."),
+        ("first_pose", first.first_outside, "The robot and the plant at the start."),
+        ("last_pose", first.last_outside, "At the end of the episode."),
+    ):
+        picture = config.out / f"{name}.png"
+        imageio.imwrite(picture, image)
+        pictures.append(Picture(path=picture, caption=caption))
+    return path, pictures
+
+
+def _describe(policy: ActingPolicy, path: Path | None) -> dict[str, Any]:
+    """Where a policy comes from, for metrics.json."""
+    if not isinstance(policy, Policy):
+        return {"path": None, "kind": type(policy).__name__}
+    counters = policy.counters
+    return {
+        "path": None if path is None else str(path),
+        "kind": "TD3" if policy.config.twin_critics else "DDPG",
+        "trained_on": policy.env_id,
+        "training_steps": counters.get("steps"),
+        "training_episodes": counters.get("episodes"),
+        "training_seconds": round(float(counters.get("seconds", 0.0)), 1),
+        "training_seed": counters.get("seed"),
+        "package_version": policy.package_version,
+    }
