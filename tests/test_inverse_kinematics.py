@@ -473,11 +473,15 @@ def test_neighbour_poses_are_reached_within_the_limits_and_lie_in_the_allowed_bo
     assert (again.reach == Reach.REACHABLE).all()
 
 
+@pytest.mark.parametrize("population", ["start poses", "joints beyond their limits"])
 def test_a_dense_random_search_finds_no_neighbour_where_none_was_found_and_none_nearer(
-    ik: InverseKinematics,
+    ik: InverseKinematics, population: str
 ) -> None:
-    wanted = box_poses(20_000, seed=21)
-    solution = ik.solve(wanted, home(20_000))
+    if population == "start poses":
+        wanted = box_poses(20_000, seed=21)
+    else:
+        wanted = forward_kinematics(1.3 * random_qpos(2000, seed=24))
+    solution = ik.solve(wanted, home(len(wanted)))
     # Poses farther from the reachable shell of the wrist than a neighbour may be need no search.
     wrist = wanted[:, :3, 3] - 0.126 * wanted[:, :3, 2] - torch.tensor([0.0, 0.0, 0.36])
     near_shell = (wrist.norm(dim=-1) > 0.4104 - 0.072) & (wrist.norm(dim=-1) < 0.82 + 0.072)

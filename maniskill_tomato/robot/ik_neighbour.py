@@ -8,8 +8,8 @@
 The distance D between poses is D^2 = (|dp| / a)^2 + (angle / b)^2, a (5 cm) and b (10 degrees) being allowed.
 The joint angles that minimise it within their limits are found by a projected Levenberg-Marquardt method,
 started in every arm configuration from the arm angle that breaks the limits least, with its angles put on the
-limits. Where the minimum exceeds a or b alone, the two parts are weighted anew until the larger ratio is as
-small as it gets.
+limits. Where the minimum exceeds a or b alone, the method goes on from there with what the two exceed a and b
+by as the cost, which is zero wherever a neighbour is allowed.
 """
 
 import math
@@ -38,9 +38,13 @@ mat77d = wp.types.matrix(shape=(7, 7), dtype=wp.float64)
 ARM_ANGLES = wp.constant(24)
 ARM_ANGLE_STEP = wp.constant(wp.float64(math.tau / 24.0))
 ITERATIONS = wp.constant(20)
+"""Steps at most towards the nearest pose."""
 BOX_ITERATIONS = wp.constant(60)
+"""Steps at most towards a pose that is allowed, if the nearest is not."""
 JUST_INSIDE = wp.constant(wp.float64(0.999))
+"""The share of a and b that these steps aim at, so that they end inside."""
 HOPELESS = wp.constant(wp.float64(2.5))
+"""Distance D of the nearest pose beyond which none allowed is looked for; sqrt(2) but for local minima."""
 
 
 @wp.struct
