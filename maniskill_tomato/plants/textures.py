@@ -5,7 +5,6 @@ from base to tip and v from the right margin to the left one; a fruit's u runs a
 the blossom end.
 """
 
-from math import pi
 
 import numpy as np
 from numpy.random import PCG64, Generator, SeedSequence
@@ -46,25 +45,24 @@ def _blend(base: Float64, colour: Colour, weight: Float64) -> Float64:
     return np.asarray(base * (1 - weight[..., None]) + np.array(colour) * weight[..., None])
 
 
-def _veins(t: Float64, s: Float64, lobes: float) -> tuple[Float64, Float64]:
-    """Strength of the main veins and of the fine net, 0 to 1, at blade parameters."""
+def _veins(t: Float64, s: Float64, lobes: float) -> Float64:
+    """Strength of the midrib and the side veins, 0 to 1, at blade parameters."""
     a = np.abs(s)
     midrib = np.exp(-((a / (0.050 * (1.08 - t))) ** 2))
     # Side veins leave the midrib forward and reach the tips of the lobes.
     phase = (t - 0.20 * a + 0.05 * a * a) * 2 * lobes + 0.25 * np.sign(s)
     distance = np.abs(phase - np.round(phase))
     side = np.exp(-((distance / (0.075 * (1.1 - 0.6 * a))) ** 2)) * (1 - 0.55 * a)
-    cell_t = np.abs(np.sin(pi * (t * 26 + 3.0 * a)))
-    cell_s = np.abs(np.sin(pi * (a * 9 + t * 7)))
-    net = np.exp(-((cell_t / 0.28) ** 2)) + np.exp(-((cell_s / 0.28) ** 2))
-    return np.maximum(midrib, 0.75 * side), np.clip(net, 0, 1)
+    return np.maximum(midrib, 0.75 * side)
 
 
 def leaf_texture(variant: int, *, upper: bool, size: int = 256) -> UInt8:
     """A leaflet's blade with its veins. Shape (size, size, 4)."""
     rng = _generator(0 if upper else 1, variant)
     t, s = np.meshgrid((np.arange(size) + 0.5) / size, 2 * (np.arange(size) + 0.5) / size - 1)
-    main, net = _veins(t, s, 3.5)
+    main = _veins(t, s, 3.5)
+    # The finest veins run along the zero lines of a noise, which close into cells.
+    net = np.exp(-((cloud(rng, size, size, 20, octaves=2) / 0.10) ** 2))
     patches, speckle = cloud(rng, size, size, 3), cloud(rng, size, size, 24, octaves=2)
     hues: list[Colour] = [(62, 112, 44), (70, 124, 50), (54, 102, 46), (82, 132, 52)]
     base = np.ones((size, size, 3)) * np.array(hues[variant % len(hues)])
@@ -72,7 +70,7 @@ def leaf_texture(variant: int, *, upper: bool, size: int = 256) -> UInt8:
         base = 0.45 * base + 0.55 * np.array([140, 178, 102])
     light: Colour = (124, 164, 82) if upper else (176, 200, 136)
     base = base * (1 + 0.13 * patches + 0.07 * speckle)[..., None]
-    base = base * (1 - (0.11 if upper else 0.05) * net)[..., None]
+    base = base * (1 - (0.10 if upper else 0.06) * net)[..., None]
     # The blade darkens beside the veins, where it dips, and is fresher between them.
     base = _blend(base, light, 0.62 * main)
     edge = np.clip((np.abs(s) - 0.90) / 0.10, 0, 1) * np.clip(0.5 + cloud(rng, size, size, 5), 0, 1)
