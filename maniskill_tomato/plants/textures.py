@@ -5,7 +5,6 @@ from base to tip and v from the right margin to the left one; a fruit's u runs a
 the blossom end.
 """
 
-
 import numpy as np
 from numpy.random import PCG64, Generator, SeedSequence
 from numpy.typing import NDArray
