@@ -47,6 +47,15 @@ def cuda_problem() -> str | None:
     return None if torch.cuda.is_available() else "no CUDA device"
 
 
+@functools.cache
+def keep_renderer_alive() -> object:
+    """Holds SAPIEN's renderer for the session: it goes with its last scene, and the next compiles its shaders anew."""
+    import sapien
+    import torch
+
+    return sapien.render.RenderSystem(sapien.Device("cuda" if torch.cuda.is_available() else "cpu"))
+
+
 def pytest_runtest_setup(item: pytest.Item) -> None:
     if item.get_closest_marker("gpu") is not None and (problem := cuda_problem()) is not None:
         pytest.skip(problem)
@@ -54,3 +63,5 @@ def pytest_runtest_setup(item: pytest.Item) -> None:
         if rendering_required():
             pytest.fail(f"rendering is required here, but {problem}", pytrace=False)
         pytest.skip(problem)
+    if item.get_closest_marker("render") is not None:
+        keep_renderer_alive()
