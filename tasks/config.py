@@ -44,9 +44,14 @@ class ViewpointTaskConfig:
 
 
 def guided_task() -> ViewpointTaskConfig:
-    """The guided-reward task (section 5-1, Eq. 5-1 ... 5-6, Table 5-1)."""
+    """The guided-reward task (section 5-1, Eq. 5-1 ... 5-6, Table 5-1).
+
+    The thesis prints neither its plant nor where it stood. Here the tomato is in reach at y = 0.2 m, where the
+    yaw range of Eq. 5-2 looks from y < 0, and of the first twelve seeds this one hides it from every start (mean
+    V_f 0.15) while a fifth of the views around it are good.
+    """
     return ViewpointTaskConfig(
-        plant=PlantChoice(preset="one_tomato", seed=0),
+        plant=PlantChoice(preset="one_tomato", seed=1),
         plant_pose=PlantPose(x=0.85, y=0.2, yaw=0.0),
         start_position=((-0.1, 0.2), (-0.35, 0.1), (0.65, 1.15)),
         start_rpy=((0.0, 0.0), (0.45 * math.pi, 0.7 * math.pi), (0.0, 0.25 * math.pi)),
@@ -63,10 +68,11 @@ def sparse_task() -> ViewpointTaskConfig:
     """The sparse-reward task (section 5-2, Eq. 5-7 ... 5-11, Table 5-2).
 
     Eq. 5-10 has no case for a neighbour pose, so any pose that cannot be reached exactly is outside the
-    workspace.
+    workspace. The plant is one of the first twelve seeds that hides all three tomatoes from every start while each
+    can be seen from 15 % or more of the views around it.
     """
     return ViewpointTaskConfig(
-        plant=PlantChoice(preset="three_tomatoes", seed=0),
+        plant=PlantChoice(preset="three_tomatoes", seed=4),
         plant_pose=PlantPose(x=0.85, y=0.0, yaw=0.0),
         start_position=((-0.1, 0.2), (-0.25, 0.25), (0.65, 1.15)),
         start_rpy=((0.0, 0.0), (0.45 * math.pi, 0.7 * math.pi), (-math.pi / 8, math.pi / 8)),
