@@ -135,7 +135,7 @@ class TomatoViewpointEnv(BaseEnv):  # type: ignore[misc]
 
     @property
     def _default_human_render_camera_configs(self) -> CameraConfig:
-        pose = sapien_utils.look_at(eye=[0.15, -1.75, 1.35], target=[0.42, 0.0, 0.68])
+        pose = sapien_utils.look_at(eye=[-0.35, -1.65, 1.45], target=[0.38, 0.0, 0.66])
         return CameraConfig("render_camera", pose=pose, width=640, height=480, fov=0.82, near=0.01, far=20.0)
 
     def _load_agent(self, options: dict[str, Any], *args: Any, **kwargs: Any) -> None:
