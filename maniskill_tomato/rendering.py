@@ -9,8 +9,8 @@ from typing import Literal
 
 logger = logging.getLogger(__name__)
 
-PROBE_TIMEOUT_SECONDS = 90.0
-"""The first picture on a machine compiles shaders, about 11 s on two CPU cores."""
+PROBE_TIMEOUT_SECONDS = 180.0
+"""The first picture on a machine compiles shaders, about 11 s on two idle CPU cores."""
 
 NO_RENDERING_HINT = (
     "no Vulkan device that SAPIEN can use was found; `make vulkan` installs one that runs on the CPU "

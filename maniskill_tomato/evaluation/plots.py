@@ -41,6 +41,8 @@ STYLE: Any = {
     "figure.constrained_layout.use": True,
 }
 
+TRAJECTORY_COLOURS = (SKY, STRAW, LEAF, "#8a5aa5")
+
 ARROW_LENGTH = 0.12
 """Length of a viewing arrow, in [m]."""
 
@@ -89,10 +91,14 @@ def plot_training_curves(curves: TrainingCurves, path: Path, windows: tuple[int,
             figure.subplots(2, 2).flat, panels, strict=True
         ):
             average = moving_average(values, window)
-            start = len(values) - len(average)
-            axes.plot(np.arange(start, len(values)), average, color=colour, linewidth=1.6)
-            axes.set_title(f"{title}, moving average over {min(window, max(len(values), 1))} {unit}s")
+            axes.plot(
+                np.arange(len(values) - len(average), len(values)), average, color=colour, linewidth=1.6
+            )
+            axes.set_title(title)
+            note = f"mean of {min(window, max(len(values), 1))} {unit}s"
+            axes.set_title(note, loc="right", fontsize=8.5, fontweight="normal", color=MUTED)
             axes.set_xlabel(unit)
+            axes.xaxis.set_major_locator(MaxNLocator(nbins=6, integer=True))
         figure.savefig(path)
 
 
@@ -105,6 +111,7 @@ def plot_steps(episodes: Sequence[Episode], path: Path) -> None:
         axes.bar(np.arange(1, len(episodes) + 1), [e.steps for e in episodes], color=colours, width=0.78)
         axes.set_title("Steps per episode")
         axes.set_xlabel("episode")
+        axes.xaxis.set_major_locator(MaxNLocator(integer=True))
         axes.set_ylabel("steps")
         axes.yaxis.set_major_locator(MaxNLocator(integer=True))
         _outcome_legend(axes)
@@ -137,12 +144,13 @@ def plot_visible_fraction(episodes: Sequence[Episode], threshold: float, path: P
         axes.set_ylim(-0.03, 1.05)
         axes.set_title("Largest visible fraction per episode")
         axes.set_xlabel("episode")
+        axes.xaxis.set_major_locator(MaxNLocator(integer=True))
         axes.set_ylabel("V_f")
         _outcome_legend(axes)
         figure.savefig(path)
 
 
-def plot_trajectories(episodes: Sequence[Episode], path: Path, most: int = 4) -> None:
+def plot_trajectories(episodes: Sequence[Episode], path: Path, most: int = len(TRAJECTORY_COLOURS)) -> None:
     """Ways of the end-effector in space, with viewing arrows at the first, middle and last pose (Fig. 5-8).
 
     Args:
@@ -151,30 +159,26 @@ def plot_trajectories(episodes: Sequence[Episode], path: Path, most: int = 4) ->
         most: How many to draw.
     """
     shown = list(episodes[:most])
+    targets = np.stack([e.target for e in shown])
+    points = np.concatenate([targets, np.zeros((1, 3)), *(e.viewpoints[:, :3] for e in shown)])
+    low, high = points.min(axis=0) - 0.08, points.max(axis=0) + 0.08
     with mpl.rc_context(STYLE):
-        figure = Figure(figsize=(9.0, 5.0))
-        for index, (elevation, azimuth, title) in enumerate(
-            ((24, -125, "Seen from behind"), (84, -90, "From above"))
-        ):
-            axes: Any = figure.add_subplot(1, 2, index + 1, projection="3d")
-            for colour, episode in zip((SKY, STRAW, LEAF, "#8a5aa5"), shown, strict=False):
-                _draw_trajectory(axes, episode, colour, label=index == 0)
-            target = np.stack([e.target for e in shown])
-            axes.scatter(*target.T, s=90, color=TOMATO, label="target" if index == 0 else None)
-            axes.scatter(
-                0.0, 0.0, 0.0, s=60, marker="s", color=INK, label="robot base" if index == 0 else None
-            )
-            points = np.concatenate([target, np.zeros((1, 3)), *(e.viewpoints[:, :3] for e in shown)])
-            low, high = points.min(axis=0) - 0.08, points.max(axis=0) + 0.08
-            axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), zlim=(low[2], high[2]))
-            axes.set_box_aspect(high - low)
-            axes.view_init(elevation, azimuth)
-            axes.set(xlabel="x [m]", ylabel="y [m]", title=title)
-            if index == 0:
-                axes.set_zlabel("z [m]")
-            else:
-                axes.set_zticklabels([])
-            axes.tick_params(labelsize=7)
+        figure = Figure(figsize=(9.0, 4.9))
+        space: Any = figure.add_subplot(1, 2, 1, projection="3d")
+        above = figure.add_subplot(1, 2, 2)
+        for colour, episode in zip(TRAJECTORY_COLOURS, shown, strict=False):
+            _draw_trajectory(space, above, episode, colour)
+        space.scatter(*targets.T, s=90, color=TOMATO, label="target")
+        space.scatter(0.0, 0.0, 0.0, s=60, marker="s", color=INK, label="robot base")
+        above.scatter(targets[:, 0], targets[:, 1], s=90, color=TOMATO, zorder=4)
+        above.scatter(0.0, 0.0, s=60, marker="s", color=INK, zorder=4)
+        space.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), zlim=(low[2], high[2]))
+        space.set_box_aspect(high - low, zoom=0.92)
+        space.view_init(24, -125)
+        space.set(xlabel="x [m]", ylabel="y [m]", zlabel="z [m]", title="In space")
+        space.tick_params(labelsize=7)
+        above.set(xlabel="x [m]", ylabel="y [m]", title="From above")
+        above.set_aspect("equal", adjustable="datalim")
         figure.legend(loc="outside lower center", ncols=3 + len(shown))
         figure.savefig(path)
 
@@ -199,23 +203,31 @@ def viewing_direction(viewpoints: NDArray[np.float64]) -> NDArray[np.float64]:
     )
 
 
-def _draw_trajectory(axes: Any, episode: Episode, colour: str, label: bool) -> None:
+def _draw_trajectory(space: Any, above: Axes, episode: Episode, colour: str) -> None:
+    """One way in both pictures; the first, middle and last pose get arrows, later ones stronger."""
     positions = episode.viewpoints[:, :3]
-    axes.plot(
-        *positions.T, color=colour, linewidth=1.5, label=f"episode seed {episode.seed}" if label else None
-    )
-    axes.scatter(*positions.T, s=9, color=colour)
+    x, y, z = positions.T
+    space.plot(x, y, z, color=colour, linewidth=1.5, label=f"seed {episode.seed}")
+    space.scatter(x, y, z, s=9, color=colour)
+    above.plot(x, y, color=colour, linewidth=1.5, marker="o", markersize=3)
     marked = sorted({0, episode.steps // 2, episode.steps})
     directions = viewing_direction(episode.viewpoints)
     for pose, opacity in zip(marked, np.linspace(0.45, 1.0, len(marked)), strict=True):
-        axes.quiver(
+        looks = {"color": colour, "alpha": float(opacity)}
+        space.quiver(
             *positions[pose],
             *directions[pose],
             length=ARROW_LENGTH,
-            color=colour,
-            alpha=float(opacity),
             linewidth=2.0,
             arrow_length_ratio=0.35,
+            **looks,
+        )
+        tip = positions[pose] + ARROW_LENGTH * directions[pose]
+        above.annotate(
+            "",
+            (tip[0], tip[1]),
+            (x[pose], y[pose]),
+            arrowprops={"arrowstyle": "-|>", "linewidth": 1.8, "shrinkA": 0, "shrinkB": 0, **looks},
         )
 
 

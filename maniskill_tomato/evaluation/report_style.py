@@ -57,7 +57,7 @@ figure {
 }
 img, video { display: block; width: 100%; height: auto; border-radius: 6px; }
 figcaption, .caption { color: var(--muted); font-size: 14px; margin: 10px 2px 0; }
-.pairs { display: grid; grid-template-columns: repeat(auto-fit, minmax(300px, 1fr)); gap: 0 16px; }
+.pairs { display: grid; grid-template-columns: repeat(auto-fit, minmax(min(100%, 380px), 1fr)); gap: 0 16px; }
 .scroll { overflow-x: auto; }
 table {
   width: 100%; border-collapse: collapse; background: var(--card); border: 1px solid var(--line);
