@@ -161,25 +161,23 @@ def main(args: Args) -> int:
             GUIDED, num_envs=1, obs_mode="rgb+segmentation", sensor_configs={"width": 128, "height": 128}
         )
 
+    measurements: dict[str, Callable[[], float | None]] = {
+        "empty_environment_steps": lambda: steps_per_second(empty, 1000, np.zeros((1, 7), dtype=np.float32)),
+        "guided_state_steps": lambda: steps_per_second(guided, 1000, small_actions(6)),
+        "guided_resets": lambda: per_second(guided.reset, 100),
+        "guided_resets_with_new_plant": lambda: per_second(new_plants.reset, 5),
+        "inverse_kinematics_solves_batch_1": lambda: inverse_kinematics_rate(1),
+        "inverse_kinematics_solves_batch_1024": lambda: inverse_kinematics_rate(1024),
+        "rays_16_per_side": lambda: rays_rate(16),
+        "rays_64_per_side": lambda: rays_rate(64),
+        "guided_rendered_128_steps": lambda: (
+            steps_per_second(rendered, 20, small_actions(6)) if rendered else None
+        ),
+    }
     rates: dict[str, list[float]] = {}
     for _ in range(args.repeats):
-        for name, value in {
-            "empty_environment_steps": lambda: steps_per_second(
-                empty, 1000, np.zeros((1, 7), dtype=np.float32)
-            ),
-            "guided_state_steps": lambda: steps_per_second(guided, 1000, small_actions(6)),
-            "guided_resets": lambda: per_second(guided.reset, 100),
-            "guided_resets_with_new_plant": lambda: per_second(new_plants.reset, 5),
-            "inverse_kinematics_solves_batch_1": lambda: inverse_kinematics_rate(1),
-            "inverse_kinematics_solves_batch_1024": lambda: inverse_kinematics_rate(1024),
-            "rays_16_per_side": lambda: rays_rate(16),
-            "rays_64_per_side": lambda: rays_rate(64),
-            "guided_rendered_128_steps": lambda: (
-                steps_per_second(rendered, 20, small_actions(6)) if rendered else None
-            ),
-        }.items():
-            rate = value()
-            if rate is not None:
+        for name, measure in measurements.items():
+            if (rate := measure()) is not None:
                 rates.setdefault(name, []).append(rate)
     medians = {name: statistics.median(values) for name, values in rates.items()}
 

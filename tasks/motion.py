@@ -2,6 +2,7 @@
 settling."""
 
 import math
+from typing import Any
 
 import torch
 from mani_skill.agents.base_agent import BaseAgent
@@ -62,5 +63,6 @@ def drive_to(scene: ManiSkillScene, agent: BaseAgent, target_qpos: Tensor) -> No
 def _step(scene: ManiSkillScene, agent: BaseAgent, controller: BaseController, targets: Tensor) -> None:
     agent.robot.set_joint_drive_targets(targets, controller.joints, controller.active_joint_indices)
     if scene.gpu_sim_enabled:
-        scene.px.gpu_apply_articulation_target_position()
+        gpu_system: Any = scene.px
+        gpu_system.gpu_apply_articulation_target_position()
     scene.step()

@@ -1,6 +1,7 @@
 """What stands around the robot and the plant, for pictures only: floor, walls and light."""
 
-import numpy as np
+from typing import Any
+
 import sapien
 import sapien.render
 from mani_skill.envs.scene import ManiSkillScene
@@ -23,10 +24,10 @@ def build(scene: ManiSkillScene) -> None:
 def _add_box(
     scene: ManiSkillScene, name: str, centre: list[float], half_size: list[float], colour: tuple[float, ...]
 ) -> None:
-    builder = scene.create_actor_builder()
+    builder: Any = scene.create_actor_builder()
     builder.initial_pose = sapien.Pose(centre)
     if scene.can_render():
-        material = sapien.render.RenderMaterial(base_color=np.array(colour), roughness=0.95, specular=0.1)
+        material = sapien.render.RenderMaterial(base_color=list(colour), roughness=0.95, specular=0.1)
         builder.add_box_visual(half_size=half_size, material=material)
     builder.build_static(name=name)
 

@@ -32,6 +32,9 @@ from maniskill_tomato.tasks.planting import Planting, ripe_fruit_at_random
 from maniskill_tomato.tasks.rewards import in_forbidden_zone
 from maniskill_tomato.visibility.caster import VisibilityCaster
 
+ROBOTS = ("iiwa14_d435", "iiwa14_d435_raw_depth")
+"""The robots that can do the tasks."""
+
 START_CANDIDATES = 16
 """Start poses drawn at a time until one can be reached; the first one that can is taken, so the number does
 not matter."""
@@ -65,9 +68,9 @@ class TomatoViewpointEnv(BaseEnv):  # type: ignore[misc]
     `reward_penalty`.
     """
 
-    SUPPORTED_ROBOTS = ["iiwa14_d435", "iiwa14_d435_raw_depth"]
+    SUPPORTED_ROBOTS = list(ROBOTS)
     SUPPORTED_REWARD_MODES = options.REWARD_MODES
-    agent: Iiwa14D435
+    agent: Iiwa14D435  # pyright: ignore[reportIncompatibleVariableOverride]
 
     def __init__(
         self,
@@ -89,7 +92,7 @@ class TomatoViewpointEnv(BaseEnv):  # type: ignore[misc]
         reconfiguration_freq: int | None = None,
         **kwargs: Any,
     ) -> None:
-        options.check_choice("robot_uids", robot_uids, self.SUPPORTED_ROBOTS)
+        options.check_choice("robot_uids", robot_uids, ROBOTS)
         options.check_choice("reward_mode", reward_mode, options.REWARD_MODES)
         options.check_choice("render_mode", render_mode, options.RENDER_MODES)
         options.check_choice("control_mode", control_mode, Iiwa14D435.CONTROL_MODES)
@@ -193,7 +196,8 @@ class TomatoViewpointEnv(BaseEnv):  # type: ignore[misc]
 
     def _initialize_episode(self, env_idx: Tensor, options: dict[str, Any]) -> None:
         indices = [int(i) for i in env_idx]
-        rngs = [self._batched_episode_rng[i] for i in indices]
+        episode_rngs: Any = self._batched_episode_rng
+        rngs: list[np.random.RandomState] = [episode_rngs[i] for i in indices]
         noise = np.array(self._plant_pose_noise)
         poses = [self._plant_pose.as_array() + noise * rng.uniform(-1.0, 1.0, 3) for rng in rngs]
         x, y, yaw = torch.as_tensor(np.stack(poses), dtype=torch.float32, device=self.device).unbind(-1)
@@ -314,7 +318,8 @@ class TomatoViewpointEnv(BaseEnv):  # type: ignore[misc]
             raise InvalidInputError(
                 f"an action must be an array of numbers; got {type(action).__name__}"
             ) from error
-        size = self._orig_single_action_space.shape[0]
+        space: Any = self._orig_single_action_space
+        size: int = space.shape[0]
         if batch.shape == (size,) and self.num_envs == 1:
             batch = batch[None]
         if batch.shape != (self.num_envs, size):
@@ -329,8 +334,9 @@ class TomatoViewpointEnv(BaseEnv):  # type: ignore[misc]
     def _put_joints(self, qpos: Tensor) -> None:
         self.agent.robot.set_qpos(qpos)
         if self.gpu_sim_enabled:
+            gpu_system: Any = self.scene.px
             self.scene._gpu_apply_all()
-            self.scene.px.gpu_update_articulation_kinematics()
+            gpu_system.gpu_update_articulation_kinematics()
             self.scene._gpu_fetch_all()
 
     def _observe_viewpoint(self) -> None:
@@ -408,10 +414,11 @@ class TomatoViewpointEnv(BaseEnv):  # type: ignore[misc]
 
     # ------------------------------------------------------------------ state
 
-    def get_state_dict(self) -> dict[str, Any]:
+    def get_state_dict(self) -> dict[str, Any]:  # pyright: ignore[reportIncompatibleMethodOverride]
         """ManiSkill's state and the task's own under `task`: viewpoint, reach, target, and pose and seed of
         the plant."""
-        state: dict[str, Any] = self.scene.get_sim_state()
+        sim_state: Any = self.scene.get_sim_state()
+        state: dict[str, Any] = dict(sim_state)
         state["task"] = {
             "viewpoint": self._viewpoint.clone(),
             "reach": self._reach[:, None].float(),
@@ -444,7 +451,8 @@ class TomatoViewpointEnv(BaseEnv):  # type: ignore[misc]
             len(indices), -1
         )
         # The base never moves, and to set its pose again would shift it by rounding.
-        qpos, qvel = arm[:, -2 * robot.max_dof :].float().split(robot.max_dof, dim=-1)
+        dof = robot.max_dof
+        qpos, qvel = arm[:, -2 * dof : -dof].float(), arm[:, -dof:].float()
         with scene_mask.only(self.scene, indices):
             robot.set_qvel(qvel)
             self._put_joints(qpos)
@@ -463,10 +471,11 @@ class TomatoViewpointEnv(BaseEnv):  # type: ignore[misc]
     def set_state(self, state: Any, env_idx: Tensor | None = None) -> None:
         """Takes back the flat vector that `get_state` gave. Shape (b, D)."""
         flat = torch.as_tensor(state, dtype=torch.float32, device=self.device)
-        expected = sum(leaf.shape[-1] for leaf in _leaves(self._init_raw_state))
+        like: Any = self._init_raw_state
+        expected = sum(leaf.shape[-1] for leaf in _leaves(like))
         if flat.ndim != 2 or flat.shape[-1] != expected:
             raise InvalidInputError(f"a flat state must have shape (b, {expected}); got {tuple(flat.shape)}")
-        self.set_state_dict(_unflatten(flat, self._init_raw_state, 0)[0], env_idx)
+        self.set_state_dict(_unflatten(flat, like, 0)[0], env_idx)
 
 
 def _leaves(tree: dict[str, Any]) -> list[Tensor]:

@@ -20,7 +20,8 @@ SIZE = {"width": 96, "height": 64}
 
 
 def make(env_id: str, **kwargs: Any) -> Any:
-    return gym.make(env_id, **({"num_envs": 1, "sensor_configs": dict(SIZE)} | kwargs))
+    options: dict[str, Any] = {"num_envs": 1, "sensor_configs": dict(SIZE)}
+    return gym.make(env_id, **(options | kwargs))
 
 
 @pytest.mark.parametrize(

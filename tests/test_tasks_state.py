@@ -88,7 +88,7 @@ def test_state_of_another_plant_is_refused_before_anything_changes() -> None:
     base: Any = env.unwrapped
     before = base.get_state().clone()
     with pytest.raises(InvalidInputError, match="seed"):
-        base.set_state(other.unwrapped.get_state())  # type: ignore[attr-defined]
+        base.set_state(other.unwrapped.get_state())
     assert torch.equal(base.get_state(), before)
     with pytest.raises(InvalidInputError, match="shape"):
         base.set_state(before[:, :-1])
@@ -99,7 +99,7 @@ def test_state_of_another_plant_is_refused_before_anything_changes() -> None:
 def test_vector_wrapper_resets_by_itself_and_hands_out_final_observations() -> None:
     from mani_skill.vector.wrappers.gymnasium import ManiSkillVectorEnv
 
-    env = ManiSkillVectorEnv(make(), auto_reset=True, ignore_terminations=False, record_metrics=True)
+    env: Any = ManiSkillVectorEnv(make(), auto_reset=True, ignore_terminations=False, record_metrics=True)
     obs, _ = env.reset(seed=0)
     ends = 0
     for _ in range(95):
@@ -174,6 +174,7 @@ def test_recorded_trajectory_replays_to_the_same_states(tmp_path: Path) -> None:
     replayed = make(SPARSE)
     base: Any = replayed.unwrapped
     seen = []
+    file: Any
     with h5py.File(tmp_path / "run.h5") as file:
         for episode, seed in enumerate((3, 4)):
             trajectory = file[f"traj_{episode}"]

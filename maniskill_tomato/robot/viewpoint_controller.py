@@ -107,7 +107,7 @@ class ViewpointController(BaseController):  # type: ignore[misc]
                 taken = torch.where(unreachable, self.viewpoint.double(), taken)
         self.viewpoint, self.reach, self.target_qpos = taken.float(), reach, target_qpos.float()
 
-    def set_action(self, action: Tensor) -> None:
+    def set_action(self, action: Any) -> None:
         """Adds the action, clipped to [-1, 1], to the viewpoint and sets the joint drives' targets.
 
         Args:
