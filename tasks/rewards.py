@@ -23,9 +23,9 @@ def in_forbidden_zone(ee_position_w: Tensor) -> Tensor:
     Returns:
         Shape (B,), bool.
     """
-    x, y, z = ee_position_w.unbind(-1)
-    near_base = (x.abs() < 0.3) & (y.abs() < 0.3) & (z < 0.25)
-    return (z < 0.15) | near_base | (x > 0.7)
+    # A z below -0.25 m is outside the box around zero that stands for the one around the base, but below 0.15 m.
+    near_base = (ee_position_w.abs() < ee_position_w.new_tensor((0.3, 0.3, 0.25))).all(-1)
+    return near_base | (ee_position_w[..., 2] < 0.15) | (ee_position_w[..., 0] > 0.7)
 
 
 def guided_visual_reward(

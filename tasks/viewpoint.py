@@ -21,9 +21,9 @@ from maniskill_tomato.robot.agent import Iiwa14D435
 from maniskill_tomato.robot.d435 import CameraIntrinsics, T_flange_camera_color_optical
 from maniskill_tomato.robot.description import link_meshes
 from maniskill_tomato.robot.inverse_kinematics import InverseKinematics, Reach
-from maniskill_tomato.robot.kinematics import link_transforms
+from maniskill_tomato.robot.kinematics import link_transforms, viewpoint_transform
 from maniskill_tomato.robot.rotations import matrix_to_rpy
-from maniskill_tomato.robot.viewpoint_controller import ViewpointController, pose_matrix
+from maniskill_tomato.robot.viewpoint_controller import ViewpointController
 from maniskill_tomato.tasks import MAX_EPISODE_STEPS, options, scene_mask, scenery
 from maniskill_tomato.tasks.config import ViewpointTaskConfig, guided_task, sparse_task
 from maniskill_tomato.tasks.motion import drive_to
@@ -231,7 +231,7 @@ class TomatoViewpointEnv(BaseEnv):  # type: ignore[misc]
             draws = np.stack([rng.uniform(low, high, (START_CANDIDATES, 6)) for rng in rngs])
             candidates = torch.as_tensor(draws, dtype=torch.float32, device=self.device)
             solution = self._inverse_kinematics.solve(
-                pose_matrix(candidates.reshape(-1, 6).double()),
+                viewpoint_transform(candidates.reshape(-1, 6)),
                 ready.expand(b * START_CANDIDATES, 7),
                 neighbour=False,
             )
@@ -267,7 +267,7 @@ class TomatoViewpointEnv(BaseEnv):  # type: ignore[misc]
         start = torch.as_tensor(values, dtype=torch.float32, device=self.device).expand(batch, 6)
         ready = torch.as_tensor(Iiwa14D435.keyframes["ready"].qpos, dtype=torch.float64, device=self.device)
         solution = self._inverse_kinematics.solve(
-            pose_matrix(start.double()), ready.expand(batch, 7), neighbour=False
+            viewpoint_transform(start), ready.expand(batch, 7), neighbour=False
         )
         if bool((solution.reach != Reach.REACHABLE).any()):
             raise InvalidInputError(
@@ -387,6 +387,11 @@ class TomatoViewpointEnv(BaseEnv):  # type: ignore[misc]
         if self._obs_mode in ("state", "state_dict"):
             return {}
         return {"qpos": self.agent.robot.get_qpos(), "qvel": self.agent.robot.get_qvel()}
+
+    def _flatten_raw_obs(self, obs: Any) -> Any:
+        if self._obs_mode == "state":
+            return torch.cat(tuple(obs["extra"].values()), dim=-1)
+        return super()._flatten_raw_obs(obs)
 
     def _get_obs_extra(self, info: dict[str, Tensor]) -> dict[str, Tensor]:
         return {

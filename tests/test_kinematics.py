@@ -10,7 +10,7 @@ from torch.testing import assert_close
 
 from maniskill_tomato.errors import InvalidInputError
 from maniskill_tomato.robot import iiwa14
-from maniskill_tomato.robot.kinematics import forward_kinematics, link_transforms
+from maniskill_tomato.robot.kinematics import forward_kinematics, link_transforms, viewpoint_transform
 
 Array = npt.NDArray[np.float64]
 
@@ -145,3 +145,30 @@ def test_wrong_shapes_and_integers_are_refused(bad: torch.Tensor) -> None:
 def test_cuda_gives_the_same_as_the_cpu() -> None:
     qpos = torch.from_numpy(random_qpos(500, seed=4))
     assert_close(link_transforms(qpos.cuda()).cpu(), link_transforms(qpos), rtol=0, atol=1e-12)
+
+
+def test_viewpoint_transform_turns_about_the_fixed_axes_one_after_the_other() -> None:
+    rng = np.random.default_rng(5)
+    viewpoints = rng.uniform(-3.0, 3.0, (200, 6))
+    poses = viewpoint_transform(torch.as_tensor(viewpoints)).numpy()
+    for (x, y, z, roll, pitch, yaw), pose in zip(viewpoints, poses, strict=True):
+        turned = (
+            rotation_about(np.array([0.0, 0.0, 1.0]), yaw)
+            @ rotation_about(np.array([0.0, 1.0, 0.0]), pitch)
+            @ rotation_about(np.array([1.0, 0.0, 0.0]), roll)
+        )
+        np.testing.assert_allclose(pose, transform(turned, [x, y, z]), atol=1e-14)
+
+
+def test_viewpoint_transform_at_pitch_pi_over_2_looks_along_x() -> None:
+    pose = viewpoint_transform(torch.tensor([[0.1, 0.2, 0.3, 0.0, math.pi / 2, 0.0]]))[0]
+    assert pose.dtype == torch.float64
+    assert_close(pose[:3, 2], torch.tensor([1.0, 0.0, 0.0], dtype=torch.float64), atol=1e-7, rtol=0)
+
+
+@pytest.mark.parametrize(
+    "viewpoint", [torch.zeros(6), torch.zeros(2, 7), torch.zeros(2, 6, dtype=torch.int64)]
+)
+def test_viewpoint_transform_refuses_other_shapes_and_types(viewpoint: torch.Tensor) -> None:
+    with pytest.raises(InvalidInputError, match=r"\(B, 6\)"):
+        viewpoint_transform(viewpoint)

@@ -3,7 +3,7 @@
 # pyright: reportGeneralTypeIssues=false, reportIndexIssue=false, reportInvalidTypeForm=false
 # pyright: reportOperatorIssue=false, reportReturnType=false
 # The type checkers are silent here: Warp's stubs describe calls from outside, not the inside of a kernel.
-"""The iiwa 14's chain inside Warp kernels: double-precision types, constants, forward kinematics."""
+"""The iiwa 14's chain inside Warp kernels: double-precision types, constants, poses."""
 
 import math
 
@@ -96,3 +96,19 @@ def flange_transform(q: vec7d) -> wp.mat44d:
             p += FOREARM * z
     p += HAND * z
     return homogeneous(x, y, z, p)
+
+
+@wp.kernel
+def viewpoint_transform_kernel(viewpoints: wp.array2d[wp.float64], transforms: wp.array[wp.mat44d]):
+    i = wp.tid()
+    cr = wp.cos(viewpoints[i, 3])
+    sr = wp.sin(viewpoints[i, 3])
+    cp = wp.cos(viewpoints[i, 4])
+    sp = wp.sin(viewpoints[i, 4])
+    cy = wp.cos(viewpoints[i, 5])
+    sy = wp.sin(viewpoints[i, 5])
+    x = wp.vec3d(cy * cp, sy * cp, -sp)
+    y = wp.vec3d(cy * sp * sr - sy * cr, sy * sp * sr + cy * cr, cp * sr)
+    z = wp.vec3d(cy * sp * cr + sy * sr, sy * sp * cr - cy * sr, cp * cr)
+    p = wp.vec3d(viewpoints[i, 0], viewpoints[i, 1], viewpoints[i, 2])
+    transforms[i] = homogeneous(x, y, z, p)

@@ -1,4 +1,4 @@
-"""Forward kinematics of the iiwa 14: joint angles to the poses of its links, batched.
+"""Forward kinematics of the iiwa 14, joint angles to the poses of its links, and viewpoints to poses, batched.
 
 One Warp kernel walks the chain in double precision, on the CPU and on CUDA; results come back in the
 type of the input. The buffers and the recorded launch of each batch size are kept, so that a single
@@ -14,7 +14,7 @@ import warp as wp
 
 from maniskill_tomato.errors import InvalidInputError
 from maniskill_tomato.robot.iiwa14 import LINK_NAMES, NUM_JOINTS
-from maniskill_tomato.robot.ik_chain import link_transforms_kernel
+from maniskill_tomato.robot.ik_chain import link_transforms_kernel, viewpoint_transform_kernel
 from maniskill_tomato.warp_runtime import start_warp
 
 LARGEST_KEPT_BATCH = 4096
@@ -57,6 +57,18 @@ class _LinkTransformsLaunch:
         self.run = RecordedLaunch(link_transforms_kernel, batch, device, arrays)
 
 
+class _ViewpointTransformLaunch:
+    """The kernel's launch for one batch size, with its tensors."""
+
+    def __init__(self, batch: int, device: torch.device):
+        start_warp()
+        self.viewpoints = torch.zeros(batch, 6, dtype=torch.float64, device=device)
+        self.transforms = torch.zeros(batch, 4, 4, dtype=torch.float64, device=device)
+        arrays = [wp.from_torch(self.viewpoints), wp.from_torch(self.transforms, dtype=wp.mat44d)]
+        self.run = RecordedLaunch(viewpoint_transform_kernel, batch, device, arrays)
+
+
+_kept_viewpoint_transform_launch = lru_cache(maxsize=16)(_ViewpointTransformLaunch)
 _kept_link_transforms_launch = lru_cache(maxsize=16)(_LinkTransformsLaunch)
 
 
@@ -105,3 +117,32 @@ def forward_kinematics(qpos: torch.Tensor) -> torch.Tensor:
             f"got {qpos.dtype} of shape {tuple(qpos.shape)}"
         )
     return link_transforms(qpos.reshape(-1, NUM_JOINTS))[:, -1].reshape(*qpos.shape[:-1], 4, 4)
+
+
+def viewpoint_transform(viewpoint: torch.Tensor) -> torch.Tensor:
+    """The pose of a viewpoint, R = Rz(yaw) Ry(pitch) Rx(roll).
+
+    Args:
+        viewpoint: x, y, z, in [m], and roll, pitch, yaw, in [rad], of any floating-point type. Shape (B, 6).
+
+    Returns:
+        Homogeneous transforms in double precision. Shape (B, 4, 4), float64.
+
+    Raises:
+        InvalidInputError: `viewpoint` is not a floating-point tensor of shape (B, 6).
+    """
+    if viewpoint.dim() != 2 or viewpoint.shape[1] != 6 or not viewpoint.is_floating_point():
+        raise InvalidInputError(
+            "viewpoint must be a floating-point tensor of shape (B, 6); "
+            f"got {viewpoint.dtype} of shape {tuple(viewpoint.shape)}"
+        )
+    batch = viewpoint.shape[0]
+    if batch == 0:
+        return viewpoint.new_zeros(0, 4, 4, dtype=torch.float64)
+    kept = batch <= LARGEST_KEPT_BATCH
+    launch = (_kept_viewpoint_transform_launch if kept else _ViewpointTransformLaunch)(
+        batch, viewpoint.device
+    )
+    launch.viewpoints.copy_(viewpoint.detach())
+    launch.run()
+    return launch.transforms.clone() if kept else launch.transforms

@@ -16,8 +16,8 @@ from mani_skill.agents.controllers.base_controller import BaseController, Contro
 from torch import Tensor
 
 from maniskill_tomato.robot.inverse_kinematics import InverseKinematics, Reach
-from maniskill_tomato.robot.kinematics import forward_kinematics
-from maniskill_tomato.robot.rotations import matrix_to_rpy, rpy_to_matrix
+from maniskill_tomato.robot.kinematics import forward_kinematics, viewpoint_transform
+from maniskill_tomato.robot.rotations import matrix_to_rpy
 
 
 class ViewpointController(BaseController):  # type: ignore[misc]
@@ -85,12 +85,13 @@ class ViewpointController(BaseController):  # type: ignore[misc]
         Args:
             viewpoint: x, y, z [m], roll, pitch, yaw [rad] in the base frame. Shape (num_envs, 6).
         """
-        T_base_ee = pose_matrix(viewpoint.double())
-        qpos = self.qpos.double()
-        solution = self._inverse_kinematics.solve(T_base_ee, qpos, neighbour=self.config.neighbour_poses)
-        reach = solution.reach
-        target_qpos, taken = solution.qpos, viewpoint.double()
-        if bool((reach != Reach.REACHABLE).any()):
+        qpos = self.articulation.get_qpos()
+        solution = self._inverse_kinematics.solve(
+            viewpoint_transform(viewpoint), qpos, neighbour=self.config.neighbour_poses
+        )
+        reach, target_qpos, taken = solution.reach, solution.qpos, viewpoint
+        if int(reach.max()) != Reach.REACHABLE:
+            taken = taken.double()
             neighbour = (reach == Reach.NEIGHBOUR)[:, None]
             unreachable = (reach == Reach.UNREACHABLE)[:, None]
             reached = solution.T_base_ee
@@ -103,7 +104,7 @@ class ViewpointController(BaseController):  # type: ignore[misc]
                 target_qpos = torch.where(unreachable, home, target_qpos)
                 taken = torch.where(unreachable, at_home, taken)
             else:
-                target_qpos = torch.where(unreachable, qpos, target_qpos)
+                target_qpos = torch.where(unreachable, qpos.double(), target_qpos)
                 taken = torch.where(unreachable, self.viewpoint.double(), taken)
         self.viewpoint, self.reach, self.target_qpos = taken.float(), reach, target_qpos.float()
 
@@ -154,19 +155,3 @@ class ViewpointControllerConfig(ControllerConfig):  # type: ignore[misc]
     drive_joints: bool = True
     """Whether to hand the targets to the joint drives; a purely kinematic user sets the joints itself."""
     controller_cls = ViewpointController
-
-
-def pose_matrix(viewpoint: Tensor) -> Tensor:
-    """The homogeneous transform of a viewpoint.
-
-    Args:
-        viewpoint: x, y, z [m], roll, pitch, yaw [rad]. Shape (B, 6).
-
-    Returns:
-        Shape (B, 4, 4).
-    """
-    T = torch.zeros(*viewpoint.shape[:-1], 4, 4, dtype=viewpoint.dtype, device=viewpoint.device)
-    T[..., :3, :3] = rpy_to_matrix(viewpoint[..., 3:])
-    T[..., :3, 3] = viewpoint[..., :3]
-    T[..., 3, 3] = 1.0
-    return T
