@@ -352,10 +352,10 @@ class TomatoViewpointEnv(BaseEnv):  # type: ignore[misc]
         seen = self._caster.cast(
             T_w_links[:, -1] @ self._T_ee_camera, self._target, self.planting.T_world_plant, T_w_links
         )
-        fraction = seen.visible_fraction
+        fraction, tomato_seen = seen.visible_fraction, seen.any_visible
         target_seen = fraction > 0.0
         forbidden = in_forbidden_zone(self._viewpoint[:, :3])
-        unreachable = self._reach == Reach.UNREACHABLE
+        unreachable = self._reach == int(Reach.UNREACHABLE)
         fail = unreachable if self.task.outside_workspace == "end" else torch.zeros_like(unreachable)
         return {
             "success": (fraction > self.task.full_visibility) & ~fail,
@@ -363,10 +363,10 @@ class TomatoViewpointEnv(BaseEnv):  # type: ignore[misc]
             "visible_fraction": fraction,
             "target_id": self._target_id.clone(),
             "target_seen": target_seen,
-            "tomato_seen": seen.any_visible,
+            "tomato_seen": tomato_seen,
             "reachability": self._reach.clone(),
             "in_forbidden_zone": forbidden,
-            "reward_visual": self.task.visual_reward(fraction, target_seen, seen.any_visible, self._reach),
+            "reward_visual": self.task.visual_reward(fraction, target_seen, tomato_seen, self._reach),
             "reward_penalty": self.task.pose_penalty(self._reach, forbidden),
         }
 
