@@ -101,19 +101,20 @@ def resident_mib() -> float:
 
 
 def growth(work: Callable[[], object], times: int) -> dict[str, float]:
-    """Memory before and after `times` calls, once a tenth of them has filled caches and allocators, in
-    [MiB]."""
-    for _ in range(max(1, times // 10)):
+    """Memory before, during and after `times` calls, once 100 have filled the caches of plants, in [MiB]."""
+    for _ in range(100):
         work()
-    before = resident_mib()
-    for _ in range(times):
-        work()
-    after = resident_mib()
+    readings = [resident_mib()]
+    for _ in range(5):
+        for _ in range(times // 5):
+            work()
+        readings.append(resident_mib())
     return {
         "calls": times,
-        "before_mib": round(before, 1),
-        "after_mib": round(after, 1),
-        "growth_mib": round(after - before, 1),
+        "before_mib": round(readings[0], 1),
+        "after_mib": round(readings[-1], 1),
+        "growth_mib": round(readings[-1] - readings[0], 1),
+        "growth_in_last_fifth_mib": round(readings[-1] - readings[-2], 1),
     }
 
 
