@@ -20,27 +20,22 @@ from maniskill_tomato.plants.organs import SemanticClass
 from maniskill_tomato.robot.agent import Iiwa14D435
 from maniskill_tomato.robot.d435 import CameraIntrinsics, T_flange_camera_color_optical
 from maniskill_tomato.robot.description import link_meshes
-from maniskill_tomato.robot.inverse_kinematics import InverseKinematics, Reach
-from maniskill_tomato.robot.kinematics import link_transforms, viewpoint_transform
+from maniskill_tomato.robot.inverse_kinematics import Reach
+from maniskill_tomato.robot.kinematics import link_transforms
 from maniskill_tomato.robot.rotations import matrix_to_rpy
 from maniskill_tomato.robot.viewpoint_controller import ViewpointController
 from maniskill_tomato.tasks import MAX_EPISODE_STEPS, options, scene_mask, scenery
 from maniskill_tomato.tasks.config import ViewpointTaskConfig, guided_task, sparse_task
+from maniskill_tomato.tasks.flat_state import checked_rows, unflatten
 from maniskill_tomato.tasks.motion import drive_to
 from maniskill_tomato.tasks.plant_choice import PlantChoice, PlantPose
 from maniskill_tomato.tasks.planting import Planting, ripe_fruit_at_random
 from maniskill_tomato.tasks.rewards import in_forbidden_zone
+from maniskill_tomato.tasks.starts import Starts
 from maniskill_tomato.visibility.caster import VisibilityCaster
 
 ROBOTS = ("iiwa14_d435", "iiwa14_d435_raw_depth")
 """The robots that can do the tasks."""
-
-START_CANDIDATES = 16
-"""Start poses drawn at a time until one can be reached; the first one that can is taken, so the number does
-not matter."""
-
-MAX_START_DRAWS = 64
-"""Draws of `START_CANDIDATES` poses before a start box counts as out of reach."""
 
 
 class TomatoViewpointEnv(BaseEnv):  # type: ignore[misc]
@@ -168,7 +163,7 @@ class TomatoViewpointEnv(BaseEnv):  # type: ignore[misc]
             self._T_ee_camera = torch.tensor(
                 T_flange_camera_color_optical, dtype=torch.float32, device=device
             )
-            self._inverse_kinematics = InverseKinematics(device=str(device))
+            self._starts = Starts(self.task, device)
             self._viewpoint = torch.zeros(n, 6, device=device)
             self._reach = torch.zeros(n, dtype=torch.int64, device=device)
             self._target = torch.zeros(n, dtype=torch.int64, device=device)
@@ -208,46 +203,15 @@ class TomatoViewpointEnv(BaseEnv):  # type: ignore[misc]
         self._target[env_idx] = torch.as_tensor(targets, device=self.device)
         self._look_up_target()
         if "viewpoint" in options:
-            viewpoint, qpos = self._checked_start(options["viewpoint"], len(indices))
+            viewpoint, qpos = self._starts.given(options["viewpoint"], len(indices))
         else:
-            viewpoint, qpos = self._draw_start(rngs)
+            viewpoint, qpos = self._starts.draw(rngs)
         self._set_arm(env_idx, viewpoint, qpos)
 
     def _look_up_target(self) -> None:
         rows = torch.arange(self.num_envs, device=self.device)
         self._target_id = self.planting.fruit_segmentation_id[rows, self._target]
         self._target_position_w = self.planting.fruit_position_w(self._target)
-
-    def _draw_start(self, rngs: list[np.random.RandomState]) -> tuple[Tensor, Tensor]:
-        """Start viewpoints uniform in the task's box, redrawn until reachable, and their joints (Eq. 5-1,
-        5-2, 5-7, 5-8)."""
-        low, high = np.array((*self.task.start_position, *self.task.start_rpy)).T
-        b = len(rngs)
-        viewpoint = torch.zeros(b, 6, device=self.device)
-        qpos = torch.zeros(b, 7, device=self.device)
-        found = torch.zeros(b, dtype=torch.bool, device=self.device)
-        ready = torch.as_tensor(Iiwa14D435.keyframes["ready"].qpos, dtype=torch.float64, device=self.device)
-        for _ in range(MAX_START_DRAWS):
-            draws = np.stack([rng.uniform(low, high, (START_CANDIDATES, 6)) for rng in rngs])
-            candidates = torch.as_tensor(draws, dtype=torch.float32, device=self.device)
-            solution = self._inverse_kinematics.solve(
-                viewpoint_transform(candidates.reshape(-1, 6)),
-                ready.expand(b * START_CANDIDATES, 7),
-                neighbour=False,
-            )
-            reachable = (solution.reach == Reach.REACHABLE).reshape(b, START_CANDIDATES)
-            first = reachable.int().argmax(dim=-1)
-            rows = torch.arange(b, device=self.device)
-            new = reachable.any(dim=-1) & ~found
-            viewpoint[new] = candidates[rows, first][new]
-            qpos[new] = solution.qpos.reshape(b, START_CANDIDATES, 7)[rows, first][new].float()
-            found |= new
-            if bool(found.all()):
-                return viewpoint, qpos
-        raise InvalidInputError(
-            f"none of {MAX_START_DRAWS * START_CANDIDATES} start poses could be reached; the task's start ranges "
-            f"{self.task.start_position} [m] and {self.task.start_rpy} [rad] lie outside the arm's workspace"
-        )
 
     def _checked_target(self, env_index: int, target: object) -> int:
         ripe = self.planting.ripe_fruits[env_index]
@@ -256,24 +220,6 @@ class TomatoViewpointEnv(BaseEnv):  # type: ignore[misc]
                 f"reset option target must be a ripe fruit of the plant, one of {ripe}; got {target!r}"
             )
         return target
-
-    def _checked_start(self, viewpoint: Any, batch: int) -> tuple[Tensor, Tensor]:
-        values = np.asarray(viewpoint, dtype=np.float64)
-        if values.shape != (6,) or not np.isfinite(values).all():
-            raise InvalidInputError(
-                "reset option viewpoint must be six finite numbers (x, y, z [m], roll, pitch, yaw [rad]); "
-                f"got {viewpoint!r}"
-            )
-        start = torch.as_tensor(values, dtype=torch.float32, device=self.device).expand(batch, 6)
-        ready = torch.as_tensor(Iiwa14D435.keyframes["ready"].qpos, dtype=torch.float64, device=self.device)
-        solution = self._inverse_kinematics.solve(
-            viewpoint_transform(start), ready.expand(batch, 7), neighbour=False
-        )
-        if bool((solution.reach != Reach.REACHABLE).any()):
-            raise InvalidInputError(
-                f"the arm cannot reach the reset option viewpoint {viewpoint!r}; give one inside its workspace"
-            )
-        return start, solution.qpos.float()
 
     def _set_arm(self, env_idx: Tensor, viewpoint: Tensor, qpos: Tensor) -> None:
         self._viewpoint[env_idx] = viewpoint
@@ -437,13 +383,16 @@ class TomatoViewpointEnv(BaseEnv):  # type: ignore[misc]
         """Takes back what `get_state_dict` gave.
 
         Raises:
-            InvalidInputError: The state belongs to another plant; nothing was changed.
+            InvalidInputError: The state belongs to another plant, lacks something or is not finite; nothing was
+                changed.
         """
         indices = torch.arange(self.num_envs, device=self.device) if env_idx is None else env_idx
+        robot = self.agent.robot
         task = {
-            k: torch.as_tensor(v, device=self.device).reshape(len(indices), -1)
-            for k, v in state["task"].items()
+            name: checked_rows(state, ("task", name), len(indices), self.device)
+            for name in ("viewpoint", "reach", "target", "plant_pose", "plant_seed")
         }
+        arm = checked_rows(state, ("articulations", robot.name), len(indices), self.device)
         seeds = [self.planting.seeds[int(i)] for i in indices]
         stored = [int(s) for s in task["plant_seed"][:, 0]]
         if stored != seeds:
@@ -451,10 +400,6 @@ class TomatoViewpointEnv(BaseEnv):  # type: ignore[misc]
                 f"the state belongs to plants of seed {stored}, but this environment holds {seeds}; "
                 "make it with plant={'seed': ...} or reset it with the seed of that episode"
             )
-        robot = self.agent.robot
-        arm = torch.as_tensor(state["articulations"][robot.name], device=self.device).reshape(
-            len(indices), -1
-        )
         # The base never moves, and to set its pose again would shift it by rounding.
         dof = robot.max_dof
         qpos, qvel = arm[:, -2 * dof : -dof].float(), arm[:, -dof:].float()
@@ -475,28 +420,8 @@ class TomatoViewpointEnv(BaseEnv):  # type: ignore[misc]
 
     def set_state(self, state: Any, env_idx: Tensor | None = None) -> None:
         """Takes back the flat vector that `get_state` gave. Shape (b, D)."""
-        flat = torch.as_tensor(state, dtype=torch.float32, device=self.device)
         like: Any = self._init_raw_state
-        expected = sum(leaf.shape[-1] for leaf in _leaves(like))
-        if flat.ndim != 2 or flat.shape[-1] != expected:
-            raise InvalidInputError(f"a flat state must have shape (b, {expected}); got {tuple(flat.shape)}")
-        self.set_state_dict(_unflatten(flat, like, 0)[0], env_idx)
-
-
-def _leaves(tree: dict[str, Any]) -> list[Tensor]:
-    return [leaf for v in tree.values() for leaf in (_leaves(v) if isinstance(v, dict) else [v])]
-
-
-def _unflatten(flat: Tensor, like: dict[str, Any], start: int) -> tuple[dict[str, Any], int]:
-    tree: dict[str, Any] = {}
-    for key, value in like.items():
-        if isinstance(value, dict):
-            tree[key], start = _unflatten(flat, value, start)
-        else:
-            width = value.shape[-1]
-            tree[key] = flat[:, start : start + width]
-            start += width
-    return tree, start
+        self.set_state_dict(unflatten(torch.as_tensor(state, device=self.device), like), env_idx)
 
 
 class TomatoViewpointGuidedEnv(TomatoViewpointEnv):

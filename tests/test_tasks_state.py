@@ -92,6 +92,13 @@ def test_state_of_another_plant_is_refused_before_anything_changes() -> None:
     assert torch.equal(base.get_state(), before)
     with pytest.raises(InvalidInputError, match="shape"):
         base.set_state(before[:, :-1])
+    with pytest.raises(InvalidInputError, match="finite"):
+        base.set_state(before * torch.nan)
+    incomplete = base.get_state_dict()
+    del incomplete["task"]["viewpoint"]
+    with pytest.raises(InvalidInputError, match="task/viewpoint"):
+        base.set_state_dict(incomplete)
+    assert torch.equal(base.get_state(), before)
     env.close()
     other.close()
 
