@@ -102,4 +102,4 @@ NO_RENDERING_HINT = (
 def is_rendering_failure(error: RuntimeError) -> bool:
     """Whether SAPIEN raised this because it found nothing to render on."""
     text = str(error).lower()
-    return any(word in text for word in ("render", "vulkan", "find device", "find a device"))
+    return any(word in text for word in ("render", "vulkan", "vk::", "find device", "find a device"))

@@ -1,6 +1,9 @@
 """What the tasks refuse, what they accept, and how plants are chosen and placed."""
 
 import math
+import os
+import subprocess
+import sys
 from typing import Any
 
 import gymnasium as gym
@@ -164,3 +167,23 @@ def test_plant_choice_fields_replace_those_of_the_default() -> None:
 
 def test_plant_pose_parses_three_numbers() -> None:
     assert PlantPose.parse([1, 0, 0.5], PlantPose(x=0.9, y=0.0)) == PlantPose(x=1.0, y=0.0, yaw=0.5)
+
+
+def test_pictures_without_vulkan_are_refused_with_the_command_that_installs_it() -> None:
+    script = (
+        "import gymnasium as gym, maniskill_tomato\n"
+        "from maniskill_tomato.errors import RenderingUnavailableError\n"
+        "state = gym.make('TomatoViewpointGuided-v1', num_envs=1, obs_mode='state')\n"
+        "assert state.reset(seed=0)[0].shape == (1, 9)\n"
+        "try:\n"
+        "    gym.make('TomatoViewpointGuided-v1', num_envs=1, obs_mode='rgb')\n"
+        "except RenderingUnavailableError as error:\n"
+        "    assert 'make vulkan' in str(error)\n"
+        "    print('refused')\n"
+    )
+    hidden = {"VK_DRIVER_FILES": "/nonexistent", "VK_ICD_FILENAMES": "/nonexistent"}
+    result = subprocess.run(
+        [sys.executable, "-c", script], env=os.environ | hidden, capture_output=True, text=True, timeout=300
+    )
+    assert result.returncode == 0, result.stderr
+    assert "refused" in result.stdout
