@@ -211,7 +211,7 @@ def test_the_demo_films_episodes_when_it_can_render(
     main(["demo", "--out", str(tmp_path), "--minutes", "0.02", "--episodes", "1"])
     assert f"video   {tmp_path / 'video.mp4'}" in capsys.readouterr().out
     reader = imageio.get_reader(tmp_path / "video.mp4")
-    assert reader.get_length() > 20
+    assert reader.get_meta_data()["duration"] > 1.0
     frame = np.asarray(reader.get_data(5))
     assert frame.shape == (544, 1280, 3)
     assert frame[:480, :640].std() > 10.0 and frame[:480, 640:].std() > 10.0
@@ -242,6 +242,15 @@ def test_a_policy_that_is_missing_damaged_or_of_another_task_is_an_error(
     assert "trained on TomatoViewpointSparse-v1" in message and "--allow-other-task" in message
     main(["eval", GUIDED, "--policy", str(other), "--allow-other-task", "--no-baseline", *out])
     assert "random_actions" not in json.loads((tmp_path / "out/metrics.json").read_text())
+
+
+@pytest.mark.parametrize("env_id", TASK_IDS)
+def test_the_shipped_policy_solves_its_task(tmp_path: Path, env_id: str) -> None:
+    main(["eval", env_id, "--episodes", "50", "--out", str(tmp_path), "--no-video", "--no-baseline"])
+    metrics = json.loads((tmp_path / "metrics.json").read_text())
+    assert metrics["policy"]["trained_on"] == env_id
+    assert metrics["success_rate"] >= 0.9
+    assert metrics["mean_steps"] <= 3.0
 
 
 def test_without_a_shipped_policy_the_message_says_what_to_do(

@@ -24,13 +24,13 @@ FRAMES_PER_SECOND = 20
 VIEW_SIZE = (640, 480)
 """Width and height of each of the two pictures, in [px]."""
 
-JOINT_SPEED = 1.2
+JOINT_SPEED = 0.9
 """Speed of the fastest joint between two viewpoints as shown, in [rad/s]; the film only, not the task."""
 
-HOLD_SECONDS = 0.6
+HOLD_SECONDS = 0.8
 """How long the film rests at a viewpoint."""
 
-MAX_MOVE_FRAMES = 40
+MAX_MOVE_FRAMES = 60
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
