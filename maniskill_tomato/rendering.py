@@ -13,7 +13,7 @@ PROBE_TIMEOUT_SECONDS = 180.0
 """The first picture on a machine compiles shaders, about 11 s on two idle CPU cores."""
 
 NO_RENDERING_HINT = (
-    "no Vulkan device that SAPIEN can use was found; `make vulkan` installs one that runs on the CPU "
+    "No Vulkan device that SAPIEN can use was found; `make vulkan` installs one that runs on the CPU "
     "(Debian and Ubuntu)"
 )
 

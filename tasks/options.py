@@ -93,12 +93,6 @@ def pick_render_backend(render_backend: str, rendering: bool) -> str:
     return "gpu" if torch.cuda.is_available() else "cpu"
 
 
-NO_RENDERING_HINT = (
-    "pictures were asked for, but no Vulkan device can render them ({cause}); install one for the CPU with "
-    "`make vulkan` (Mesa's lavapipe), or use obs_mode='state' and render_mode=None, which need none"
-)
-
-
 def is_rendering_failure(error: RuntimeError) -> bool:
     """Whether SAPIEN raised this because it found nothing to render on."""
     text = str(error).lower()

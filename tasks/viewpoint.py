@@ -17,6 +17,7 @@ from torch import Tensor
 
 from maniskill_tomato.errors import InvalidInputError, RenderingUnavailableError
 from maniskill_tomato.plants.organs import SemanticClass
+from maniskill_tomato.rendering import NO_RENDERING_HINT
 from maniskill_tomato.robot.agent import Iiwa14D435
 from maniskill_tomato.robot.d435 import CameraIntrinsics, T_flange_camera_color_optical
 from maniskill_tomato.robot.description import link_meshes
@@ -122,7 +123,9 @@ class TomatoViewpointEnv(BaseEnv):  # type: ignore[misc]
             )
         except RuntimeError as error:
             if rendering and options.is_rendering_failure(error):
-                raise RenderingUnavailableError(options.NO_RENDERING_HINT.format(cause=error)) from error
+                raise RenderingUnavailableError(
+                    f"{NO_RENDERING_HINT}; obs_mode='state' with render_mode=None needs none ({error})"
+                ) from error
             raise
 
     # ------------------------------------------------------------------ scene

@@ -98,7 +98,7 @@ def evaluate(
         if rendering.rendering_available():
             video, views = _film(config, policy)
         else:
-            left_out = LEFT_OUT.format(hint=rendering.NO_RENDERING_HINT.capitalize())
+            left_out = LEFT_OUT.format(hint=rendering.NO_RENDERING_HINT)
     report = config.out / "report.html"
     facts = {key.replace("_", " "): str(value) for key, value in description.items() if key != "path"}
     facts["evaluation time"] = f"{metrics['wall_seconds']:.0f} s"
