@@ -8,6 +8,7 @@ import torch
 from mani_skill.envs.utils.observations import ALL_VISUAL_TEXTURES
 
 from maniskill_tomato.errors import InvalidInputError
+from maniskill_tomato.rendering import NO_RENDERING_HINT
 
 Motion = Literal["kinematic", "dynamic"]
 
@@ -93,7 +94,14 @@ def pick_render_backend(render_backend: str, rendering: bool) -> str:
     return "gpu" if torch.cuda.is_available() else "cpu"
 
 
-def is_rendering_failure(error: RuntimeError) -> bool:
-    """Whether SAPIEN raised this because it found nothing to render on."""
+def rendering_failure(error: RuntimeError) -> str | None:
+    """What to tell a user whose SAPIEN raised this because it cannot draw; None if it is about something else."""
     text = str(error).lower()
-    return any(word in text for word in ("render", "vulkan", "vk::", "find device", "find a device"))
+    if "window" in text or "display" in text:
+        return (
+            f"render_mode='human' opens a window, but there is no display ({error}); use render_mode='rgb_array', "
+            "or start the program under xvfb-run"
+        )
+    if any(word in text for word in ("render", "vulkan", "vk::", "find device", "find a device")):
+        return f"{NO_RENDERING_HINT}; obs_mode='state' with render_mode=None needs none ({error})"
+    return None

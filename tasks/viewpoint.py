@@ -17,7 +17,6 @@ from torch import Tensor
 
 from maniskill_tomato.errors import InvalidInputError, RenderingUnavailableError
 from maniskill_tomato.plants.organs import SemanticClass
-from maniskill_tomato.rendering import NO_RENDERING_HINT
 from maniskill_tomato.robot.agent import Iiwa14D435
 from maniskill_tomato.robot.d435 import CameraIntrinsics, T_flange_camera_color_optical
 from maniskill_tomato.robot.description import link_meshes
@@ -122,10 +121,9 @@ class TomatoViewpointEnv(BaseEnv):  # type: ignore[misc]
                 **kwargs,
             )
         except RuntimeError as error:
-            if rendering and options.is_rendering_failure(error):
-                raise RenderingUnavailableError(
-                    f"{NO_RENDERING_HINT}; obs_mode='state' with render_mode=None needs none ({error})"
-                ) from error
+            problem = options.rendering_failure(error) if rendering else None
+            if problem is not None:
+                raise RenderingUnavailableError(problem) from error
             raise
 
     # ------------------------------------------------------------------ scene
