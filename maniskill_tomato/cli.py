@@ -41,8 +41,12 @@ class PlantOptions:
     """Preset of the plant: one_tomato, three_tomatoes or full."""
     plant_seed: str | None = None
     """Its seed, or train, validation or held_out for a new plant of that split in every episode."""
+    plant_pool: int | None = None
+    """With a split, draw only from this number of its plants; plants seen before need not grow again."""
     plant_pose: tuple[float, float, float] | None = None
     """Where it stands: x [m], y [m], yaw [rad]."""
+    plant_pose_noise: tuple[float, float, float] | None = None
+    """Half ranges of a uniform addition to that in every episode: x [m], y [m], yaw [rad]."""
 
     def env_options(self) -> dict[str, Any]:
         """The options for `gymnasium.make`."""
@@ -51,9 +55,13 @@ class PlantOptions:
             plant["preset"] = self.plant
         if self.plant_seed is not None:
             plant["seed"] = int(self.plant_seed) if self.plant_seed.isdigit() else self.plant_seed
+        if self.plant_pool is not None:
+            plant["pool"] = self.plant_pool
         options: dict[str, Any] = {"plant": plant} if plant else {}
         if self.plant_pose is not None:
             options["plant_pose"] = self.plant_pose
+        if self.plant_pose_noise is not None:
+            options["plant_pose_noise"] = self.plant_pose_noise
         return options
 
 

@@ -31,6 +31,9 @@ class PlantChoice:
     """One of `maniskill_tomato.plants.config.PRESETS`."""
     seed: int | str = 0
     """The plant's seed, or the name of a split of `SEED_SPLITS`: then each reset draws a seed from it."""
+    pool: int | None = None
+    """With a split, draw only from this number of its seeds, the first ones; None draws from all. A plant that was
+    seen before is ready at once, a new one takes 0.1 to 0.2 s to grow."""
     leaf_density: float | None = None
     """Share of the preset's leaves, 0 or more; None keeps the preset's own."""
     detail: Literal["training", "picture"] = "training"
@@ -47,6 +50,11 @@ class PlantChoice:
                 )
         elif isinstance(self.seed, bool) or not 0 <= self.seed <= MAX_SEED:
             raise InvalidInputError(f"plant seed must be an integer from 0 to {MAX_SEED}; got {self.seed!r}")
+        if self.pool is not None and not self._pool_fits():
+            raise InvalidInputError(
+                "plant pool must be an integer from 1 to the size of a split, and needs a split's name as seed; "
+                f"got pool={self.pool!r} with seed={self.seed!r}"
+            )
         if self.leaf_density is not None and not (
             math.isfinite(self.leaf_density) and self.leaf_density >= 0.0
         ):
@@ -55,6 +63,12 @@ class PlantChoice:
             )
         if self.detail not in ("training", "picture"):
             raise InvalidInputError.choice("plant detail", self.detail, ("training", "picture"))
+
+    def _pool_fits(self) -> bool:
+        if not isinstance(self.seed, str) or not isinstance(self.pool, int) or isinstance(self.pool, bool):
+            return False
+        low, high = SEED_SPLITS[self.seed]
+        return 1 <= self.pool <= high - low
 
     @property
     def changes(self) -> bool:
@@ -66,7 +80,7 @@ class PlantChoice:
         if isinstance(self.seed, int):
             return self.seed
         low, high = SEED_SPLITS[self.seed]
-        return int(rng.randint(low, high))
+        return int(rng.randint(low, high if self.pool is None else low + self.pool))
 
     @classmethod
     def parse(

@@ -11,6 +11,7 @@ from mani_skill.envs.scene import ManiSkillScene
 from mani_skill.utils.structs.actor import Actor
 from mani_skill.utils.structs.pose import Pose
 from torch import Tensor
+from torch.nn.functional import pad
 
 from maniskill_tomato.plants.generator import generate_plant
 from maniskill_tomato.plants.organs import Plant, SemanticClass
@@ -18,29 +19,45 @@ from maniskill_tomato.plants.rendering import build_plant_actors
 from maniskill_tomato.tasks import scene_mask
 from maniskill_tomato.tasks.plant_choice import PlantChoice
 
+GROWN_PLANTS = 256
+"""How many plants are kept, of 1 MB or less each, for environments that show them again."""
 
-@lru_cache(maxsize=32)
+
+@lru_cache(maxsize=GROWN_PLANTS)
 def grow(choice: PlantChoice, seed: int) -> Plant:
     """The plant of a choice and seed; the last few are kept, as environments often share them."""
     return generate_plant(choice.preset, seed, choice.detail, choice.leaf_density)
 
 
 class Planting:
-    """One plant for every environment of a scene."""
+    """One plant for every environment of a scene.
+
+    Where nothing is rendered, plants can do without actors: they are then numbers only, and another one takes an
+    environment's place at once (`replace`), while actors are made anew with their scene. The segmentation ids are
+    the same either way.
+    """
 
     def __init__(
-        self, scene: ManiSkillScene, choice: PlantChoice, seeds: Sequence[int], device: torch.device
+        self,
+        scene: ManiSkillScene,
+        choice: PlantChoice,
+        seeds: Sequence[int],
+        device: torch.device,
+        *,
+        with_actors: bool = True,
     ) -> None:
         """Grows the plants and adds their organs to the scene as kinematic actors.
 
         Args:
-            scene: The scene, before it is set up.
+            scene: The scene, before it is set up; robot and scenery must be in it already.
             choice: Which plants.
             seeds: The seed of each environment's plant; environments with equal seeds share actors' meshes.
             device: Where tensors live.
+            with_actors: Whether to add actors.
         """
         self.plants = [grow(choice, seed) for seed in seeds]
         self.seeds = list(seeds)
+        self._choice = choice
         self._scene = scene
         self._device = device
         num_envs = len(self.plants)
@@ -50,45 +67,63 @@ class Planting:
         """Rotation about the vertical, in [rad]. Shape (num_envs,)."""
         self.T_world_plant = torch.eye(4, device=device).repeat(num_envs, 1, 1)
         """Plant frame in the world frame. Shape (num_envs, 4, 4)."""
-
-        self._actors: list[tuple[list[int], list[Actor]]] = []
-        pose = sapien.Pose()
-        if len(set(seeds)) == 1:
-            actors = build_plant_actors(
-                scene, self.plants[0], scene_idxs=list(range(num_envs)), pose=pose, name_prefix="plant/"
-            )
-            self._actors.append((list(range(num_envs)), actors))
-        else:
-            for i, plant in enumerate(self.plants):
-                actors = build_plant_actors(
-                    scene, plant, scene_idxs=[i], pose=pose, name_prefix=f"plant_{i}/"
-                )
-                self._actors.append(([i], actors))
-        # The pose of the plant is task state; thirteen numbers for each of its organs would only repeat it.
-        for _, actors in self._actors:
-            for actor in actors:
-                scene.remove_from_state_dict_registry(actor)
-
         max_fruits = max(len(plant.fruits) for plant in self.plants)
         self._fruit_centre_p = torch.zeros(num_envs, max_fruits, 3, device=device)
         self.fruit_segmentation_id = torch.zeros(num_envs, max_fruits, dtype=torch.int32, device=device)
         """Segmentation id of every fruit, by index in `Plant.fruits`. Shape (num_envs, max_fruits), int32."""
-        self.ripe_fruits: list[list[int]] = []
+        self.ripe_fruits: list[list[int]] = [[] for _ in seeds]
         """Indices of the ripe fruits of each environment's plant."""
-        self._organ_classes: list[dict[int, SemanticClass]] = []
-        for env_indices, actors in self._actors:
-            for k, i in enumerate(env_indices):
-                plant = self.plants[i]
-                ids = [int(actor._objs[k].per_scene_id) for actor in actors]
-                self._organ_classes.append(
-                    {d: organ.semantic_class for d, organ in zip(ids, plant.organs, strict=True)}
-                )
-                for j, fruit in enumerate(plant.fruits):
-                    self._fruit_centre_p[i, j] = torch.as_tensor(fruit.centre)
-                    self.fruit_segmentation_id[i, j] = ids[fruit.organ_index]
-                self.ripe_fruits.append(
-                    [j for j, fruit in enumerate(plant.fruits) if fruit.ripeness == "ripe"]
-                )
+        # Entities are numbered in the order in which they come into a scene.
+        self._first_id = [1 + max(int(e.per_scene_id) for e in s.entities) for s in scene.sub_scenes]
+        self._actors = self._add_actors() if with_actors else []
+        for i in range(num_envs):
+            self._enter(i)
+
+    def _add_actors(self) -> list[tuple[list[int], list[Actor]]]:
+        pose = sapien.Pose()
+        everywhere = list(range(len(self.plants)))
+        if len(set(self.seeds)) == 1:
+            groups = [(everywhere, "plant/")]
+        else:
+            groups = [([i], f"plant_{i}/") for i in everywhere]
+        added = []
+        for env_indices, prefix in groups:
+            plant = self.plants[env_indices[0]]
+            actors = build_plant_actors(
+                self._scene, plant, scene_idxs=env_indices, pose=pose, name_prefix=prefix
+            )
+            for actor in actors:
+                # The plant's pose is task state; thirteen numbers for each organ would only repeat it.
+                self._scene.remove_from_state_dict_registry(actor)
+            added.append((env_indices, actors))
+        return added
+
+    def _enter(self, env_index: int) -> None:
+        """Fills the tables with an environment's plant."""
+        plant, first = self.plants[env_index], self._first_id[env_index]
+        missing = len(plant.fruits) - self._fruit_centre_p.shape[1]
+        if missing > 0:
+            self._fruit_centre_p = pad(self._fruit_centre_p, (0, 0, 0, missing))
+            self.fruit_segmentation_id = pad(self.fruit_segmentation_id, (0, missing))
+        for j, fruit in enumerate(plant.fruits):
+            self._fruit_centre_p[env_index, j] = torch.as_tensor(fruit.centre)
+            self.fruit_segmentation_id[env_index, j] = first + fruit.organ_index
+        self.ripe_fruits[env_index] = [j for j, f in enumerate(plant.fruits) if f.ripeness == "ripe"]
+
+    def replace(self, env_index: int, seed: int) -> Plant:
+        """Gives an environment another plant of the same choice; only without actors.
+
+        Args:
+            env_index: Which environment.
+            seed: The new plant's seed.
+
+        Returns:
+            The new plant.
+        """
+        self.seeds[env_index] = seed
+        self.plants[env_index] = grow(self._choice, seed)
+        self._enter(env_index)
+        return self.plants[env_index]
 
     def place(self, env_idx: Tensor, x: Tensor, y: Tensor, yaw: Tensor) -> None:
         """Puts the plants of some environments somewhere else.
@@ -134,7 +169,8 @@ class Planting:
 
     def semantic_classes(self, env_index: int) -> dict[int, SemanticClass]:
         """The semantic class of every organ of an environment's plant, by segmentation id."""
-        return dict(self._organ_classes[env_index])
+        first = self._first_id[env_index]
+        return {first + k: organ.semantic_class for k, organ in enumerate(self.plants[env_index].organs)}
 
 
 def ripe_fruit_at_random(planting: Planting, env_index: int, rng: np.random.RandomState) -> int:

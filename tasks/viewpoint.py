@@ -29,7 +29,7 @@ from maniskill_tomato.tasks.config import ViewpointTaskConfig, guided_task, spar
 from maniskill_tomato.tasks.flat_state import checked_rows, unflatten
 from maniskill_tomato.tasks.motion import drive_to
 from maniskill_tomato.tasks.plant_choice import PlantChoice, PlantPose
-from maniskill_tomato.tasks.planting import Planting, ripe_fruit_at_random
+from maniskill_tomato.tasks.planting import GROWN_PLANTS, Planting, ripe_fruit_at_random
 from maniskill_tomato.tasks.rewards import in_forbidden_zone
 from maniskill_tomato.tasks.starts import Starts
 from maniskill_tomato.visibility.caster import VisibilityCaster
@@ -101,11 +101,13 @@ class TomatoViewpointEnv(BaseEnv):  # type: ignore[misc]
         self._plant_pose_noise = options.check_half_ranges("plant_pose_noise", plant_pose_noise, 3)
         self.motion = motion
         self._rays_per_side = rays_per_side
-        self._caster: VisibilityCaster | None = None
-        self._T_ee_camera: Tensor | None = None
-        if reconfiguration_freq is None:
-            reconfiguration_freq = 1 if self._choice.changes else 0
+        self._has_caster = False
         rendering = options.needs_rendering(obs_mode, render_mode)
+        render_backend = options.pick_render_backend(render_backend, rendering)
+        # A new plant to look at needs new actors, and so a new scene.
+        self._swaps_plants = self._choice.changes and render_backend == "none"
+        if reconfiguration_freq is None:
+            reconfiguration_freq = 1 if self._choice.changes and not self._swaps_plants else 0
         try:
             super().__init__(
                 *args,
@@ -116,7 +118,7 @@ class TomatoViewpointEnv(BaseEnv):  # type: ignore[misc]
                 render_mode=render_mode,
                 control_mode=control_mode,
                 sim_backend=options.pick_sim_backend(sim_backend, num_envs),
-                render_backend=options.pick_render_backend(render_backend, rendering),
+                render_backend=render_backend,
                 reconfiguration_freq=reconfiguration_freq,
                 **kwargs,
             )
@@ -151,13 +153,17 @@ class TomatoViewpointEnv(BaseEnv):  # type: ignore[misc]
     def _load_scene(self, options: dict[str, Any]) -> None:
         scenery.build(self.scene)
         seeds = [self._choice.draw_seed(self._batched_episode_rng[i]) for i in range(self.num_envs)]
-        self.planting = Planting(self.scene, self._choice, seeds, self.device)
-        if self._caster is None:
+        self.planting = Planting(
+            self.scene, self._choice, seeds, self.device, with_actors=not self._swaps_plants
+        )
+        if not self._has_caster:
+            self._has_caster = True
             self._caster = VisibilityCaster(
                 plants=self.planting.plants,
                 intrinsics=self.camera_intrinsics,
                 robot_meshes=link_meshes(),
                 rays_per_side=self._rays_per_side,
+                cached_plants=GROWN_PLANTS,
                 device=str(self.device),
             )
             n, device = self.num_envs, self.device
@@ -194,6 +200,8 @@ class TomatoViewpointEnv(BaseEnv):  # type: ignore[misc]
         indices = [int(i) for i in env_idx]
         episode_rngs: Any = self._batched_episode_rng
         rngs: list[np.random.RandomState] = [episode_rngs[i] for i in indices]
+        if self._choice.changes:
+            self._change_plants(indices, rngs)
         noise = np.array(self._plant_pose_noise)
         poses = [self._plant_pose.as_array() + noise * rng.uniform(-1.0, 1.0, 3) for rng in rngs]
         x, y, yaw = torch.as_tensor(np.stack(poses), dtype=torch.float32, device=self.device).unbind(-1)
@@ -208,6 +216,13 @@ class TomatoViewpointEnv(BaseEnv):  # type: ignore[misc]
         else:
             viewpoint, qpos = self._starts.draw(rngs)
         self._set_arm(env_idx, viewpoint, qpos)
+
+    def _change_plants(self, indices: list[int], rngs: list[np.random.RandomState]) -> None:
+        # The first draw of an episode is its plant's seed, the same that a new scene was built with just before.
+        for i, rng in zip(indices, rngs, strict=True):
+            seed = self._choice.draw_seed(rng)
+            if self._swaps_plants and seed != self.planting.seeds[i]:
+                self._caster.replace_plant(i, self.planting.replace(i, seed))
 
     def _look_up_target(self) -> None:
         rows = torch.arange(self.num_envs, device=self.device)
@@ -294,7 +309,6 @@ class TomatoViewpointEnv(BaseEnv):  # type: ignore[misc]
     def evaluate(self) -> dict[str, Tensor]:
         """What the camera sees from where it is: V_f, whether that is a success, and the terms of the
         reward."""
-        assert self._caster is not None and self._T_ee_camera is not None
         T_w_links = link_transforms(self.agent.robot.get_qpos())
         seen = self._caster.cast(
             T_w_links[:, -1] @ self._T_ee_camera, self._target, self.planting.T_world_plant, T_w_links

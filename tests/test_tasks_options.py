@@ -38,6 +38,8 @@ def make(**kwargs: Any) -> Any:
         ({"plant": {"sort": 3}}, "leaf_density"),
         ({"plant": {"seed": "moon"}}, "held_out"),
         ({"plant": {"seed": -1}}, "from 0 to"),
+        ({"plant": {"seed": 3, "pool": 4}}, "needs a split"),
+        ({"plant": {"seed": "train", "pool": 0}}, "from 1 to"),
         ({"plant": {"leaf_density": float("nan")}}, "0 or more"),
         ({"plant": 3}, "one_tomato"),
         ({"plant_pose": (0.8, 0.0)}, "three numbers"),
@@ -137,6 +139,32 @@ def test_a_split_gives_a_new_plant_at_every_reset_and_the_same_for_the_same_seed
     low, high = SEED_SPLITS["held_out"]
     assert all(low <= s < high for s in seeds)
     assert len(set(seeds[:3])) == 3 and seeds[0] == seeds[3]
+
+
+def test_a_pool_limits_the_plants_that_are_drawn() -> None:
+    env = make(plant={"seed": "train", "pool": 3})
+    seeds = set()
+    for seed in range(30):
+        env.reset(seed=seed)
+        seeds.add(env.unwrapped.planting.seeds[0])
+    env.close()
+    assert seeds == {0, 1, 2}
+
+
+def test_a_changed_plant_is_what_the_camera_sees() -> None:
+    changing = make(plant={"preset": "full", "seed": "train"})
+    for seed in range(6):
+        obs, info = changing.reset(seed=seed)
+        plant_seed = changing.unwrapped.planting.seeds[0]
+        fixed = make(plant={"preset": "full", "seed": plant_seed})
+        options = {"target": int(changing.unwrapped.target_fruit[0]), "viewpoint": obs[0, :6].numpy()}
+        obs_2, info_2 = fixed.reset(seed=seed, options=options)
+        torch.testing.assert_close(obs_2, obs, atol=1e-6, rtol=0)
+        assert torch.equal(info["target_id"], info_2["target_id"])
+        torch.testing.assert_close(info["visible_fraction"], info_2["visible_fraction"], atol=1e-2, rtol=0)
+        assert fixed.unwrapped.semantic_classes() == changing.unwrapped.semantic_classes()
+        fixed.close()
+    changing.close()
 
 
 def test_seed_splits_are_disjoint() -> None:

@@ -179,3 +179,24 @@ def test_a_new_plant_at_every_reset_shows_in_the_picture() -> None:
     assert float((pictures[0].float() - pictures[1].float()).abs().mean()) > 5
     assert int((pictures[0].int() - pictures[2].int()).abs().max()) <= 1
     env.close()
+
+
+def test_new_plants_are_the_same_with_and_without_a_renderer() -> None:
+    plant = {"preset": "three_tomatoes", "seed": "train"}
+    plain = make(SPARSE, obs_mode="state", render_backend="none", plant=plant)
+    pictured = make(SPARSE, obs_mode="segmentation", plant=plant)
+    for seed in (3, 1, 3):
+        a, b = plain.reset(seed=seed), pictured.reset(seed=seed)
+        assert plain.unwrapped.planting.seeds == pictured.unwrapped.planting.seeds
+        assert torch.equal(a[1]["target_id"], b[1]["target_id"])
+        torch.testing.assert_close(
+            a[0][:, :6], torch.cat([b[0]["extra"]["ee_position"], b[0]["extra"]["ee_rpy"]], -1)
+        )
+        torch.testing.assert_close(a[1]["visible_fraction"], b[1]["visible_fraction"])
+        ids = set(pictured.unwrapped.segmentation_id_map)
+        assert set(plain.unwrapped.semantic_classes()) <= ids
+        assert plain.unwrapped.semantic_classes() == pictured.unwrapped.semantic_classes()
+        name = pictured.unwrapped.segmentation_id_map[int(b[1]["target_id"])].name
+        assert "fruit" in name
+    plain.close()
+    pictured.close()
