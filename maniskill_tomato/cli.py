@@ -1,10 +1,11 @@
-"""The command `maniskill-tomato`: train, evaluate, demonstrate.
+"""The command `maniskill-tomato`: train, evaluate, demonstrate, export.
 
 Examples:
     maniskill-tomato train TomatoViewpointGuided-v1
     maniskill-tomato train TomatoViewpointSparse-v1 --preset thesis-sparse --seed 3
     maniskill-tomato eval TomatoViewpointGuided-v1 --policy runs/demo/training/policy.pt --episodes 100
     maniskill-tomato demo
+    maniskill-tomato export --policy runs/demo/training/policy.pt --out exported
 """
 
 import dataclasses
@@ -103,7 +104,8 @@ class Eval:
     env_id: EnvId
     """Id of the task."""
     policy: str | None = None
-    """File of the policy, or `random`; by default the one that ships with the package."""
+    """File of the policy (.pt, or .onnx from `export`), or `random`; by default the one that ships with the
+    package."""
     episodes: int = 100
     """How many episodes."""
     seed: int = 1000
@@ -122,15 +124,17 @@ class Eval:
     def run(self) -> None:
         """Evaluates and says where the report is."""
         from maniskill_tomato.evaluation.evaluate import EvaluationConfig, evaluate
+        from maniskill_tomato.evaluation.exported import open_policy
+        from maniskill_tomato.evaluation.rollout import ActingPolicy
         from maniskill_tomato.learning.envs import check_env_id
-        from maniskill_tomato.learning.policy import Policy, RandomPolicy, load_policy
+        from maniskill_tomato.learning.policy import RandomPolicy
 
         check_env_id(self.env_id)
         path: Path | None = None
-        policy: Policy | RandomPolicy = RandomPolicy(self.seed)
+        policy: ActingPolicy = RandomPolicy(self.seed)
         if self.policy != "random":
             path = Path(self.policy) if self.policy else shipped_policy(self.env_id)
-            policy = load_policy(path, env_id=None if self.allow_other_task else self.env_id)
+            policy = open_policy(path, env_id=None if self.allow_other_task else self.env_id)
         run_dir = path.parent if path is not None and (path.parent / "history.npz").is_file() else None
         config = EvaluationConfig(
             env_id=self.env_id,
@@ -149,6 +153,26 @@ class Eval:
             print(result.left_out)
         print(f"metrics {self.out / 'metrics.json'}")
         print(f"report  {result.report}")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Export:
+    """Write a policy as an ONNX file and a JSON description, which run without PyTorch and ManiSkill."""
+
+    policy: Path | None = None
+    """File of the policy, or a checkpoint of its run; by default those that ship with the package."""
+    out: Path = Path("runs/export")
+    """Folder of the results; an earlier export of the same name in it is replaced."""
+
+    def run(self) -> None:
+        """Exports and says where the files are."""
+        from maniskill_tomato.learning.export import export_policy
+
+        for path in [self.policy] if self.policy else [shipped_policy(env_id) for env_id in TASK_IDS]:
+            result = export_policy(path, self.out)
+            print(f"model       {result.model}")
+            print(f"description {result.description}")
+            print(f"largest difference from PyTorch {result.largest_difference:.1e}")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -240,7 +264,7 @@ def summary(metrics: dict[str, Any]) -> str:
     )
 
 
-def parse(argv: Sequence[str]) -> Train | Eval | Demo:
+def parse(argv: Sequence[str]) -> Train | Eval | Demo | Export:
     """The command that the arguments describe; `train` options default to those of its `--preset`."""
     preset = _asked_preset(argv)
     train_default = Train(env_id=tyro.MISSING, preset=preset, config=PRESETS[preset])
@@ -248,11 +272,12 @@ def parse(argv: Sequence[str]) -> Train | Eval | Demo:
         Annotated[Train, tyro.conf.subcommand("train", default=train_default)]
         | Annotated[Eval, tyro.conf.subcommand("eval")]
         | Annotated[Demo, tyro.conf.subcommand("demo")]
+        | Annotated[Export, tyro.conf.subcommand("export")]
     )
-    command: Train | Eval | Demo = tyro.cli(
+    command: Train | Eval | Demo | Export = tyro.cli(
         commands,
         prog="maniskill-tomato",
-        description="Active perception for tomato harvesting: train, evaluate, demonstrate.",
+        description="Active perception for tomato harvesting: train, evaluate, demonstrate, export.",
         args=list(argv),
         config=(tyro.conf.OmitArgPrefixes,),
     )

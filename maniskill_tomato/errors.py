@@ -17,6 +17,10 @@ class InvalidInputError(TomatoError, ValueError):
         return cls(f"{name} must be one of {listed}; got {value!r}")
 
 
+class PolicyError(TomatoError):
+    """An exported policy is missing, damaged, made for something else, or answers nonsense."""
+
+
 class RenderingUnavailableError(TomatoError, RuntimeError):
     """Pictures were asked for on a machine without a usable Vulkan device."""
 

@@ -73,7 +73,7 @@ def check_command_line() -> str:
         result.returncode == 0,
         f"`maniskill-tomato --help` exits {result.returncode}: {result.stderr.strip()}",
     )
-    for subcommand in ("train", "eval", "demo"):
+    for subcommand in ("train", "eval", "demo", "export"):
         require(subcommand in result.stdout, f"`maniskill-tomato --help` does not mention {subcommand!r}")
     return "maniskill-tomato --help"
 

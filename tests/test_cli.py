@@ -73,7 +73,7 @@ def test_help_is_quick_and_loads_neither_torch_nor_the_simulator() -> None:
         [sys.executable, "-c", program], capture_output=True, text=True, cwd=ROOT, check=True
     )
     assert result.stdout.splitlines()[-1] == "[] 0"
-    assert all(word in result.stdout for word in ("train", "eval", "demo"))
+    assert all(word in result.stdout for word in ("train", "eval", "demo", "export"))
 
 
 @pytest.mark.parametrize("env_id", TASK_IDS)

@@ -12,6 +12,7 @@ import numpy as np
 
 from maniskill_tomato import rendering
 from maniskill_tomato.evaluation import plots
+from maniskill_tomato.evaluation.exported import ExportedPolicy, describe_policy
 from maniskill_tomato.evaluation.metrics import make_metrics, write_metrics
 from maniskill_tomato.evaluation.report import Picture, ReportInput, write_report
 from maniskill_tomato.evaluation.rollout import ActingPolicy, Episode, run_episodes
@@ -211,16 +212,6 @@ def _film(config: EvaluationConfig, policy: ActingPolicy) -> tuple[Path, list[Pi
 
 def _describe(policy: ActingPolicy, path: Path | None) -> dict[str, Any]:
     """Where a policy comes from, for metrics.json."""
-    if not isinstance(policy, Policy):
+    if not isinstance(policy, Policy | ExportedPolicy):
         return {"path": None, "kind": type(policy).__name__}
-    counters = policy.counters
-    return {
-        "path": None if path is None else str(path),
-        "kind": "TD3" if policy.config.twin_critics else "DDPG",
-        "trained_on": policy.env_id,
-        "training_steps": counters.get("steps"),
-        "training_episodes": counters.get("episodes"),
-        "training_seconds": round(float(counters.get("seconds", 0.0)), 1),
-        "training_seed": counters.get("seed"),
-        "package_version": policy.package_version,
-    }
+    return {"path": None if path is None else str(path), **describe_policy(policy)}

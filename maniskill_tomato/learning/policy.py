@@ -39,6 +39,11 @@ class Policy:
         """Number of observed values."""
         return len(self.normalizer.centre)
 
+    @property
+    def algorithm(self) -> str:
+        """TD3 or DDPG."""
+        return "TD3" if self.config.twin_critics else "DDPG"
+
     def act(self, observations: Tensor) -> Tensor:
         """The actions for a batch of observations, without exploration.
 

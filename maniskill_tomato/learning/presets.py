@@ -6,22 +6,8 @@ from dataclasses import dataclass
 from typing import Any, Literal
 
 from maniskill_tomato.errors import InvalidInputError
-
-OBSERVATION_NAMES = (
-    "ee_x",
-    "ee_y",
-    "ee_z",
-    "ee_roll",
-    "ee_pitch",
-    "ee_yaw",
-    "target_x",
-    "target_y",
-    "target_z",
-)
-"""The observation, in order; world frame, [m] and [rad]."""
-
-ACTION_NAMES = ("dx", "dy", "dz", "droll", "dpitch", "dyaw")
-"""The action, in order; an action of 1 is 1 m or 1 rad."""
+from maniskill_tomato.policy.layout import ACTION_NAMES as ACTION_NAMES
+from maniskill_tomato.policy.layout import OBSERVATION_NAMES as OBSERVATION_NAMES
 
 OBSERVATION_CENTRE = (0.2, 0.0, 0.8, 0.0, math.pi / 2, 0.0, 0.7, 0.0, 0.8)
 """What normalisation maps to 0: the middle of the arm's working range in front of the plant, looking along x.

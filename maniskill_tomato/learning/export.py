@@ -1,0 +1,230 @@
+"""A trained policy as an ONNX file and a description, for machines without PyTorch and ManiSkill.
+
+The actor is a chain of a few dense layers, so its graph is written node by node with the `onnx` package rather than
+traced by `torch.onnx`: that would add onnxscript and an intermediate representation to the dependencies, and its
+output changes with their versions. Here the same policy gives the same bytes. An actor that this module does not
+know completely is caught before anything is written, because every export is compared with PyTorch.
+"""
+
+import hashlib
+import json
+from collections.abc import Callable
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import onnx
+import torch
+from numpy.typing import NDArray
+from onnx import TensorProto, helper, numpy_helper
+
+import maniskill_tomato
+from maniskill_tomato.errors import InvalidInputError, PolicyError
+from maniskill_tomato.learning.checkpoint import load_checkpoint, write_atomically
+from maniskill_tomato.learning.policy import Policy, load_policy
+from maniskill_tomato.policy.description import (
+    INPUT_NAME,
+    OUTPUT_NAME,
+    ActionComponent,
+    Component,
+    PolicyDescription,
+)
+from maniskill_tomato.policy.layout import ACTION_NAMES, ACTION_UNITS, OBSERVATION_NAMES, OBSERVATION_UNITS
+from maniskill_tomato.policy.onnx_policy import OnnxPolicy, description_path
+from maniskill_tomato.tasks import TASK_IDS
+from maniskill_tomato.tasks.config import ViewpointTaskConfig, guided_task, sparse_task
+
+OPSET = 17
+"""Version of the operators; an old one on purpose, so that old runtimes read the file too."""
+
+IR_VERSION = 8
+"""Version of the file format, the one of that time."""
+
+TOLERANCE = 1e-5
+"""Largest difference from PyTorch that an export may have, in [m] and [rad]."""
+
+_TASKS: dict[str, Callable[[], ViewpointTaskConfig]] = dict(
+    zip(TASK_IDS, (guided_task, sparse_task), strict=True)
+)
+
+
+@dataclass(frozen=True, kw_only=True)
+class ExportResult:
+    """What an export wrote."""
+
+    model: Path
+    """The ONNX file."""
+    description: Path
+    """The JSON file beside it."""
+    largest_difference: float
+    """From PyTorch, over the observations of `parity_observations`, in [m] and [rad]."""
+
+
+def export_policy(path: Path | str, out: Path) -> ExportResult:
+    """Writes NAME.onnx and NAME.json for the policy or checkpoint file NAME.pt.
+
+    Args:
+        path: The file; any checkpoint of a run will do.
+        out: Folder of the results; an earlier export of the same name is replaced.
+
+    Raises:
+        InvalidInputError: `out` cannot be made.
+        CheckpointError: The policy cannot be read, or the results cannot be written.
+        PolicyError: The policy has another layout than this version's tasks, or ONNX Runtime answers
+            otherwise than PyTorch.
+    """
+    path = Path(path)
+    policy = load_policy(path)
+    _check_layout(path)
+    target = out / f"{path.stem}.onnx"
+    model = make_model(policy)
+    description = describe_policy(policy, model)
+    difference = largest_difference(policy, OnnxPolicy.from_bytes(model, description, path))
+    if not difference <= TOLERANCE:
+        raise PolicyError(
+            f"{path} cannot be exported: ONNX Runtime and PyTorch differ by {difference:.1e}, more than {TOLERANCE:g}; "
+            "nothing was written"
+        )
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise InvalidInputError(
+            f"{out} cannot be a folder ({error.strerror}); choose another --out"
+        ) from error
+    write_atomically(target, model)
+    write_atomically(description_path(target), description.to_json().encode())
+    return ExportResult(model=target, description=description_path(target), largest_difference=difference)
+
+
+def make_model(policy: Policy) -> bytes:
+    """The ONNX file of a policy: observations in [m] and [rad] in, actions in [m] and [rad] out."""
+    graph = _Graph()
+    x = graph.add("Sub", INPUT_NAME, centre=policy.normalizer.centre)
+    x = graph.add("Div", x, half_range=policy.normalizer.half_range)
+    for index, layer in enumerate(policy.actor.hidden):
+        x = graph.add_dense(x, f"hidden_{index}", layer)
+        x = graph.add("Relu", x)
+    x = graph.add_dense(x, "output", policy.actor.output)
+    x = graph.add("Tanh", x)
+    x = graph.add("Mul", x, scale=policy.action_scale)
+    x = graph.add("Min", x, high=policy.action_high)
+    graph.add("Max", x, output=OUTPUT_NAME, low=policy.action_low)
+    proto = helper.make_model(
+        helper.make_graph(
+            graph.nodes,
+            "viewpoint_policy",
+            [_tensor(INPUT_NAME, policy.observation_dim)],
+            [_tensor(OUTPUT_NAME, len(policy.action_scale))],
+            graph.constants,
+        ),
+        opset_imports=[helper.make_opsetid("", OPSET)],
+        ir_version=IR_VERSION,
+        producer_name="maniskill-tomato",
+        producer_version=maniskill_tomato.__version__,
+        doc_string=f"Viewpoint policy of {policy.env_id}; its layout and units are in the JSON file beside it.",
+    )
+    onnx.checker.check_model(proto, full_check=True)
+    content: bytes = proto.SerializeToString(deterministic=True)
+    return content
+
+
+def describe_policy(policy: Policy, model: bytes) -> PolicyDescription:
+    """The description of a policy and its ONNX file."""
+    make_task = _TASKS.get(policy.env_id)
+    task = make_task() if make_task else None
+    config = json.dumps(policy.config.to_dict(), sort_keys=True)
+    bounds = (_shortest(policy.action_low), _shortest(policy.action_high), _shortest(policy.action_scale))
+    return PolicyDescription(
+        package_version=policy.package_version,
+        env_id=policy.env_id,
+        success_threshold=task.full_visibility if task else None,
+        default_plant={**asdict(task.plant), "pose": asdict(task.plant_pose)} if task else None,
+        observation=tuple(
+            Component(name=name, unit=unit, low=None, high=None)
+            for name, unit in zip(OBSERVATION_NAMES, OBSERVATION_UNITS, strict=True)
+        ),
+        normalizer_centre=_shortest(policy.normalizer.centre),
+        normalizer_half_range=_shortest(policy.normalizer.half_range),
+        action=tuple(
+            ActionComponent(name=name, unit=unit, low=low, high=high, scale=scale)
+            for name, unit, low, high, scale in zip(ACTION_NAMES, ACTION_UNITS, *bounds, strict=True)
+        ),
+        training={
+            "algorithm": policy.algorithm,
+            **{key: policy.counters.get(key) for key in ("seed", "steps", "episodes", "updates")},
+            "config_sha256": hashlib.sha256(config.encode()).hexdigest(),
+        },
+        onnx_sha256=hashlib.sha256(model).hexdigest(),
+    )
+
+
+def parity_observations(policy: Policy, count: int = 1000, seed: int = 0) -> NDArray[np.float32]:
+    """Observations on which an export is compared with PyTorch.
+
+    Returns:
+        Zeros, the normaliser's centre, every value alone at and far beyond both ends of its range, all values
+        there together, and `count` random ones around the range. Shape (B, 9).
+    """
+    centre = policy.normalizer.centre.cpu().numpy()
+    half_range = policy.normalizer.half_range.cpu().numpy()
+    signs = np.concatenate((np.eye(len(centre)), np.ones((1, len(centre)))))
+    edges = np.concatenate([factor * signs for factor in (-10.0, -1.0, 1.0, 10.0)])
+    random = np.random.default_rng(seed).normal(scale=1.5, size=(count, len(centre)))
+    around = centre + half_range * np.concatenate((edges, random))
+    return np.concatenate((np.zeros((1, len(centre))), centre[None], around)).astype(np.float32)
+
+
+def largest_difference(policy: Policy, exported: OnnxPolicy) -> float:
+    """The largest difference between the actions of both on `parity_observations`, in [m] and [rad]."""
+    observations = parity_observations(policy)
+    reference = policy.act(torch.from_numpy(observations)).numpy()
+    return float(np.abs(exported.act(observations) - reference).max())
+
+
+def _check_layout(path: Path) -> None:
+    """Refuses a policy that observes or does something else than the descriptions say."""
+    data = load_checkpoint(path)
+    for what, names in (("observation", OBSERVATION_NAMES), ("action", ACTION_NAMES)):
+        if list(data[what]["names"]) != list(names):
+            raise PolicyError(
+                f"{path} cannot be exported: its {what} is {', '.join(data[what]['names'])}; this version's is "
+                f"{', '.join(names)}"
+            )
+
+
+class _Graph:
+    """Nodes in a row, each with one output, and their constants."""
+
+    def __init__(self) -> None:
+        self.nodes: list[onnx.NodeProto] = []
+        self.constants: list[onnx.TensorProto] = []
+
+    def add(self, operator: str, x: str, output: str | None = None, **constants: Any) -> str:
+        """Appends a node that takes `x` and the constants; returns the name of its output."""
+        output = output or f"{operator.lower()}_{len(self.nodes)}"
+        self._append(operator, x, output, constants)
+        return output
+
+    def add_dense(self, x: str, name: str, layer: Any) -> str:
+        """Appends x W^T + b; returns the name of its output."""
+        weights = {f"{name}.weight": layer.weight, f"{name}.bias": layer.bias}
+        self._append("Gemm", x, name, weights, transB=1)
+        return name
+
+    def _append(
+        self, operator: str, x: str, output: str, constants: dict[str, Any], **attributes: Any
+    ) -> None:
+        for name, tensor in constants.items():
+            values = tensor.detach().cpu().numpy().astype(np.float32)
+            self.constants.append(numpy_helper.from_array(values, name))
+        self.nodes.append(helper.make_node(operator, [x, *constants], [output], name=output, **attributes))
+
+
+def _tensor(name: str, width: int) -> onnx.ValueInfoProto:
+    return helper.make_tensor_value_info(name, TensorProto.FLOAT, ["batch", width])
+
+
+def _shortest(values: torch.Tensor) -> tuple[float, ...]:
+    """Float32 values as the shortest decimals that give them back: 0.35, not 0.3499999940395355."""
+    return tuple(float(str(value)) for value in values.cpu().numpy().astype(np.float32))
