@@ -1,0 +1,271 @@
+"""Trains PPO (Stable-Baselines3) on a task as the on-policy comparison and evaluates it like every other policy.
+
+Actions, observations and reward are those of the `td3` preset, so that only the algorithm differs. Every seed gets a
+run folder with config.json, episodes.csv, history.npz, tensorboard/, ppo.pt and eval/metrics.json.
+
+Examples:
+    python scripts/train_ppo.py TomatoViewpointGuided-v1 --seeds 0 1 2 --out runs/ppo-guided
+    python scripts/train_ppo.py TomatoViewpointSparse-v1 --config.total-timesteps 60000 --out runs/ppo-sparse
+"""
+
+import dataclasses
+import json
+import logging
+import sys
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any, Literal, SupportsFloat
+
+import gymnasium as gym
+import torch
+import tyro
+from stable_baselines3 import PPO
+from stable_baselines3.common.policies import ActorCriticPolicy
+from torch import Tensor
+from torch.utils.tensorboard import SummaryWriter
+from tqdm import tqdm
+
+import maniskill_tomato
+from maniskill_tomato.errors import TomatoError
+from maniskill_tomato.evaluation.evaluate import write_trajectories
+from maniskill_tomato.evaluation.metrics import make_metrics, write_metrics
+from maniskill_tomato.evaluation.rollout import run_episodes
+from maniskill_tomato.learning.checkpoint import save_checkpoint, write_atomically
+from maniskill_tomato.learning.envs import make_env
+from maniskill_tomato.learning.gymnasium_env import Array, make_gymnasium_env, normalize_observation
+from maniskill_tomato.learning.history import TrainingHistory
+from maniskill_tomato.learning.interrupt import stop_on_signals
+from maniskill_tomato.learning.presets import get_preset
+from maniskill_tomato.learning.trainer import check_run_dir
+from maniskill_tomato.tasks import TASK_IDS
+
+SPS_EVERY = 100
+"""Environment steps between two points of charts/SPS."""
+
+TD3 = get_preset("td3")
+
+
+@dataclass(frozen=True, kw_only=True)
+class PPOConfig:
+    """How PPO learns; what it shares with the `td3` preset has that preset's value."""
+
+    algorithm: Literal["PPO"] = "PPO"
+    total_timesteps: int = 15_000
+    """Environment steps; a multiple of n_steps, or a few more are taken."""
+    reward: Literal["task", "potential"] = TD3.reward
+    """Learn from the task's reward, or from success with V_f as a potential."""
+    step_cost: float = TD3.step_cost
+    """What each step costs with the potential reward."""
+    gamma: float = TD3.gamma
+    """Discount factor."""
+    gae_lambda: float = 0.95
+    """Decay of the advantage estimate."""
+    n_steps: int = 500
+    """Steps of a rollout."""
+    batch_size: int = 100
+    """Transitions per minibatch."""
+    n_epochs: int = 10
+    """Passes over a rollout."""
+    learning_rate: float = 3e-4
+    """Adam step size."""
+    clip_range: float = 0.2
+    """Bound on the change of the probability ratio."""
+    log_std_init: float = -1.2
+    """Logarithm of the first standard deviation, in units of the action scale: 0.3, as the td3 preset's noise."""
+    hidden: tuple[int, ...] = TD3.actor_hidden
+    """Width of the hidden layers of actor and critic."""
+    action_scale: tuple[float, ...] = TD3.action_scale
+    """The action that an output of 1 stands for, in [m] and [rad]."""
+
+    def to_dict(self) -> dict[str, Any]:
+        """The fields, ready for JSON."""
+        return {k: list(v) if isinstance(v, tuple) else v for k, v in dataclasses.asdict(self).items()}
+
+
+class Recorder(gym.Wrapper[Array, Array, Array, Array]):
+    """Keeps the history of the training, and TensorBoard's charts."""
+
+    def __init__(self, env: gym.Env[Array, Array], run_dir: Path) -> None:
+        super().__init__(env)
+        self.history = TrainingHistory(1)
+        self.steps = 0
+        self._folder = run_dir / "tensorboard"
+        self._writer: SummaryWriter | None = None
+        self._start = 0.0
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Array, dict[str, Any]]:
+        if self._writer is None:  # Only now, so that the clock of the event file starts with the training.
+            self._writer = SummaryWriter(str(self._folder))
+            self._start = time.perf_counter()
+        return self.env.reset(seed=seed, options=options)
+
+    def step(self, action: Array) -> tuple[Array, SupportsFloat, bool, bool, dict[str, Any]]:
+        observation, reward, terminated, truncated, info = self.env.step(action)
+        self.steps += 1
+        finished = self.history.add_step(
+            self.steps,
+            [info["task_reward"]],
+            [info["visible_fraction"]],
+            [info["success"]],
+            [terminated or truncated],
+        )
+        if self._writer is not None:
+            for record in finished:
+                self._writer.add_scalar("charts/episodic_return", record.episodic_return, self.steps)
+                self._writer.add_scalar("charts/episodic_length", record.steps, self.steps)
+                self._writer.add_scalar("charts/success", float(record.success), self.steps)
+            if self.steps % SPS_EVERY == 0:
+                rate = self.steps / (time.perf_counter() - self._start)
+                self._writer.add_scalar("charts/SPS", rate, self.steps)
+        return observation, reward, terminated, truncated, info
+
+    def close(self) -> None:
+        if self._writer is not None:
+            self._writer.close()
+        super().close()
+
+
+class PPOPolicy:
+    """The trained actor as the evaluation wants it: the task's observations in, the task's actions out."""
+
+    def __init__(self, policy: ActorCriticPolicy, action_scale: Sequence[float]) -> None:
+        self._policy = policy
+        self._scale = torch.tensor(action_scale)
+
+    def act(self, observations: Tensor) -> Tensor:
+        """The most likely actions. Shape (B, 6)."""
+        actions, _ = self._policy.predict(normalize_observation(observations.numpy()), deterministic=True)
+        return torch.from_numpy(actions) * self._scale
+
+
+def train(env_id: str, config: PPOConfig, run_dir: Path, seed: int, progress: bool) -> PPOPolicy | None:
+    """Trains one seed in `run_dir`; None if somebody asked to stop before the end."""
+    check_run_dir(run_dir)
+    torch.set_num_threads(1)
+    content = {
+        "env_id": env_id,
+        "seed": seed,
+        "package_version": maniskill_tomato.__version__,
+        "config": config.to_dict(),
+    }
+    task = make_gymnasium_env(
+        env_id,
+        action_scale=config.action_scale,
+        reward=config.reward,
+        gamma=config.gamma,
+        step_cost=config.step_cost,
+    )
+    env = Recorder(task, run_dir)
+    model = PPO(
+        "MlpPolicy",
+        env,
+        learning_rate=config.learning_rate,
+        n_steps=config.n_steps,
+        batch_size=config.batch_size,
+        n_epochs=config.n_epochs,
+        gamma=config.gamma,
+        gae_lambda=config.gae_lambda,
+        clip_range=config.clip_range,
+        policy_kwargs={"net_arch": list(config.hidden), "log_std_init": config.log_std_init},
+        seed=seed,
+        device="cpu",
+    )
+    write_atomically(run_dir / "config.json", (json.dumps(content, indent=2) + "\n").encode())
+    start = time.perf_counter()
+    with (
+        stop_on_signals() as stop,
+        tqdm(total=config.total_timesteps, desc=f"PPO, seed {seed}", disable=not progress) as bar,
+    ):
+
+        def after_step(local: dict[str, Any], glob: dict[str, Any]) -> bool:
+            bar.update()
+            return stop.reason is None
+
+        model.learn(config.total_timesteps, callback=after_step)
+    seconds = time.perf_counter() - start
+    env.history.save(run_dir)
+    counters = {"steps": env.steps, "episodes": len(env.history.episodes), "seconds": seconds, "seed": seed}
+    save_checkpoint(
+        run_dir / "ppo.pt", {**content, "counters": counters, "policy": model.policy.state_dict()}
+    )
+    env.close()
+    return PPOPolicy(model.policy, config.action_scale) if stop.reason is None else None
+
+
+def evaluate(env_id: str, policy: PPOPolicy, run_dir: Path, episodes: int, seed: int, progress: bool) -> None:
+    """Writes eval/metrics.json and eval/trajectories.npz of a run and prints one line."""
+    counters = torch.load(run_dir / "ppo.pt", weights_only=True)["counters"]
+    start = time.perf_counter()
+    env = make_env(env_id)
+    try:
+        threshold = float(env.unwrapped.task.full_visibility)  # type: ignore[attr-defined]
+        done = run_episodes(env, policy, episodes, seed, progress)
+    finally:
+        env.close()
+    description = {
+        "path": str(run_dir / "ppo.pt"),
+        "kind": "PPO",
+        "trained_on": env_id,
+        **{f"training_{k}": round(v, 1) if k == "seconds" else v for k, v in counters.items()},
+        "package_version": maniskill_tomato.__version__,
+    }
+    metrics = make_metrics(
+        env_id,
+        done,
+        seed=seed,
+        success_threshold=threshold,
+        policy=description,
+        wall_seconds=time.perf_counter() - start,
+    )
+    write_metrics(run_dir / "eval" / "metrics.json", metrics)
+    write_trajectories(run_dir / "eval" / "trajectories.npz", done)
+    print(
+        f"{run_dir}: success {metrics['success_rate']:.0%} of {episodes}, {metrics['mean_steps']:.1f} steps, "
+        f"trained {counters['steps']} steps in {counters['seconds']:.0f} s"
+    )
+
+
+@dataclass(frozen=True, kw_only=True)
+class Args:
+    """Train PPO with one or more seeds, one after the other, and evaluate each."""
+
+    env_id: Annotated[
+        str, tyro.conf.Positional, tyro.conf.arg(metavar="ENV_ID", help=f"One of {', '.join(TASK_IDS)}.")
+    ]
+    """Id of the task."""
+    out: Path
+    """Folder that gets a run folder seed-N for every seed."""
+    seeds: tuple[int, ...] = (0,)
+    """Seeds of the training runs."""
+    episodes: int = 100
+    """Evaluation episodes."""
+    eval_seed: int = 1000
+    """Seed of the first evaluation episode; the others follow."""
+    progress: bool = True
+    """Draw progress bars."""
+    config: PPOConfig = PPOConfig()
+    """How to learn."""
+
+
+def main(args: Args) -> None:
+    """Trains and evaluates every seed; a signal ends the present run and starts no other."""
+    for seed in args.seeds:
+        run_dir = args.out / f"seed-{seed}"
+        policy = train(args.env_id, args.config, run_dir, seed, args.progress)
+        if policy is None:
+            print(f"stopped; {run_dir} holds what was learned so far")
+            return
+        evaluate(args.env_id, policy, run_dir, args.episodes, args.eval_seed, args.progress)
+
+
+if __name__ == "__main__":
+    logging.basicConfig(level=logging.WARNING, format="%(message)s")
+    try:
+        main(tyro.cli(Args))
+    except TomatoError as error:
+        print(f"error: {error}", file=sys.stderr)
+        raise SystemExit(2) from None
