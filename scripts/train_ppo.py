@@ -22,6 +22,7 @@ import gymnasium as gym
 import torch
 import tyro
 from stable_baselines3 import PPO
+from stable_baselines3.common.logger import Logger
 from stable_baselines3.common.policies import ActorCriticPolicy
 from torch import Tensor
 from torch.utils.tensorboard import SummaryWriter
@@ -174,6 +175,7 @@ def train(env_id: str, config: PPOConfig, run_dir: Path, seed: int, progress: bo
         seed=seed,
         device="cpu",
     )
+    model.set_logger(Logger(None, []))  # Its default is a folder among the system's temporary files.
     write_atomically(run_dir / "config.json", (json.dumps(content, indent=2) + "\n").encode())
     start = time.perf_counter()
     with (
