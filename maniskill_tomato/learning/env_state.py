@@ -1,5 +1,6 @@
 """The state of a learner's environments in the middle of their episodes, with every random generator of theirs."""
 
+import logging
 from collections.abc import Mapping
 from typing import Any, Protocol, runtime_checkable
 
@@ -14,6 +15,8 @@ from maniskill_tomato.learning.random_state import (
     set_generator_state,
     set_random_state,
 )
+
+logger = logging.getLogger(__name__)
 
 
 @runtime_checkable
@@ -80,6 +83,10 @@ def set_env_state(env: LearnerEnv, state: dict[str, Any] | None) -> None:
         return
     anything: Any = env
     base: Any = anything.base_env
+    if getattr(base, "motion", None) == "dynamic":
+        logger.warning(
+            "the physics engine keeps numbers that cannot be saved; last digits may differ from here on"
+        )
     options = {"reconfigure": True} if base.reconfiguration_freq else {}
     anything.reset(seed=list(state["episode_seed"]), options=options)
     base.set_state_dict(_map_tensors(state["sim"], base.device))
