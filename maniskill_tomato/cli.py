@@ -146,6 +146,7 @@ class Train:
             name
             for name, given, begun in (
                 ("the task", self.env_id, run_file.env_id),
+                ("--preset", self.preset, run_file.preset or "td3"),
                 ("--seed", self.seed, run_file.seed or 0),
                 ("--seeds", self.seeds, tuple(map(str, run_file.seeds))),
                 ("--out", self.out, None),

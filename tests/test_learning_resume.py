@@ -430,9 +430,9 @@ def test_one_process_at_a_time_trains_in_a_folder(tmp_path: Path) -> None:
 
 
 def test_time_and_number_of_checkpoints_can_be_chosen(tmp_path: Path) -> None:
-    seconds = config(checkpoint_every=10_000, checkpoint_seconds=1e-9, checkpoints_kept=2)
+    seconds = config(total_timesteps=20, checkpoint_every=999, checkpoint_seconds=1e-9, checkpoints_kept=2)
     train(tmp_path / "run", seconds)
-    assert [p.name for p in checkpoints(tmp_path / "run")] == ["step_000000239.pt", "step_000000240.pt"]
+    assert [p.name for p in checkpoints(tmp_path / "run")] == ["step_000000019.pt", "step_000000020.pt"]
     with pytest.raises(InvalidInputError, match="checkpoint_seconds must be above 0"):
         config(checkpoint_seconds=0.0)
     with pytest.raises(InvalidInputError, match="checkpoints_kept must be 1 or more"):
@@ -519,7 +519,9 @@ def real_run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return run_dir
 
 
-@pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGTERM, signal.SIGINT])
+@pytest.mark.parametrize(
+    "number", [signal.SIGKILL, signal.SIGTERM, pytest.param(signal.SIGINT, marks=pytest.mark.slow)]
+)
 def test_a_killed_run_of_the_real_task_ends_as_the_unbroken_one(
     tmp_path: Path, real_run: Path, number: signal.Signals
 ) -> None:

@@ -160,6 +160,7 @@ def test_what_does_not_go_together_is_refused(tmp_path: Path, capsys: pytest.Cap
     message = fails(capsys, *resume, "--gamma", "0.5", "--seed", "3", "--plant", "full", "--out", "x")
     assert "cannot take --seed, --out, --plant..., --gamma; only total_episodes" in message
     assert "cannot take the task" in fails(capsys, SPARSE, *resume)
+    assert "cannot take --preset" in fails(capsys, *resume, "--preset", "thesis-sparse")
     assert "seeds must be integers" in fails(capsys, GUIDED, "--seeds", "1", "two")
 
 

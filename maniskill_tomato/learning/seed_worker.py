@@ -4,6 +4,7 @@ output.
 The process that started it keeps its standard input open; when that closes, this one stops as for SIGTERM.
 """
 
+import contextlib
 import dataclasses
 import json
 import logging
@@ -31,10 +32,8 @@ def main() -> None:
     threading.Thread(target=_stop_with_parent, daemon=True).start()
 
     def send(kind: str, values: dict[str, Any]) -> None:
-        try:
+        with contextlib.suppress(BrokenPipeError):  # The closed standard input stops the run.
             channel.write(json.dumps({"kind": kind, **values}) + "\n")
-        except BrokenPipeError:
-            os.kill(os.getpid(), signal.SIGTERM)
 
     def report(progress: Progress) -> None:
         send("progress", dataclasses.asdict(progress))

@@ -226,12 +226,16 @@ class _Worker:
         reason, error = str(known.get("stop_reason", "not started")), None
         status = None if self._process is None else self._process.returncode
         if status is not None and self._end.get("kind") != "end":
-            stopped_early = status == -signal.SIGTERM
-            reason = "SIGTERM" if stopped_early else "failed"
-            cause = (
-                f"ended by {signal.Signals(-status).name}" if status < 0 else f"ended with status {status}"
-            )
-            error = known.get("message") or f"{cause}; see {self.run_dir / LOG_NAME}"
+            if status == -signal.SIGTERM:  # Stopped before its training had begun.
+                reason = "SIGTERM"
+            else:
+                reason = "failed"
+                cause = (
+                    f"ended by {signal.Signals(-status).name}"
+                    if status < 0
+                    else f"ended with status {status}"
+                )
+                error = known.get("message") or f"{cause}; see {self.run_dir / LOG_NAME}"
         return SeedResult(
             seed=self.seed,
             run_dir=self.run_dir,
