@@ -68,7 +68,7 @@ def env_state(env: LearnerEnv) -> dict[str, Any] | None:
 def set_env_state(env: LearnerEnv, state: dict[str, Any] | None) -> None:
     """Puts `env`, made with the same options, where it was; its global random generators are left to the caller.
 
-    The episode is begun again from its seed, which grows its plants, and then moved on to the saved state.
+    An episode is begun from the same seed, its plants are grown, and it is then moved on to the saved state.
 
     Raises:
         CheckpointError: The environment's state was not saved.
