@@ -26,8 +26,17 @@ class RenderingUnavailableError(TomatoError, RuntimeError):
 
 
 class CheckpointError(TomatoError):
-    """A checkpoint is missing, damaged or made for something else."""
+    """A checkpoint is missing, damaged or made for something else, or cannot be written."""
+
+    def __init__(self, message: str, newer_format: bool = False) -> None:
+        """Keeps whether the file is whole, but written by a newer version."""
+        super().__init__(message)
+        self.newer_format = newer_format
 
 
 class TrainingDivergedError(TomatoError):
     """A loss or a weight is no longer a finite number."""
+
+
+class SeedsFailedError(TomatoError):
+    """Some of several training runs failed; the others are complete."""

@@ -1,5 +1,6 @@
 """Checkpoints: weights with everything needed to use them, written whole or not at all."""
 
+import contextlib
 import io
 import os
 import pickle
@@ -30,6 +31,9 @@ REQUIRED_KEYS = (
     "counters",
 )
 
+TRAINING_PARTS = ("critics", "target_actor", "target_critics", "actor_optimizer", "critic_optimizer")
+"""Parts of an agent that only its further training needs."""
+
 
 def make_checkpoint(
     agent: Agent,
@@ -37,6 +41,7 @@ def make_checkpoint(
     action_bounds: tuple[Tensor, Tensor],
     counters: dict[str, int | float],
     with_training_state: bool = True,
+    run: dict[str, Any] | None = None,
 ) -> dict[str, Any]:
     """What a checkpoint file holds: tensors, numbers and strings only, so that it loads without running code.
 
@@ -47,6 +52,7 @@ def make_checkpoint(
         counters: Steps, episodes, updates, seconds, seed.
         with_training_state: Also keep critics, target networks and optimisers; a policy to be used needs none
             of them.
+        run: What else a run needs to go on exactly, kept under `run`; see `Trainer`.
     """
     low, high = action_bounds
     scale = torch.tensor(agent.config.action_scale)
@@ -74,8 +80,10 @@ def make_checkpoint(
         "counters": counters,
     }
     if with_training_state:
-        for name in ("critics", "target_actor", "target_critics", "actor_optimizer", "critic_optimizer"):
+        for name in TRAINING_PARTS:
             data[name] = getattr(agent, name).state_dict()
+    if run is not None:
+        data["run"] = run
     return data
 
 
@@ -106,11 +114,24 @@ def write_atomically(path: Path, content: bytes) -> None:
             file.flush()
             os.fsync(file.fileno())
         temporary.replace(path)
+        _sync_folder(path.parent)
     except OSError as error:
-        temporary.unlink(missing_ok=True)
+        with contextlib.suppress(OSError):
+            temporary.unlink(missing_ok=True)
         raise CheckpointError(
-            f"cannot write {path}: {error.strerror or error}; free some space or choose another --out"
+            f"cannot write {path}: {error.strerror or error}; what was there before is kept. Free some space "
+            "or choose another --out; a run goes on with --resume"
         ) from error
+
+
+def _sync_folder(folder: Path) -> None:
+    """Makes a rename in `folder` last through a power failure, where the file system can."""
+    descriptor = os.open(folder, os.O_RDONLY)
+    try:
+        with contextlib.suppress(OSError):
+            os.fsync(descriptor)
+    finally:
+        os.close(descriptor)
 
 
 def load_checkpoint(path: Path | str, device: torch.device | str = "cpu") -> dict[str, Any]:
@@ -125,7 +146,13 @@ def load_checkpoint(path: Path | str, device: torch.device | str = "cpu") -> dic
             f"no checkpoint at {path}; `maniskill-tomato train` writes policy.pt into its run folder"
         )
     try:
-        data = torch.load(path, map_location=device, weights_only=True)
+        content = io.BytesIO(path.read_bytes())
+        # torch does not compare the archive's checksums, so that flipped bits would become weights.
+        with zipfile.ZipFile(content) as archive:
+            if (bad := archive.testzip()) is not None:
+                raise zipfile.BadZipFile(f"wrong checksum of {bad}")
+        content.seek(0)
+        data = torch.load(content, map_location=device, weights_only=True)
     except (
         RuntimeError,
         EOFError,
@@ -144,14 +171,15 @@ def load_checkpoint(path: Path | str, device: torch.device | str = "cpu") -> dic
         raise CheckpointError(
             f"{path} is not a checkpoint of this package, which would hold {', '.join(REQUIRED_KEYS)}"
         )
-    content: dict[str, Any] = data
-    if not isinstance(content["format"], int) or content["format"] > FORMAT:
+    checkpoint: dict[str, Any] = data
+    if not isinstance(checkpoint["format"], int) or checkpoint["format"] > FORMAT:
         raise CheckpointError(
-            f"{path} has checkpoint format {content['format']}, written by version "
-            f"{content['package_version']}; "
-            f"this version, {maniskill_tomato.__version__}, reads up to {FORMAT}: upgrade maniskill-tomato"
+            f"{path} has checkpoint format {checkpoint['format']}, written by version "
+            f"{checkpoint['package_version']}; "
+            f"this version, {maniskill_tomato.__version__}, reads up to {FORMAT}: upgrade maniskill-tomato",
+            newer_format=True,
         )
-    return content
+    return checkpoint
 
 
 def _names(names: tuple[str, ...], count: int) -> list[str]:

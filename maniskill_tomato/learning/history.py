@@ -4,15 +4,19 @@ curves."""
 import csv
 import io
 from collections import deque
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar, cast
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 
 from maniskill_tomato.errors import InvalidInputError
 from maniskill_tomato.learning.checkpoint import write_atomically
+
+_Record = TypeVar("_Record")
 
 RECENT_EPISODES = 50
 """Episodes that the progress bar averages over."""
@@ -115,6 +119,32 @@ class TrainingHistory:
         values = [float(getattr(record, field)) for record in self.recent]
         return sum(values) / len(values) if values else float("nan")
 
+    def state_dict(self) -> dict[str, Any]:
+        """Everything so far, episodes that still run included, exactly and as tensors."""
+        return {
+            "episodes": _columns(self.episodes, EpisodeRecord),
+            "running": _columns(self._running, _RunningEpisode),
+            "step_reward": torch.tensor(self._step_reward, dtype=torch.float64),
+            "step_visible_fraction": torch.tensor(self._step_visible_fraction, dtype=torch.float64),
+        }
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Takes back what `state_dict` gave.
+
+        Raises:
+            InvalidInputError: It is of another number of environments.
+        """
+        running = _rows(state["running"], _RunningEpisode)
+        if len(running) != len(self._running):
+            raise InvalidInputError(
+                f"the history is of {len(running)} parallel environments, not of {len(self._running)}"
+            )
+        self._running = running
+        self.episodes = _rows(state["episodes"], EpisodeRecord)
+        self.recent = deque(self.episodes[-RECENT_EPISODES:], maxlen=RECENT_EPISODES)
+        self._step_reward = state["step_reward"].tolist()
+        self._step_visible_fraction = state["step_visible_fraction"].tolist()
+
     def save(self, folder: Path) -> None:
         """Writes `episodes.csv` and `history.npz` (everything, as arrays) into `folder`."""
         names = [field.name for field in fields(EpisodeRecord)]
@@ -159,3 +189,18 @@ class _RunningEpisode:
     loss_sum: float = 0.0
     max_visible_fraction: float = 0.0
     success: bool = False
+
+
+def _columns(records: Sequence[Any], kind: type[Any]) -> dict[str, torch.Tensor]:
+    """One float64 tensor per field: exact for Python's floats, counts and truth values."""
+    return {
+        field.name: torch.tensor([float(getattr(r, field.name)) for r in records], dtype=torch.float64)
+        for field in fields(kind)
+    }
+
+
+def _rows(columns: dict[str, torch.Tensor], kind: Callable[..., _Record]) -> list[_Record]:
+    """The records that `_columns` came from."""
+    types: dict[str, Any] = {field.name: field.type for field in fields(cast(Any, kind))}
+    lists = {name: [types[name](value) for value in columns[name].tolist()] for name in types}
+    return [kind(**dict(zip(lists, row, strict=True))) for row in zip(*lists.values(), strict=True)]

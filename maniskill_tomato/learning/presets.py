@@ -26,6 +26,16 @@ EPSILON_GREEDY_HIGH = (0.1, 0.1, 0.1, 0.43, 0.17, 0.26)
 PresetName = Literal["td3", "thesis-guided", "thesis-sparse"]
 ExplorationName = Literal["epsilon-greedy", "decaying-gaussian", "look-at-goals"]
 
+MAY_CHANGE = (
+    "total_episodes",
+    "total_timesteps",
+    "max_minutes",
+    "checkpoint_every",
+    "checkpoint_seconds",
+    "checkpoints_kept",
+)
+"""Options that may differ when a run is continued: its length, and how often it is saved."""
+
 _AT_LEAST_ONE = (
     "batch_size",
     "buffer_size",
@@ -33,6 +43,7 @@ _AT_LEAST_ONE = (
     "exploration_steps",
     "num_envs",
     "checkpoint_every",
+    "checkpoints_kept",
     "torch_threads",
 )
 _NOT_NEGATIVE = (
@@ -123,11 +134,15 @@ class TrainConfig:
     """Parallel environments; ManiSkill allows more than one on a GPU only."""
     checkpoint_every: int = 5000
     """Environment steps between checkpoints."""
+    checkpoint_seconds: float | None = 60.0
+    """Longest time between checkpoints, in [s]; what a crash can cost. None leaves it to `checkpoint_every`."""
+    checkpoints_kept: int = 3
+    """Newest checkpoints that stay on the disk."""
     torch_threads: int = 1
     """CPU threads of PyTorch; these networks are too small to gain from more."""
 
     def __post_init__(self) -> None:
-        for name in ("total_episodes", "total_timesteps", "max_minutes"):
+        for name in ("total_episodes", "total_timesteps", "max_minutes", "checkpoint_seconds"):
             value = getattr(self, name)
             if value is not None and not value > 0:
                 raise InvalidInputError(f"{name} must be above 0, got {value}")

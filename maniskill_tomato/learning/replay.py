@@ -1,6 +1,6 @@
 """Replay: a ring of transitions kept in preallocated tensors."""
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -80,3 +80,27 @@ class ReplayBuffer:
             self._size, (batch_size,), generator=generator, device=self._storage.rewards.device
         )
         return Batch(*(stored[rows] for stored in self._storage))
+
+    def state_dict(self) -> dict[str, Any]:
+        """The transitions held and where the next one goes, for `load_state_dict`."""
+        held = {name: stored[: self._size].cpu().clone() for name, stored in self._storage._asdict().items()}
+        return {**held, "next": self._next, "capacity": self.capacity}
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Takes back what `state_dict` gave.
+
+        Raises:
+            InvalidInputError: It belongs to a buffer of another size or other transitions.
+        """
+        size = len(state["rewards"])
+        if state["capacity"] != self.capacity or size > self.capacity:
+            raise InvalidInputError(
+                f"the replay state is of a buffer of {state['capacity']} transitions, this one holds {self.capacity}"
+            )
+        for name, stored in self._storage._asdict().items():
+            if state[name].shape != (size, *stored.shape[1:]):
+                raise InvalidInputError(
+                    f"replay {name} must have shape {(size, *stored.shape[1:])}, got {tuple(state[name].shape)}"
+                )
+            stored[:size] = state[name].to(stored.device)
+        self._next, self._size = int(state["next"]), size

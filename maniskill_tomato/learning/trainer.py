@@ -1,33 +1,56 @@
 """The training loop (Algorithm 2): act, store, update, log, keep checkpoints."""
 
-import json
+import errno
 import logging
 import math
 import time
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import gymnasium as gym
-import numpy as np
 import torch
 from torch import Tensor
 
-import maniskill_tomato
-from maniskill_tomato.errors import InvalidInputError, TrainingDivergedError
+from maniskill_tomato.errors import CheckpointError, InvalidInputError, TrainingDivergedError
 from maniskill_tomato.learning.agent import make_agent, update
-from maniskill_tomato.learning.checkpoint import make_checkpoint, save_checkpoint, write_atomically
+from maniskill_tomato.learning.checkpoint import TRAINING_PARTS, make_checkpoint, save_checkpoint
+from maniskill_tomato.learning.env_state import (
+    env_state,
+    seed_action_spaces,
+    set_env_state,
+    set_tensor_attributes,
+    tensor_attributes,
+)
 from maniskill_tomato.learning.envs import LearnerEnv
 from maniskill_tomato.learning.exploration import make_exploration
 from maniskill_tomato.learning.history import TrainingHistory
 from maniskill_tomato.learning.interrupt import StopRequest, stop_on_signals
 from maniskill_tomato.learning.presets import TrainConfig
-from maniskill_tomato.learning.progress import TrainingLog
+from maniskill_tomato.learning.progress import Progress, TrainingLog
+from maniskill_tomato.learning.random_state import (
+    global_random_state,
+    seed_global_random_state,
+    set_global_random_state,
+)
 from maniskill_tomato.learning.replay import Batch, ReplayBuffer
 from maniskill_tomato.learning.rewards import potential_reward
+from maniskill_tomato.learning.run_folder import (
+    RUN_STATE_FORMAT,
+    check_run_dir,
+    checkpoint_path,
+    checkpoints,
+    newest_good_checkpoint,
+    only_writer,
+    remove_results,
+    write_config,
+)
 
 logger = logging.getLogger(__name__)
 
-CHECKPOINTS_KEPT = 3
+DISK_ERRORS = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS, errno.EIO)
+"""What a system answers when it cannot take what is written."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -59,6 +82,9 @@ class Trainer:
         run_dir: Path,
         seed: int = 0,
         show_progress: bool = True,
+        env_options: dict[str, Any] | None = None,
+        resume: bool = False,
+        report: Callable[[Progress], None] | None = None,
     ) -> None:
         """Prepares a run; nothing is stepped or written yet.
 
@@ -69,9 +95,14 @@ class Trainer:
             run_dir: Folder of the run; it must not hold another one.
             seed: Seed of the environment, the weights, the replay and the exploration.
             show_progress: Whether to draw a progress bar.
+            env_options: The options that `env` was made with, kept in `config.json`.
+            resume: Go on with the run in `run_dir` from its newest checkpoint, bit for bit as if it had never
+                stopped.
+            report: Called about twice a second with where the run is.
 
         Raises:
-            InvalidInputError: `run_dir` already holds a run, or `config` does not fit `env`.
+            InvalidInputError: `run_dir` already holds a run and `resume` is off, or holds none and it is on, or
+                `config` does not fit `env`.
         """
         observation_space, action_space = env.single_observation_space, env.single_action_space
         if not isinstance(observation_space, gym.spaces.Box) or not isinstance(action_space, gym.spaces.Box):
@@ -81,16 +112,19 @@ class Trainer:
             raise InvalidInputError(
                 f"action_scale must have {action_dim} values, one per action, got {len(config.action_scale)}"
             )
-        if (run_dir / "config.json").exists():
-            raise InvalidInputError(
-                f"{run_dir} already holds a run; choose another --out or pass --overwrite"
-            )
+        if not resume:
+            check_run_dir(run_dir)
+        elif not (run_dir / "config.json").is_file():
+            raise InvalidInputError(f"{run_dir} holds no run to continue (no config.json)")
         self._env = env
         self._env_id = env_id
         self._config = config
         self._run_dir = run_dir
         self._seed = seed
         self._show_progress = show_progress
+        self._env_options = env_options or {}
+        self._resume = resume
+        self._report = report
         self._dims = observation_space.shape[0], action_dim
         self._action_bounds = torch.as_tensor(action_space.low), torch.as_tensor(action_space.high)
         self._step = 0
@@ -98,32 +132,54 @@ class Trainer:
         self._updates_owed = 0.0
         self._episodes = 0
         self._checkpoint_step = 0
-        self._start = time.perf_counter()
+        self._start = self._checkpoint_time = time.perf_counter()
 
     def run(self) -> TrainResult:
         """Trains until the configured end, a signal or an error.
 
         Ctrl-C and SIGTERM end the run after the present step with everything saved; a second one stops at
-        once.
+        once. However it ends, `resume` goes on from its newest checkpoint.
 
         Raises:
-            TrainingDivergedError: The critic's loss is not finite; the last good checkpoint stays.
-            CheckpointError: The disk does not take the checkpoint.
+            TrainingDivergedError: A loss, reward, action or weight is not finite; the last good checkpoint stays.
+            CheckpointError: The disk does not take a file, another process trains in the folder, or there is
+                nothing to go on from. What was saved before stays.
         """
+        with only_writer(self._run_dir):
+            try:
+                return self._run()
+            except OSError as error:
+                if error.errno not in DISK_ERRORS:
+                    raise
+                raise CheckpointError(
+                    f"cannot write to {self._run_dir}: {error.strerror or error}; the last checkpoint, of step "
+                    f"{self._checkpoint_step}, is kept. Free some space and go on with --resume {self._run_dir}"
+                ) from error
+
+    def _run(self) -> TrainResult:
         torch.set_num_threads(self._config.torch_threads)
-        torch.manual_seed(self._seed)
-        np.random.seed(self._seed % 2**32)
+        seed_global_random_state(self._seed)
+        seed_action_spaces(self._env, self._seed)
+        saved = self._saved_run()
+        write_config(self._run_dir, self._env_id, self._seed, self._env_options, self._config.to_dict())
         observations, info = self._env.reset(seed=self._seed)
-        self._prepare(observations)
-        self._write_config()
-        self._start = time.perf_counter()
+        self._prepare(observations, info["visible_fraction"])
+        self._start = self._checkpoint_time = time.perf_counter()
+        if saved is not None:
+            self._restore(saved)
+        log_state = None if saved is None else saved["run"]["log"]
+        done = (self._step, self._episodes)
         with (
             stop_on_signals() as stop,
-            TrainingLog(self._run_dir, self._config, self._show_progress) as log,
+            TrainingLog(
+                self._run_dir, self._config, self._show_progress, self._start, self._report, log_state, done
+            ) as log,
         ):
-            reason = self._loop(observations, info["visible_fraction"], log, stop)
-        seconds = time.perf_counter() - self._start
-        policy_path = self._save()
+            self._log = log
+            reason = self._loop(stop)
+            seconds = time.perf_counter() - self._start
+            policy_path = self._save()
+            log.tell(self._step, self._history)
         logger.info("training ended (%s) after %d steps; policy in %s", reason, self._step, policy_path)
         return TrainResult(
             run_dir=self._run_dir,
@@ -135,7 +191,7 @@ class Trainer:
             stop_reason=reason,
         )
 
-    def _prepare(self, observations: Tensor) -> None:
+    def _prepare(self, observations: Tensor, visible_fraction: Tensor) -> None:
         device = observations.device
         config = self._config
         self._agent = make_agent(config, *self._dims, device)
@@ -144,16 +200,18 @@ class Trainer:
         self._exploration = make_exploration(config, self._generator, device)
         self._scale = torch.tensor(config.action_scale, device=device)
         self._history = TrainingHistory(self._env.num_envs)
+        self._observations = observations
+        self._visible_fraction = visible_fraction
+        self._episode_starts = torch.ones(self._env.num_envs, dtype=torch.bool, device=device)
 
-    def _loop(
-        self, observations: Tensor, visible_fraction: Tensor, log: TrainingLog, stop: StopRequest
-    ) -> str:
+    def _loop(self, stop: StopRequest) -> str:
         """Steps until the end; returns why it ended."""
-        episode_starts = torch.ones(self._env.num_envs, dtype=torch.bool, device=observations.device)
         while (reason := stop.reason or self._end_reason()) is None:
+            observations = self._observations
             actions = self._exploration.explore(
-                self._agent.policy(observations), observations, self._step, episode_starts
+                self._agent.policy(observations), observations, self._step, self._episode_starts
             )
+            self._check_finite(action=actions)
             next_observations, rewards, terminations, truncations, info = self._env.step(
                 actions * self._scale
             )
@@ -162,7 +220,8 @@ class Trainer:
             # At the end of an episode `next_observations` is already the start of the next one.
             step_info = info.get("final_info", info)
             reached = info["final_observation"] if "final_observation" in info else next_observations
-            learned = self._learned_reward(rewards, terminations, visible_fraction, step_info)
+            learned = self._learned_reward(rewards, terminations, self._visible_fraction, step_info)
+            self._check_finite(reward=learned, observation=reached)
             self._replay.add(Batch(observations, actions, learned, reached, terminations.float()))
             losses = self._learn()
             if losses:
@@ -175,12 +234,18 @@ class Trainer:
                 dones.tolist(),
             )
             self._episodes += len(finished)
-            log.step(self._step, losses, self._exploration.amount(self._step), finished, self._history)
-            observations, episode_starts = next_observations, dones
-            visible_fraction = info["visible_fraction"]
-            if self._step - self._checkpoint_step >= self._config.checkpoint_every:
+            self._log.step(self._step, losses, self._exploration.amount(self._step), finished, self._history)
+            self._observations, self._episode_starts = next_observations, dones
+            self._visible_fraction = info["visible_fraction"]
+            if self._checkpoint_is_due():
                 self._save_periodic()
         return reason
+
+    def _checkpoint_is_due(self) -> bool:
+        if self._step - self._checkpoint_step >= self._config.checkpoint_every:
+            return True
+        longest = self._config.checkpoint_seconds
+        return longest is not None and time.perf_counter() - self._checkpoint_time >= longest
 
     def _learned_reward(
         self,
@@ -230,12 +295,19 @@ class Trainer:
                 counts[name] = counts.get(name, 0) + 1
         means = {name: total / counts[name] for name, total in sums.items()}
         if not all(math.isfinite(value) for value in means.values()):
-            listed = ", ".join(f"{name} {value:g}" for name, value in means.items())
-            raise TrainingDivergedError(
-                f"training diverged at step {self._step}: {listed}. Lower the learning rates or check the "
-                f"rewards; the checkpoints in {self._run_dir / 'checkpoints'} are from before"
-            )
+            raise self._diverged(", ".join(f"{name} {value:g}" for name, value in means.items()))
         return means
+
+    def _check_finite(self, **tensors: Tensor) -> None:
+        for name, values in tensors.items():
+            if not bool(values.isfinite().all()):
+                raise self._diverged(f"{name} {values.flatten()[:8].tolist()}")
+
+    def _diverged(self, listed: str) -> TrainingDivergedError:
+        return TrainingDivergedError(
+            f"training diverged at step {self._step}: {listed}. Lower the learning rates or check the "
+            f"rewards; the checkpoints in {self._run_dir / 'checkpoints'} are from before"
+        )
 
     def _counters(self) -> dict[str, int | float]:
         return {
@@ -246,15 +318,79 @@ class Trainer:
             "seed": self._seed,
         }
 
+    def _saved_run(self) -> dict[str, Any] | None:
+        """The checkpoint to go on from, or None for a run that begins."""
+        if not self._resume:
+            return None
+        saved = newest_good_checkpoint(self._run_dir, self._env_id, self._seed, self._config.to_dict())
+        if saved is None:
+            logger.info("%s was stopped before its first checkpoint; it begins again", self._run_dir)
+            remove_results(self._run_dir)
+        elif saved["run"]["torch_version"] != torch.__version__:
+            logger.warning(
+                "the run was begun with torch %s; with torch %s its last digits may differ",
+                saved["run"]["torch_version"],
+                torch.__version__,
+            )
+        return saved
+
+    def _run_state(self) -> dict[str, Any]:
+        """What a run needs beside its networks to go on exactly: data only, on the CPU."""
+        return {
+            "format": RUN_STATE_FORMAT,
+            "torch_version": str(torch.__version__),
+            "updates_owed": self._updates_owed,
+            "replay": self._replay.state_dict(),
+            "exploration": tensor_attributes(self._exploration),
+            "history": self._history.state_dict(),
+            "log": self._log.state_dict(),
+            "observations": self._observations.cpu(),
+            "visible_fraction": self._visible_fraction.cpu(),
+            "episode_starts": self._episode_starts.cpu(),
+            "generator": self._generator.get_state().cpu(),
+            "env": env_state(self._env),
+            "random": global_random_state(),
+        }
+
+    def _restore(self, saved: dict[str, Any]) -> None:
+        """Puts everything back to the moment of the checkpoint `saved`."""
+        state, counters, device = saved["run"], saved["counters"], self._observations.device
+        try:
+            for name in ("actor", "normalizer", *TRAINING_PARTS):
+                getattr(self._agent, name).load_state_dict(saved[name])
+            self._replay.load_state_dict(state["replay"])
+            set_tensor_attributes(self._exploration, state["exploration"], device)
+            self._history.load_state_dict(state["history"])
+            self._observations = state["observations"].to(device)
+            self._visible_fraction = state["visible_fraction"].to(device)
+            self._episode_starts = state["episode_starts"].to(device)
+            self._step = self._checkpoint_step = counters["steps"]
+            self._episodes, self._updates = counters["episodes"], counters["updates"]
+            self._updates_owed = state["updates_owed"]
+            set_env_state(self._env, state["env"])
+            self._generator.set_state(state["generator"])
+            set_global_random_state(state["random"])
+        except (KeyError, TypeError, ValueError, RuntimeError, AttributeError) as error:
+            raise CheckpointError(
+                f"the checkpoint of step {counters['steps']} in {self._run_dir} does not fit this run: {error!r}; "
+                "train again with --overwrite"
+            ) from error
+        self._start -= counters["seconds"]
+        self._history.save(self._run_dir)
+        logger.info("%s goes on from step %d", self._run_dir, self._step)
+
     def _save_periodic(self) -> None:
         """Writes a checkpoint of the present step, drops the oldest, writes the history."""
-        folder = self._run_dir / "checkpoints"
-        data = make_checkpoint(self._agent, self._env_id, self._action_bounds, self._counters())
-        save_checkpoint(folder / f"step_{self._step:09d}.pt", data)
-        for old in sorted(folder.glob("step_*.pt"))[:-CHECKPOINTS_KEPT]:
+        weights = (*self._agent.actor.parameters(), *self._agent.critics.parameters())
+        self._check_finite(weights=torch.cat([w.detach().flatten() for w in weights]))
+        data = make_checkpoint(
+            self._agent, self._env_id, self._action_bounds, self._counters(), run=self._run_state()
+        )
+        save_checkpoint(checkpoint_path(self._run_dir, self._step), data)
+        for old in checkpoints(self._run_dir)[: -self._config.checkpoints_kept]:
             old.unlink()
         self._history.save(self._run_dir)
-        self._checkpoint_step = self._step
+        self._checkpoint_step, self._checkpoint_time = self._step, time.perf_counter()
 
     def _save(self) -> Path:
         """The last checkpoint, and beside it the policy alone."""
@@ -266,35 +402,3 @@ class Trainer:
         )
         save_checkpoint(path, data)
         return path
-
-    def _write_config(self) -> None:
-        content = {
-            "env_id": self._env_id,
-            "seed": self._seed,
-            "package_version": maniskill_tomato.__version__,
-            "config": self._config.to_dict(),
-        }
-        write_atomically(self._run_dir / "config.json", (json.dumps(content, indent=2) + "\n").encode())
-
-
-def check_run_dir(run_dir: Path) -> None:
-    """Accepts a folder for a new run.
-
-    Raises:
-        InvalidInputError: It already holds a run, or is a file.
-    """
-    if run_dir.exists() and not run_dir.is_dir():
-        raise InvalidInputError(f"{run_dir} is a file; choose another --out")
-    if (run_dir / "config.json").exists():
-        raise InvalidInputError(f"{run_dir} already holds a run; choose another --out or pass --overwrite")
-
-
-def clear_run(run_dir: Path) -> None:
-    """Removes what an earlier run wrote into `run_dir`, and nothing else."""
-    if not (run_dir / "config.json").is_file():
-        return
-    for name in ("config.json", "episodes.csv", "history.npz", "policy.pt"):
-        (run_dir / name).unlink(missing_ok=True)
-    for pattern in ("checkpoints/step_*.pt", "tensorboard/events.out.tfevents.*"):
-        for path in run_dir.glob(pattern):
-            path.unlink()

@@ -1,0 +1,64 @@
+"""One training run from its description: the environment made, trained in, and closed."""
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from maniskill_tomato.learning.envs import check_env_id, make_learner_env
+from maniskill_tomato.learning.presets import TrainConfig
+from maniskill_tomato.learning.progress import Progress
+from maniskill_tomato.learning.run_folder import check_run_dir, clear_run
+from maniskill_tomato.learning.trainer import Trainer, TrainResult
+
+
+def train(
+    env_id: str,
+    config: TrainConfig,
+    run_dir: Path,
+    seed: int,
+    env_options: dict[str, Any],
+    *,
+    overwrite: bool = False,
+    resume: bool = False,
+    show_progress: bool = True,
+    report: Callable[[Progress], None] | None = None,
+) -> TrainResult:
+    """Trains in `run_dir`.
+
+    Args:
+        env_id: Id of the task.
+        config: How to learn.
+        run_dir: Folder of the run.
+        seed: Seed of everything that is random.
+        env_options: Options of the task for `gymnasium.make`.
+        overwrite: Remove an earlier run from the folder.
+        resume: Go on with the run in the folder.
+        show_progress: Whether to draw a progress bar.
+        report: Called about twice a second with where the run is.
+
+    Raises:
+        InvalidInputError: The id, an option or the folder cannot be used.
+        CheckpointError: The run cannot be saved or continued.
+        TrainingDivergedError: Something is not finite any more.
+    """
+    check_env_id(env_id)
+    if overwrite:
+        clear_run(run_dir)
+    if not resume:
+        check_run_dir(run_dir)
+    env = make_learner_env(env_id, config.num_envs, **env_options)
+    try:
+        trainer = Trainer(
+            env,
+            env_id,
+            config,
+            run_dir,
+            seed,
+            show_progress,
+            env_options=env_options,
+            resume=resume,
+            report=report,
+        )
+        return trainer.run()
+    finally:
+        env.close()
