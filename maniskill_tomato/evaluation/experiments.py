@@ -95,7 +95,7 @@ EXPERIMENTS: dict[ExperimentName, Experiment] = {
 
 @dataclass(frozen=True, kw_only=True)
 class Variant:
-    """The exact settings with something changed."""
+    """The exact settings, or those with one thing changed."""
 
     name: str
     title: str
@@ -191,13 +191,10 @@ SINGLE_CHANGES: tuple[Variant, ...] = (
 )
 """One change each."""
 
-COMBINATIONS: tuple[Variant, ...] = ()
-"""Several changes each, in search of the fewest that work."""
-
 
 def variants_of(experiment: Experiment) -> dict[str, Variant]:
     """All variants of an experiment by name, the exact settings first."""
-    known = (EXACT, *SINGLE_CHANGES, *COMBINATIONS)
+    known = (EXACT, *SINGLE_CHANGES)
     return {v.name: v for v in known if experiment.name in v.experiments}
 
 
