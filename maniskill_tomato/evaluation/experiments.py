@@ -1,0 +1,210 @@
+"""The thesis's two experiments (sections 5-1 and 5-2), and variants that change one setting of them."""
+
+import dataclasses
+from dataclasses import dataclass, field
+from typing import Any, Literal
+
+from maniskill_tomato.errors import InvalidInputError
+from maniskill_tomato.learning.presets import PRESETS, PresetName, TrainConfig
+
+ExperimentName = Literal["guided", "sparse"]
+
+OTHER_POSE = (0.8, 0.1, 0.5)
+"""Where the plant stands in the evaluations "at a pose other than the training pose": x, y [m], yaw [rad]. The
+thesis shows its poses in Figures 5-5, 5-10 and 5-18 and prints no numbers."""
+
+THESIS_EPISODES = 6
+"""Length of the thesis's evaluations, in episodes."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Evaluation:
+    """Where a trained policy is judged."""
+
+    name: str
+    """Short name, part of file names."""
+    title: str
+    """What stands above its figures."""
+    env_options: dict[str, Any] = field(default_factory=dict)
+    """Options for `gymnasium.make`; none for the plant and the pose of the training."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class ThesisNumbers:
+    """What the thesis prints about the length of a training, to mark in its curves."""
+
+    total_steps: int | None
+    """Steps of the whole training, if it says."""
+    exploration_ends: tuple[int, int] | None
+    """Episode and step at which the exploration ends, if it does."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Experiment:
+    """One of the thesis's two."""
+
+    name: ExperimentName
+    env_id: str
+    preset: PresetName
+    """The exact settings: Table 5-1 or 5-2."""
+    windows: tuple[int, int]
+    """Moving-average windows of its training curves, in episodes and steps."""
+    evaluations: tuple[Evaluation, ...]
+    """The first is on the plant and at the pose of the training; the others are the thesis's."""
+    thesis: ThesisNumbers
+
+
+EXPERIMENTS: dict[ExperimentName, Experiment] = {
+    "guided": Experiment(
+        name="guided",
+        env_id="TomatoViewpointGuided-v1",
+        preset="thesis-guided",
+        windows=(12, 75),
+        evaluations=(
+            Evaluation(name="training-pose", title="one tomato, as in training"),
+            Evaluation(
+                name="one-tomato",
+                title="one tomato, another pose (Fig. 5-5 to 5-9)",
+                env_options={"plant_pose": OTHER_POSE},
+            ),
+            Evaluation(
+                name="three-tomatoes",
+                title="three tomatoes, another pose (Fig. 5-10 to 5-13)",
+                env_options={"plant": {"preset": "three_tomatoes", "seed": 4}, "plant_pose": OTHER_POSE},
+            ),
+        ),
+        thesis=ThesisNumbers(total_steps=1278, exploration_ends=None),
+    ),
+    "sparse": Experiment(
+        name="sparse",
+        env_id="TomatoViewpointSparse-v1",
+        preset="thesis-sparse",
+        windows=(30, 180),
+        evaluations=(
+            Evaluation(name="training-pose", title="three tomatoes, as in training"),
+            Evaluation(
+                name="three-tomatoes",
+                title="three tomatoes, another pose (Fig. 5-18 to 5-21)",
+                env_options={"plant_pose": OTHER_POSE},
+            ),
+        ),
+        thesis=ThesisNumbers(total_steps=None, exploration_ends=(238, 1800)),
+    ),
+}
+
+
+@dataclass(frozen=True, kw_only=True)
+class Variant:
+    """The exact settings, or those with one thing changed."""
+
+    name: str
+    title: str
+    """What differs, for tables."""
+    changes: dict[str, Any]
+    """Fields of `TrainConfig` and their new values; none for the exact settings."""
+    experiments: tuple[ExperimentName, ...] = ("guided", "sparse")
+    """Where it applies."""
+
+    def config(self, experiment: Experiment) -> TrainConfig:
+        """The training configuration of this variant."""
+        return dataclasses.replace(PRESETS[experiment.preset], **self.changes)
+
+
+SMALL_ACTIONS = (0.35, 0.35, 0.35, 0.6, 0.6, 0.6)
+"""The action scale of the preset `td3`, in [m] and [rad]."""
+
+EXACT = Variant(name="exact", title="exactly Table 5-1 / 5-2", changes={})
+
+SINGLE_CHANGES: tuple[Variant, ...] = (
+    Variant(
+        name="small-actions",
+        title="actions of at most 0.35 m and 0.6 rad, not 1",
+        changes={"action_scale": SMALL_ACTIONS},
+    ),
+    Variant(
+        name="small-start",
+        title="output weights of the actor within 0.003, not Glorot",
+        changes={"actor_output_init": "small"},
+    ),
+    Variant(
+        name="pre-tanh-penalty",
+        title="penalty of 0.01 on the squared outputs before tanh",
+        changes={"pre_tanh_penalty": 0.01},
+    ),
+    Variant(
+        name="normalised",
+        title="observations scaled to about [-1, 1]",
+        changes={"normalize_observations": True},
+    ),
+    Variant(
+        name="buffer-100k",
+        title="buffer of 100,000 transitions, not 1000 / 1500",
+        changes={"buffer_size": 100_000},
+    ),
+    Variant(name="tau-0.005", title="tau 0.005, not 0.001", changes={"tau": 0.005}),
+    Variant(name="tau-0.01", title="tau 0.01, not 0.001", changes={"tau": 0.01}),
+    Variant(name="gamma-0.9", title="gamma 0.9, not 0.99", changes={"gamma": 0.9}),
+    Variant(
+        name="potential-reward", title="potential reward, not the task's", changes={"reward": "potential"}
+    ),
+    Variant(
+        name="actor-lr-1e-3",
+        title="actor's learning rate 0.001, not 0.0001",
+        changes={"actor_learning_rate": 1e-3},
+    ),
+    Variant(
+        name="critic-lr-1e-4",
+        title="critic's learning rate 0.0001, not 0.001",
+        changes={"critic_learning_rate": 1e-4},
+    ),
+    Variant(name="batch-256", title="256 transitions per update, not 32", changes={"batch_size": 256}),
+    Variant(
+        name="slow-exploration",
+        title="EXP 4800, not 1200",
+        changes={"exploration_steps": 4800},
+        experiments=("guided",),
+    ),
+    Variant(
+        name="slow-exploration-sparse",
+        title="EXP 7200, not 1800",
+        changes={"exploration_steps": 7200},
+        experiments=("sparse",),
+    ),
+    Variant(
+        name="wide-noise",
+        title="noise of standard deviation 0.32 (0.1 read as the variance)",
+        changes={"exploration_noise": 0.32},
+        experiments=("sparse",),
+    ),
+    Variant(
+        name="double-episodes",
+        title="480 episodes, not 240",
+        changes={"total_episodes": 480},
+        experiments=("guided",),
+    ),
+    Variant(
+        name="six-fold-episodes",
+        title="3000 episodes, not 500",
+        changes={"total_episodes": 3000},
+        experiments=("sparse",),
+    ),
+)
+"""One change each."""
+
+
+def variants_of(experiment: Experiment) -> dict[str, Variant]:
+    """All variants of an experiment by name, the exact settings first."""
+    known = (EXACT, *SINGLE_CHANGES)
+    return {v.name: v for v in known if experiment.name in v.experiments}
+
+
+def find_variant(experiment: Experiment, name: str) -> Variant:
+    """The variant called `name`.
+
+    Raises:
+        InvalidInputError: The experiment has none of this name; the message lists them.
+    """
+    variants = variants_of(experiment)
+    if name not in variants:
+        raise InvalidInputError.choice(f"variant of {experiment.name}", name, variants)
+    return variants[name]
