@@ -27,10 +27,6 @@ from maniskill_tomato.tasks import TASK_IDS
 
 # PyTorch and ManiSkill take seconds to import, so that every command imports what it needs when it runs.
 
-THESIS_WINDOWS: dict[str, tuple[int, int]] = {"thesis-guided": (12, 75), "thesis-sparse": (30, 180)}
-"""Moving-average windows of the thesis's training curves, in episodes and steps (Fig. 5-1 to 5-4, 5-14 to
-5-17)."""
-
 EnvId = Annotated[
     str, tyro.conf.Positional, tyro.conf.arg(metavar="ENV_ID", help=f"One of {', '.join(TASK_IDS)}.")
 ]

@@ -39,7 +39,7 @@ from maniskill_tomato.learning.gymnasium_env import Array, make_gymnasium_env, n
 from maniskill_tomato.learning.history import TrainingHistory
 from maniskill_tomato.learning.interrupt import stop_on_signals
 from maniskill_tomato.learning.presets import get_preset
-from maniskill_tomato.learning.trainer import check_run_dir
+from maniskill_tomato.learning.run_folder import check_run_dir
 from maniskill_tomato.tasks import TASK_IDS
 
 SPS_EVERY = 100

@@ -23,7 +23,8 @@ from maniskill_tomato.learning.envs import LearnerEnv, make_env, make_learner_en
 from maniskill_tomato.learning.history import load_history
 from maniskill_tomato.learning.policy import Policy, load_policy
 from maniskill_tomato.learning.presets import TrainConfig
-from maniskill_tomato.learning.trainer import Trainer, clear_run
+from maniskill_tomato.learning.run_folder import clear_run
+from maniskill_tomato.learning.trainer import Trainer
 from maniskill_tomato.robot.inverse_kinematics import Reach
 
 logger = logging.getLogger(__name__)
