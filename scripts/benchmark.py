@@ -33,6 +33,7 @@ from maniskill_tomato.robot.d435 import color_intrinsics
 from maniskill_tomato.robot.iiwa14 import JOINT_LOWER, JOINT_UPPER
 from maniskill_tomato.robot.inverse_kinematics import InverseKinematics
 from maniskill_tomato.robot.kinematics import forward_kinematics
+from maniskill_tomato.tasks.planting import GROWN_PLANTS
 from maniskill_tomato.visibility.caster import VisibilityCaster
 
 GUIDED = "TomatoViewpointGuided-v1"
@@ -101,8 +102,8 @@ def resident_mib() -> float:
 
 
 def growth(work: Callable[[], object], times: int) -> dict[str, float]:
-    """Memory before, during and after `times` calls, once 100 have filled the caches of plants, in [MiB]."""
-    for _ in range(100):
+    """Memory before, during and after `times` calls, once the caches of plants are full, in [MiB]."""
+    for _ in range(2 * GROWN_PLANTS):
         work()
     readings = [resident_mib()]
     for _ in range(5):

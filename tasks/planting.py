@@ -19,7 +19,7 @@ from maniskill_tomato.plants.rendering import build_plant_actors
 from maniskill_tomato.tasks import scene_mask
 from maniskill_tomato.tasks.plant_choice import PlantChoice
 
-GROWN_PLANTS = 256
+GROWN_PLANTS = 128
 """How many plants are kept, of 1 MB or less each, for environments that show them again."""
 
 
