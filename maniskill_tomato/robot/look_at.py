@@ -76,8 +76,7 @@ def look_at_pose(position: Tensor, target: Tensor, roll: Tensor | float = 0.0) -
     cosine, sine = torch.cos(turn), torch.sin(turn)
     x = cosine * right - sine * up
     y = -sine * right - cosine * up
-    origin = position.expand_as(x)
-    upper = torch.stack(torch.broadcast_tensors(x, y, forward, origin), dim=-1)
+    upper = torch.stack([x, y, forward.expand_as(x), position.expand_as(x)], dim=-1)
     last = upper.new_tensor((0.0, 0.0, 0.0, 1.0)).expand(*upper.shape[:-2], 1, 4)
     return torch.cat([upper, last], dim=-2)
 

@@ -34,6 +34,7 @@ from maniskill_tomato.robot.iiwa14 import LINK_NAMES
 from maniskill_tomato.visibility import kernels
 from maniskill_tomato.visibility.lattice import ray_lattice
 from maniskill_tomato.visibility.meshes import PlantMeshCache, PlantMeshes, build_mesh
+from maniskill_tomato.visibility.view_buffers import make_view
 from maniskill_tomato.warp_runtime import start_warp
 
 LinkMeshes = Mapping[str, tuple[NDArray[Any], NDArray[Any]]]
@@ -138,6 +139,24 @@ class VisibilityCaster:
         """Number of environments B."""
         return len(self._shown)
 
+    @property
+    def device(self) -> torch.device:
+        """Where the rays are cast."""
+        return self._device
+
+    @property
+    def scene(self) -> kernels.Scene:
+        """The tables of plants and links, for other kernels over the same meshes.
+
+        They follow `replace_plant`; a plant with more fruits than any before brings a new object.
+        """
+        return self._scene
+
+    @property
+    def camera(self) -> kernels.Camera:
+        """What the image covers."""
+        return self._camera
+
     def plant(self, env_index: int) -> Plant:
         """The plant that an environment shows."""
         return self._shown[env_index].plant
@@ -207,9 +226,6 @@ class VisibilityCaster:
     def _array(self, values: NDArray[Any], dtype: Any) -> Any:
         return wp.array(values, dtype=dtype, device=self._warp_device)
 
-    def _empty(self, shape: int | tuple[int, ...], dtype: Any) -> Any:
-        return wp.empty(shape, dtype=dtype, device=self._warp_device)
-
     def _build_links(self, robot_meshes: LinkMeshes) -> list[tuple[int, NDArray[np.float32], Any]]:
         """Index in `LINK_NAMES`, vertices and mesh of each link that has triangles."""
         links = []
@@ -276,17 +292,8 @@ class VisibilityCaster:
         scene.link_lows = self._array(np.array(lows, dtype=np.float32).reshape(-1, 3), wp.vec3)
         scene.link_highs = self._array(np.array(highs, dtype=np.float32).reshape(-1, 3), wp.vec3)
 
-        view = kernels.View()
-        links = len(self._links)
-        view.plant_rotations = self._empty(b, wp.mat33)
-        view.plant_positions = self._empty(b, wp.vec3)
-        view.rectangles = self._empty(b, wp.vec4)
-        view.link_rotations = self._empty((b, links), wp.mat33)
-        view.link_positions = self._empty((b, links), wp.vec3)
-        view.links_in_the_way = self._empty(b, wp.int32)
-        view.counters = self._empty((b, int(kernels.OUTCOMES)), wp.int32)
-        view.any_seen = self._empty(b, wp.int32)
-
+        self._scene = scene
+        view = make_view(b, len(self._links), self._warp_device)
         targets = wp.from_torch(self._targets)
         poses = [
             wp.from_torch(self._camera_poses, dtype=wp.mat44),
