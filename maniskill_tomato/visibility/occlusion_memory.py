@@ -28,8 +28,8 @@ CELL_SIZE: Final = float(memory_kernels.CELL_SIZE)
 MAX_VISITS: Final = int(memory_kernels.MAX_VISITS)
 """Camera positions that are remembered."""
 
-TARGET_RADIUS: Final = 0.033
-"""Radius of the disc that stands for the target in predictions, in [m]."""
+TARGET_RADIUS: Final = 0.028
+"""Radius of the disc that stands for the target in predictions, in [m]: the mean of generated ripe fruits."""
 
 _LARGEST_PREDICTION_KEPT = 32
 
