@@ -166,6 +166,21 @@ def test_a_wall_hides_the_target_behind_it_and_free_space_does_not(device: str) 
     assert float(memory.predict(front)[0, 0, 0]) > 0.95
 
 
+def test_what_stands_in_a_voxel_is_expected_beside_it_too_and_not_far_away(device: str) -> None:
+    memory = begun((0.0, 0.0, 0.0), device)
+    cameras = torch.tensor([[[-0.5, 0.0, 0.0], [0.5, 0.0, 0.0]]], device=device)
+    before = memory.predict(cameras)[0, :, 0].tolist()
+    pose = torch.eye(4)
+    pose[:3, 3] = torch.tensor([-0.5, 0.0, 0.0])
+    # All in the voxels just below the line from the target to the first camera, 3 cm beside it.
+    points = torch.tensor([[-0.11, 0.03, -0.03]]).repeat(20, 1)
+    labels = torch.full((20,), int(RayLabel.OTHER))
+    memory.integrate(pose[None].to(device), rays_to(points, pose, labels, device))
+    after = memory.predict(cameras)[0, :, 0].tolist()
+    assert after[0] < before[0] - 0.1
+    assert after[1] == pytest.approx(before[1], abs=1e-6)
+
+
 def test_a_wall_that_covers_half_hides_half(device: str) -> None:
     memory = begun((0.0, 0.0, 0.0), device)
     wall_view(memory, (0.0, 1.0), RayLabel.OTHER)
@@ -173,11 +188,26 @@ def test_a_wall_that_covers_half_hides_half(device: str) -> None:
     assert seen == pytest.approx(0.5, abs=0.15)
 
 
-def plain_prediction(memory: OcclusionMemory, camera: Tensor, density: float, weight: float) -> list[float]:
+def plain_density(hits: Tensor, passed: Tensor, density: float, weights: dict[int, float]) -> Tensor:
+    """Hits per voxel edge: blocks of 4 voxels along each edge, then 2, then 1, each beginning from the one before."""
+    expected = torch.full_like(hits, density)
+    for edge, weight in weights.items():
+        blocks = [
+            edge**3 * torch.nn.functional.avg_pool3d(values[None], edge)[0] for values in (hits, passed)
+        ]
+        all_hits, all_passed = (torch.kron(block, torch.ones(edge, edge, edge).double()) for block in blocks)
+        expected = (all_hits + weight * expected) / (all_passed + weight)
+    return expected
+
+
+def plain_prediction(
+    memory: OcclusionMemory, camera: Tensor, density: float, voxel_weight: float, block_weight: float
+) -> list[float]:
     """The same prediction by sampling 8 rays densely in double precision."""
     target = memory.target_position[0].double()
     hits, passed = memory.hits[0].double(), memory.passed_length[0].double()
-    per_edge = torch.where((hits > 0) | (passed > 0), (hits + weight * density) / (passed + weight), density)
+    weights = {4: block_weight, 2: block_weight, 1: voxel_weight}
+    per_edge = plain_density(hits, passed, density, weights)
     is_unknown = (hits == 0) & (passed < 0.25)
     axes = look_at_pose(camera.double(), target)[:3, :3]
     right, up = axes[:, 0], -axes[:, 1]
@@ -194,7 +224,7 @@ def plain_prediction(memory: OcclusionMemory, camera: Tensor, density: float, we
 
 
 def test_predictions_are_those_of_a_plain_loop() -> None:
-    memory = begun((0.7, 0.1, 1.0), unknown_probability=0.02, prior_length=0.5)
+    memory = begun((0.7, 0.1, 1.0), unknown_probability=0.02, voxel_weight=0.4, block_weight=1.5)
     for seed in range(3):
         points, T_world_camera, label = random_view(300, seed)
         near = memory.target_position + 0.3 * (points - memory.target_position)
@@ -204,7 +234,7 @@ def test_predictions_are_those_of_a_plain_loop() -> None:
     predicted = memory.predict(cameras[None])[0]
     assert float(predicted[:, 0].std()) > 0.1
     for camera, found in zip(cameras, predicted, strict=True):
-        expected = plain_prediction(memory, camera, -math.log(0.98), 0.5)
+        expected = plain_prediction(memory, camera, -math.log(0.98), 0.4, 1.5)
         # The fixed points of 1/256 voxel edge and the samples of the loop.
         assert found.tolist() == pytest.approx(expected, abs=4e-3)
 

@@ -14,8 +14,8 @@ from maniskill_tomato.visibility.view_rays import RANGE, RayLabel, ViewRayCaster
 
 pytestmark = pytest.mark.render
 
-PLANTS = 10
-VIEWS = 4
+PLANTS = 8
+VIEWS = 3
 
 
 def test_a_rendered_image_tells_what_the_rays_tell_and_gives_the_same_observation(
