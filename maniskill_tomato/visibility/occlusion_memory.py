@@ -3,7 +3,8 @@
 The foliage in a voxel is taken for many small leaves at random places, as when leaf area density is estimated from
 laser scans: hits divided by the length that rays went through the voxel estimate its density lambda, the expected
 hits per length (Beland et al., Agricultural and Forest Meteorology 151, 2011), and a ray of length s through it stays
-free with the probability exp(-lambda s). A gamma prior stands for what is assumed before anything is seen.
+free with the probability exp(-lambda s). Leaves are larger than voxels, so the estimate of a voxel begins from that of
+the 4 cm around it, and that from the 8 cm around those: each time the mean of a gamma posterior.
 """
 
 import math
