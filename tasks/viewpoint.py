@@ -28,6 +28,7 @@ from maniskill_tomato.tasks import MAX_EPISODE_STEPS, options, scene_mask, scene
 from maniskill_tomato.tasks.config import ViewpointTaskConfig, guided_task, sparse_task
 from maniskill_tomato.tasks.flat_state import checked_rows, unflatten
 from maniskill_tomato.tasks.motion import drive_to
+from maniskill_tomato.tasks.other_targets import other_ripe_fruits
 from maniskill_tomato.tasks.plant_choice import PlantChoice, PlantPose
 from maniskill_tomato.tasks.planting import GROWN_PLANTS, Planting, ripe_fruit_at_random
 from maniskill_tomato.tasks.rewards import in_forbidden_zone
@@ -49,6 +50,7 @@ class TomatoViewpointEnv(BaseEnv):  # type: ignore[misc]
     - `plant_pose_noise`: half ranges of a uniform addition to it at every reset, in [m, m, rad].
     - `motion`: `"kinematic"` puts the joints at the solution, `"dynamic"` drives them there through physics.
     - `rays_per_side`: the visibility query casts this number squared.
+    - `other_targets`: how many other ripe fruits are judged at every step as if each were the target (below).
     - `render_backend`: `"auto"` renders on the GPU if there is one, else on the CPU, and not at all where no
       picture is asked for.
 
@@ -60,7 +62,10 @@ class TomatoViewpointEnv(BaseEnv):  # type: ignore[misc]
     **Action** (`pd_viewpoint`, 6 numbers in [-1, 1]): increments of the first six, 1 meaning 1 m or 1 rad.
     **Info**, each of shape (num_envs,): `success`, `fail`, `visible_fraction`, `target_id` (segmentation id),
     `target_seen`, `tomato_seen`, `reachability` (`Reach`), `in_forbidden_zone`, `reward_visual`,
-    `reward_penalty`.
+    `reward_penalty`. With `other_targets` K also what another target in the same place would have given, for the K
+    ripe fruits that follow the target in the plant's order: `other_visible_fraction`, `other_success`,
+    `other_reward`, `other_exists` (the plant has that many), each of shape (num_envs, K), and `other_position` in
+    the world frame, in [m], of shape (num_envs, K, 3).
     """
 
     SUPPORTED_ROBOTS = list(ROBOTS)
@@ -77,6 +82,7 @@ class TomatoViewpointEnv(BaseEnv):  # type: ignore[misc]
         plant_pose_noise: Sequence[float] = (0.0, 0.0, 0.0),
         motion: options.Motion = "kinematic",
         rays_per_side: int = 16,
+        other_targets: int = 0,
         num_envs: int = 1,
         obs_mode: str | None = None,
         reward_mode: str | None = None,
@@ -95,12 +101,14 @@ class TomatoViewpointEnv(BaseEnv):  # type: ignore[misc]
         options.check_motion(motion)
         options.check_num_envs(num_envs, sim_backend)
         options.check_rays_per_side(rays_per_side)
+        options.check_other_targets(other_targets)
         self.task = task
         self._choice = PlantChoice.parse(plant, task.plant)
         self._plant_pose = PlantPose.parse(plant_pose, task.plant_pose)
         self._plant_pose_noise = options.check_half_ranges("plant_pose_noise", plant_pose_noise, 3)
         self.motion = motion
         self._rays_per_side = rays_per_side
+        self._other_targets = other_targets
         self._has_caster = False
         rendering = options.needs_rendering(obs_mode, render_mode)
         render_backend = options.pick_render_backend(render_backend, rendering)
@@ -228,6 +236,10 @@ class TomatoViewpointEnv(BaseEnv):  # type: ignore[misc]
         rows = torch.arange(self.num_envs, device=self.device)
         self._target_id = self.planting.fruit_segmentation_id[rows, self._target]
         self._target_position_w = self.planting.fruit_position_w(self._target)
+        if self._other_targets:
+            self._others, self._others_exist = other_ripe_fruits(
+                self.planting, self._target, self._other_targets
+            )
 
     def _checked_target(self, env_index: int, target: object) -> int:
         ripe = self.planting.ripe_fruits[env_index]
@@ -310,8 +322,16 @@ class TomatoViewpointEnv(BaseEnv):  # type: ignore[misc]
         """What the camera sees from where it is: V_f, whether that is a success, and the terms of the
         reward."""
         T_w_links = link_transforms(self.agent.robot.get_qpos())
+        info = self._judge(self._target, T_w_links)
+        info["target_id"] = self._target_id.clone()
+        if self._other_targets:
+            info |= self._judge_others(T_w_links)
+        return info
+
+    def _judge(self, target: Tensor, T_w_links: Tensor) -> dict[str, Tensor]:
+        """The present view as one of `target`, indices in `Plant.fruits`. Shape (num_envs,)."""
         seen = self._caster.cast(
-            T_w_links[:, -1] @ self._T_ee_camera, self._target, self.planting.T_world_plant, T_w_links
+            T_w_links[:, -1] @ self._T_ee_camera, target, self.planting.T_world_plant, T_w_links
         )
         fraction, tomato_seen = seen.visible_fraction, seen.any_visible
         target_seen = fraction > 0.0
@@ -322,13 +342,25 @@ class TomatoViewpointEnv(BaseEnv):  # type: ignore[misc]
             "success": (fraction > self.task.full_visibility) & ~fail,
             "fail": fail,
             "visible_fraction": fraction,
-            "target_id": self._target_id.clone(),
             "target_seen": target_seen,
             "tomato_seen": tomato_seen,
             "reachability": self._reach.clone(),
             "in_forbidden_zone": forbidden,
             "reward_visual": self.task.visual_reward(fraction, target_seen, tomato_seen, self._reach),
             "reward_penalty": self.task.pose_penalty(self._reach, forbidden),
+        }
+
+    def _judge_others(self, T_w_links: Tensor) -> dict[str, Tensor]:
+        """The present view as one of each of the other ripe fruits."""
+        fruits = self._others.unbind(-1)
+        judged = [self._judge(fruit, T_w_links) for fruit in fruits]
+        rewards: list[Tensor] = [self.get_reward(obs=None, action=torch.empty(0), info=j) for j in judged]
+        return {
+            "other_visible_fraction": torch.stack([j["visible_fraction"] for j in judged], dim=-1),
+            "other_success": torch.stack([j["success"] for j in judged], dim=-1),
+            "other_reward": torch.stack(rewards, dim=-1),
+            "other_exists": self._others_exist.clone(),
+            "other_position": torch.stack([self.planting.fruit_position_w(f) for f in fruits], dim=-2),
         }
 
     def compute_dense_reward(self, obs: Any, action: Tensor, info: dict[str, Tensor]) -> Tensor:
