@@ -76,6 +76,27 @@ def test_help_is_quick_and_loads_neither_torch_nor_the_simulator() -> None:
     assert all(word in result.stdout for word in ("train", "eval", "demo", "export"))
 
 
+@pytest.mark.parametrize(
+    "options",
+    [
+        ("--hindsight-targets", "2", "--n-step", "3", "--aux-visibility-weight", "0.1"),
+        ("--success-threshold-start", "0.3", "--normalize-observations", "running"),
+        ("--preset", "fast-td3", "--num-envs", "1", "--updates-per-step", "0.2", "--batch-size", "16"),
+    ],
+    ids=["hindsight", "threshold", "fast-td3"],
+)
+def test_options_of_the_learner_are_flags(tmp_path: Path, options: tuple[str, ...]) -> None:
+    main(["train", TASK_IDS[1], "--out", str(tmp_path / "run"), *SHORT, *options])
+    config = json.loads((tmp_path / "run" / "config.json").read_text())
+    for flag, value in zip(options[::2], options[1::2], strict=True):
+        if flag != "--preset":
+            assert str(config["config"][flag.removeprefix("--").replace("-", "_")]) == value
+    assert config["env_options"] == {}
+    main(["train", "--resume", str(tmp_path / "run"), "--total-timesteps", "120"])
+    policy = load_policy(tmp_path / "run" / "policy.pt")
+    assert policy.counters["steps"] == 120 and policy.counters["updates"] > 0
+
+
 @pytest.mark.parametrize("env_id", TASK_IDS)
 def test_training_a_hundred_steps_writes_a_run(
     tmp_path: Path, env_id: str, capsys: pytest.CaptureFixture[str]

@@ -5,6 +5,7 @@ import json
 import subprocess
 import sys
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -27,6 +28,7 @@ from maniskill_tomato.learning.envs import make_env
 from maniskill_tomato.learning.export import export_policy
 from maniskill_tomato.learning.policy import load_policy
 from maniskill_tomato.learning.presets import PRESETS, TrainConfig, get_preset
+from maniskill_tomato.policy.description import PolicyDescription
 from maniskill_tomato.policy.onnx_policy import OnnxPolicy
 from maniskill_tomato.tasks import TASK_IDS
 
@@ -98,7 +100,7 @@ def test_an_export_follows_a_calculation_by_hand(tmp_path: Path) -> None:
         total_timesteps=1,
         actor_hidden=(2,),
         action_scale=(0.1, 0.2, 0.3, 0.4, 0.5, 0.6),
-        normalize_observations=True,
+        normalize_observations="fixed",
     )
     agent = make_agent(config, 9, 6)
     with torch.no_grad():
@@ -119,6 +121,34 @@ def test_an_export_follows_a_calculation_by_hand(tmp_path: Path) -> None:
     (action,) = policy.act(observation[None])
     # tanh(2 * 0.5) * 0.1; dz saturates at 0.3 and dyaw at tanh(1) * 0.6 = 0.457, both above the bound.
     np.testing.assert_allclose(action, [0.1 * np.tanh(1.0), 0.0, 0.25, 0.0, 0.0, 0.25], rtol=0.0, atol=1e-6)
+
+
+def test_a_running_normaliser_is_exported_as_it_was_last(tmp_path: Path) -> None:
+    config = replace(PRESETS["td3"], normalize_observations="running")
+    agent = make_agent(config, 9, 6)
+    seen = torch.randn(500, 9, generator=torch.Generator().manual_seed(0)) * 0.2 + torch.tensor(
+        CENTRE.tolist()
+    )
+    agent.observe(seen)
+    with torch.no_grad():
+        agent.actor.output.weight.mul_(100.0)
+    bounds = (-torch.ones(6), torch.ones(6))
+    save_checkpoint(tmp_path / "p.pt", make_checkpoint(agent, GUIDED, bounds, {}, with_training_state=False))
+    model = export_policy(tmp_path / "p.pt", tmp_path / "out").model
+    content = json.loads(model.with_suffix(".json").read_text())["normalizer"]
+    assert content["kind"] == "running"
+    np.testing.assert_allclose(content["centre"], seen.double().mean(dim=0), rtol=1e-5)
+    np.testing.assert_allclose(content["half_range"], seen.double().std(dim=0, correction=0), rtol=1e-5)
+    wanted = agent.policy(seen).numpy() * np.array(config.action_scale)
+    assert np.abs(wanted).max() > 0.05
+    np.testing.assert_allclose(OnnxPolicy.load(model).act(seen.numpy()), wanted, rtol=0.0, atol=1e-5)
+
+
+def test_a_description_that_does_not_say_where_its_normaliser_comes_from_is_read(exported: Path) -> None:
+    text = exported.with_suffix(".json").read_text()
+    content = json.loads(text)
+    assert PolicyDescription.from_json(text).normalizer_kind == content["normalizer"].pop("kind") == "fixed"
+    assert PolicyDescription.from_json(json.dumps(content)).normalizer_kind == "unknown"
 
 
 def test_a_batch_of_any_size_is_answered_row_by_row(exported: Path) -> None:

@@ -199,11 +199,17 @@ def test_the_thesis_presets_are_tables_5_1_and_5_2() -> None:
         assert config.actor_hidden == config.critic_hidden == (100, 100)
         assert config.action_scale == (1.0,) * 6
         assert (config.twin_critics, config.policy_frequency, config.target_noise) == (False, 1, 0.0)
-        assert (config.reward, config.updates_per_step, config.normalize_observations) == ("task", 1.0, False)
+        assert (config.reward, config.updates_per_step, config.normalize_observations) == (
+            "task",
+            1.0,
+            "none",
+        )
 
 
 def test_an_unknown_preset_lists_the_known_ones() -> None:
-    with pytest.raises(InvalidInputError, match="'td3', 'thesis-guided', 'thesis-sparse'; got 'sac'"):
+    with pytest.raises(
+        InvalidInputError, match="'td3', 'fast-td3', 'thesis-guided', 'thesis-sparse'; got 'sac'"
+    ):
         get_preset("sac")
 
 

@@ -97,7 +97,7 @@ def small_config(**changes: Any) -> TrainConfig:
         gamma=0.95,
         actor_hidden=(64, 64),
         critic_hidden=(64, 64),
-        normalize_observations=False,
+        normalize_observations="none",
         exploration_steps=1000,
         action_scale=(0.25, 0.25, 0.25, 0.35, 0.35, 0.35),
         updates_per_step=1.0,
@@ -129,6 +129,30 @@ def test_training_solves_the_toy_task_that_an_untrained_policy_does_not(tmp_path
         ReachTask(), small_config(total_timesteps=4000, exploration_steps=2000), tmp_path / "trained"
     )
     assert success_rate(load_policy(untrained.policy_path), 100) < 0.3
+    assert success_rate(load_policy(trained.policy_path), 100) > 0.7
+
+
+def test_fast_td3_in_small_solves_the_toy_task(tmp_path: Path) -> None:
+    """Several steps, running normalisation, categorical critics and a noise level for each environment together."""
+    config = replace(
+        get_preset("fast-td3"),
+        total_timesteps=5000,
+        num_envs=8,
+        n_step=2,
+        learning_starts=400,
+        batch_size=128,
+        buffer_size=20_000,
+        updates_per_step=0.25,
+        tau=0.02,
+        actor_learning_rate=1e-3,
+        critic_learning_rate=1e-3,
+        actor_hidden=(64, 64),
+        critic_hidden=(64, 64),
+        exploration_steps=2000,
+        action_scale=(0.25, 0.25, 0.25, 0.35, 0.35, 0.35),
+        step_cost=0.02,
+    )
+    trained = train(ReachTask(8), config, tmp_path / "run")
     assert success_rate(load_policy(trained.policy_path), 100) > 0.7
 
 

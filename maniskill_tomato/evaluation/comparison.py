@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from maniskill_tomato.errors import InvalidInputError
-from maniskill_tomato.learning.presets import PRESETS, TrainConfig
+from maniskill_tomato.learning.presets import PRESETS, TrainConfig, modernise
 
 RESAMPLES = 10_000
 CURVE_RESAMPLES = 1000
@@ -331,7 +331,7 @@ def _label(config: dict[str, Any], others: Sequence[dict[str, Any]]) -> str:
 def _nearest_preset(options: dict[str, Any]) -> tuple[str, dict[str, Any]]:
     """The preset that shares most options, and the options that it does not share."""
     defaults = TrainConfig(total_timesteps=1).to_dict()
-    complete = {**defaults, "total_timesteps": None, **options}
+    complete = {**defaults, "total_timesteps": None, **modernise(options)}
     differences: dict[str, dict[str, Any]] = {}
     for name, preset in PRESETS.items():
         values = preset.to_dict()

@@ -134,7 +134,7 @@ SINGLE_CHANGES: tuple[Variant, ...] = (
     Variant(
         name="normalised",
         title="observations scaled to about [-1, 1]",
-        changes={"normalize_observations": True},
+        changes={"normalize_observations": "fixed"},
     ),
     Variant(
         name="buffer-100k",

@@ -31,7 +31,15 @@ REQUIRED_KEYS = (
     "counters",
 )
 
-TRAINING_PARTS = ("critics", "target_actor", "target_critics", "actor_optimizer", "critic_optimizer")
+TRAINING_PARTS = (
+    "critics",
+    "target_actor",
+    "target_critics",
+    "actor_optimizer",
+    "critic_optimizer",
+    "statistics",
+    "heads",
+)
 """Parts of an agent that only its further training needs."""
 
 

@@ -146,6 +146,7 @@ def describe_policy(policy: Policy, model: bytes) -> PolicyDescription:
         ),
         normalizer_centre=_shortest(policy.normalizer.centre),
         normalizer_half_range=_shortest(policy.normalizer.half_range),
+        normalizer_kind=policy.config.normalize_observations,
         action=tuple(
             ActionComponent(name=name, unit=unit, low=low, high=high, scale=scale)
             for name, unit, low, high, scale in zip(ACTION_NAMES, ACTION_UNITS, *bounds, strict=True)

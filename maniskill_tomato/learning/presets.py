@@ -1,11 +1,13 @@
 """Training configurations: the thesis's two (Tables 5-1 and 5-2) and good defaults."""
 
+import dataclasses
 import math
 from typing import Literal
 
 from maniskill_tomato.errors import InvalidInputError
 from maniskill_tomato.learning.train_config import MAY_CHANGE as MAY_CHANGE
 from maniskill_tomato.learning.train_config import TrainConfig as TrainConfig
+from maniskill_tomato.learning.train_config import modernise as modernise
 from maniskill_tomato.policy.layout import ACTION_NAMES as ACTION_NAMES
 from maniskill_tomato.policy.layout import OBSERVATION_NAMES as OBSERVATION_NAMES
 
@@ -23,37 +25,64 @@ EPSILON_GREEDY_LOW = (-0.07, -0.2, -0.1, -0.17, -0.17, -0.17)
 EPSILON_GREEDY_HIGH = (0.1, 0.1, 0.1, 0.43, 0.17, 0.26)
 """Upper ends of Eq. 5-6 in the order of `ACTION_NAMES`. [m], [rad]."""
 
-PresetName = Literal["td3", "thesis-guided", "thesis-sparse"]
+PresetName = Literal["td3", "fast-td3", "thesis-guided", "thesis-sparse"]
+
+_TD3 = TrainConfig(
+    total_timesteps=15_000,
+    reward="potential",
+    step_cost=0.05,
+    gamma=0.9,
+    tau=0.01,
+    batch_size=256,
+    buffer_size=100_000,
+    learning_starts=1500,
+    updates_per_step=0.5,
+    actor_learning_rate=1e-3,
+    critic_learning_rate=1e-3,
+    twin_critics=True,
+    policy_frequency=2,
+    target_noise=0.2,
+    pre_tanh_penalty=1e-3,
+    actor_hidden=(128, 128),
+    critic_hidden=(128, 128),
+    critic_action_layer=0,
+    actor_output_init="small",
+    normalize_observations="fixed",
+    action_scale=(0.35, 0.35, 0.35, 0.6, 0.6, 0.6),
+    exploration="look-at-goals",
+    exploration_steps=10_000,
+    exploration_noise=0.3,
+    exploration_noise_end=0.1,
+    exploration_goal_share=0.1,
+)
+
+_FAST_TD3 = dataclasses.replace(
+    _TD3,
+    total_timesteps=3_000_000,
+    tau=0.1,
+    batch_size=8192,
+    buffer_size=1_000_000,
+    learning_starts=10_240,
+    updates_per_step=2 / 1024,
+    actor_learning_rate=3e-4,
+    critic_learning_rate=3e-4,
+    critic="categorical",
+    value_range=(-4.0, 2.0),
+    actor_hidden=(512, 256, 128),
+    critic_hidden=(1024, 512, 256),
+    normalize_observations="running",
+    exploration_steps=1_000_000,
+    exploration_noise=0.4,
+    exploration_noise_end=0.001,
+    exploration_noise_per_env=True,
+    num_envs=1024,
+    checkpoint_every=500_000,
+    checkpoint_seconds=None,
+)
 
 PRESETS: dict[PresetName, TrainConfig] = {
-    "td3": TrainConfig(
-        total_timesteps=15_000,
-        reward="potential",
-        step_cost=0.05,
-        gamma=0.9,
-        tau=0.01,
-        batch_size=256,
-        buffer_size=100_000,
-        learning_starts=1500,
-        updates_per_step=0.5,
-        actor_learning_rate=1e-3,
-        critic_learning_rate=1e-3,
-        twin_critics=True,
-        policy_frequency=2,
-        target_noise=0.2,
-        pre_tanh_penalty=1e-3,
-        actor_hidden=(128, 128),
-        critic_hidden=(128, 128),
-        critic_action_layer=0,
-        actor_output_init="small",
-        normalize_observations=True,
-        action_scale=(0.35, 0.35, 0.35, 0.6, 0.6, 0.6),
-        exploration="look-at-goals",
-        exploration_steps=10_000,
-        exploration_noise=0.3,
-        exploration_noise_end=0.1,
-        exploration_goal_share=0.1,
-    ),
+    "td3": _TD3,
+    "fast-td3": _FAST_TD3,
     "thesis-guided": TrainConfig(
         total_episodes=240, buffer_size=1000, exploration="epsilon-greedy", exploration_steps=1200
     ),

@@ -46,7 +46,8 @@ def train(
         clear_run(run_dir)
     if not resume:
         check_run_dir(run_dir)
-    env = make_learner_env(env_id, config.num_envs, **env_options)
+    judged = {"other_targets": config.hindsight_targets} if config.hindsight_targets else {}
+    env = make_learner_env(env_id, config.num_envs, **{**judged, **env_options})
     try:
         trainer = Trainer(
             env,

@@ -19,6 +19,8 @@ MAY_CHANGE = (
 """Options that may differ when a run is continued: its length, and how often it is saved."""
 
 _AT_LEAST_ONE = (
+    "n_step",
+    "success_threshold_steps",
     "batch_size",
     "buffer_size",
     "policy_frequency",
@@ -29,6 +31,9 @@ _AT_LEAST_ONE = (
     "torch_threads",
 )
 _NOT_NEGATIVE = (
+    "hindsight_targets",
+    "aux_distance_weight",
+    "aux_visibility_weight",
     "learning_starts",
     "updates_per_step",
     "step_cost",
@@ -38,6 +43,11 @@ _NOT_NEGATIVE = (
     "exploration_noise",
     "exploration_noise_end",
 )
+
+_CHOICES = {
+    "critic": ("scalar", "categorical"),
+    "normalize_observations": ("none", "fixed", "running"),
+}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -60,6 +70,8 @@ class TrainConfig:
     """What each step costs with the potential reward."""
     gamma: float = 0.99
     """Discount factor."""
+    n_step: int = 1
+    """Steps that a return adds up before it bootstraps; fewer where the episode ends."""
     tau: float = 0.001
     """Share by which the target networks follow at each of their updates."""
     batch_size: int = 32
@@ -76,6 +88,12 @@ class TrainConfig:
     """Adam step size of the critics."""
     twin_critics: bool = False
     """Use the smaller of two critics' targets (TD3)."""
+    critic: Literal["scalar", "categorical"] = "scalar"
+    """What the critics learn: the value, or its distribution over fixed atoms (C51, FastTD3)."""
+    value_atoms: int = 101
+    """Atoms of the categorical critics."""
+    value_range: tuple[float, float] = (-10.0, 10.0)
+    """Smallest and largest value that the categorical critics can tell."""
     policy_frequency: int = 1
     """Critic updates per update of the actor and the targets (TD3: 2)."""
     target_noise: float = 0.0
@@ -84,6 +102,19 @@ class TrainConfig:
     """Bound of that noise, in units of the action scale."""
     pre_tanh_penalty: float = 0.0
     """Weight of the mean squared actor output before tanh, against saturation."""
+    aux_distance_weight: float = 0.0
+    """Weight of predicting the distance to the target, in [m], from the actor's last hidden layer."""
+    aux_visibility_weight: float = 0.0
+    """Weight of predicting V_f after the action from the critics' last hidden layers."""
+
+    # Hindsight.
+    hindsight_targets: int = 0
+    """Other ripe tomatoes for which every step is stored once more, as if they had been the target."""
+    success_threshold_start: float | None = None
+    """V_f above which a view counts as a success at the start of the run, potential reward only; it rises linearly
+    to 1, and the task's own threshold holds as soon as it is lower. None: always the task's."""
+    success_threshold_steps: int = 5000
+    """Steps in which it rises."""
 
     # Networks.
     actor_hidden: tuple[int, ...] = (100, 100)
@@ -94,8 +125,9 @@ class TrainConfig:
     """Hidden layer of the critics that the action enters; 1 is the second, as in the thesis."""
     actor_output_init: Literal["glorot", "small"] = "glorot"
     """Initialiser of the actor's last layer: the thesis's, or one whose first actions are nearly zero."""
-    normalize_observations: bool = False
-    """Scale observations by the fixed ranges OBSERVATION_CENTRE and OBSERVATION_HALF_RANGE."""
+    normalize_observations: Literal["none", "fixed", "running"] = "none"
+    """Scale observations by the fixed ranges OBSERVATION_CENTRE and OBSERVATION_HALF_RANGE, or by the mean and
+    standard deviation of those of the run so far."""
     action_scale: tuple[float, ...] = (1.0, 1.0, 1.0, 1.0, 1.0, 1.0)
     """The action that an actor output of 1 stands for, in [m] and [rad] (thesis: 1)."""
 
@@ -107,9 +139,12 @@ class TrainConfig:
     exploration_noise: float = 0.1
     """Standard deviation of the noise at the start, in units of the action scale."""
     exploration_noise_end: float = 0.0
-    """Standard deviation at the end of the schedule (look-at goals only), in units of the action scale."""
+    """Standard deviation at the end of the schedule (look-at goals), in units of the action scale."""
     exploration_goal_share: float = 0.0
     """Share of episodes led through look-at goals at the end of the schedule (look-at goals only)."""
+    exploration_noise_per_env: bool = False
+    """Every environment draws its own noise level with each episode, uniformly between exploration_noise_end and
+    exploration_noise, instead of the schedule's (FastTD3)."""
 
     # Running.
     num_envs: int = 1
@@ -133,6 +168,16 @@ class TrainConfig:
         for name in ("gamma", "exploration_goal_share"):
             if not 0.0 <= getattr(self, name) < 1.0:
                 raise InvalidInputError(f"{name} must be in [0, 1), got {getattr(self, name)}")
+        if self.success_threshold_start is not None:
+            if not 0.0 < self.success_threshold_start < 1.0:
+                raise InvalidInputError(
+                    f"success_threshold_start must be in (0, 1), got {self.success_threshold_start}"
+                )
+            if self.reward != "potential" or self.n_step != 1:
+                raise InvalidInputError(
+                    "success_threshold_start needs reward 'potential' and n_step 1, because every batch is labelled "
+                    f"anew; got {self.reward!r} and {self.n_step}"
+                )
         for name in ("tau", "actor_learning_rate", "critic_learning_rate"):
             if not 0.0 < getattr(self, name) <= 1.0:
                 raise InvalidInputError(f"{name} must be in (0, 1], got {getattr(self, name)}")
@@ -142,10 +187,11 @@ class TrainConfig:
         for name in _NOT_NEGATIVE:
             if not getattr(self, name) >= 0:
                 raise InvalidInputError(f"{name} must be 0 or more, got {getattr(self, name)}")
-        if self.buffer_size < max(self.batch_size, self.num_envs):
+        at_once = self.num_envs * self.n_step * max(self.hindsight_targets, 1)
+        if self.buffer_size < max(self.batch_size, at_once):
             raise InvalidInputError(
-                f"buffer_size must be at least batch_size ({self.batch_size}) and "
-                f"num_envs ({self.num_envs}), got {self.buffer_size}"
+                f"buffer_size must be at least batch_size ({self.batch_size}) and num_envs x n_step x "
+                f"hindsight_targets ({at_once}), got {self.buffer_size}"
             )
         for name in ("actor_hidden", "critic_hidden"):
             widths = getattr(self, name)
@@ -158,6 +204,28 @@ class TrainConfig:
             )
         if not self.action_scale or not all(0.0 < scale <= 1.0 for scale in self.action_scale):
             raise InvalidInputError(f"action_scale must hold values in (0, 1], got {self.action_scale}")
+        if (
+            self.value_atoms < 2
+            or len(self.value_range) != 2
+            or not self.value_range[0] < self.value_range[1]
+        ):
+            raise InvalidInputError(
+                "categorical critics need 2 or more value_atoms over a rising value_range, got "
+                f"{self.value_atoms} over {self.value_range}"
+            )
+        for name, allowed in _CHOICES.items():
+            if getattr(self, name) not in allowed:
+                raise InvalidInputError.choice(name, getattr(self, name), allowed)
+        if self.exploration_noise_per_env and self.exploration == "epsilon-greedy":
+            raise InvalidInputError(
+                "exploration_noise_per_env needs an exploration with noise, decaying-gaussian or look-at-goals; "
+                "epsilon-greedy has none"
+            )
+
+    @property
+    def needs_visible_fractions(self) -> bool:
+        """Whether the replay must keep V_f."""
+        return self.aux_visibility_weight > 0.0 or self.success_threshold_start is not None
 
     def to_dict(self) -> dict[str, Any]:
         """The fields as numbers, strings and lists, ready for JSON."""
@@ -166,6 +234,8 @@ class TrainConfig:
     @classmethod
     def from_dict(cls, values: dict[str, Any]) -> "TrainConfig":
         """The configuration that `to_dict` described.
+
+        Options are read as `modernise` leaves them.
 
         Raises:
             InvalidInputError: A field is unknown (the message lists them) or its value not allowed.
@@ -176,5 +246,14 @@ class TrainConfig:
             raise InvalidInputError(
                 f"unknown training options: {', '.join(unknown)}; known are {', '.join(sorted(known))}"
             )
+        values = modernise(values)
         arguments: dict[str, Any] = {k: tuple(v) if isinstance(v, list) else v for k, v in values.items()}
         return cls(**arguments)
+
+
+def modernise(values: dict[str, Any]) -> dict[str, Any]:
+    """Options as this version writes them: `normalize_observations` was once a switch, on for `fixed`."""
+    normalize = values.get("normalize_observations")
+    if isinstance(normalize, bool):
+        return {**values, "normalize_observations": "fixed" if normalize else "none"}
+    return values

@@ -33,6 +33,7 @@ from maniskill_tomato.learning.run_folder import (
     remove_results,
     write_config,
 )
+from maniskill_tomato.learning.threshold import label_successes, success_threshold
 from maniskill_tomato.learning.training_state import TrainingState
 
 logger = logging.getLogger(__name__)
@@ -187,6 +188,7 @@ class Trainer:
         state = self._state
         while (reason := stop.reason or self._end_reason()) is None:
             observations = state.observations
+            state.agent.observe(observations)
             actions = state.exploration.explore(
                 state.agent.policy(observations), observations, state.step, state.episode_starts
             )
@@ -201,7 +203,8 @@ class Trainer:
             reached = info["final_observation"] if "final_observation" in info else next_observations
             learned = learned_reward(self._config, rewards, terminations, state.visible_fraction, step_info)
             self._check_finite(reward=learned, observation=reached)
-            state.replay.add(Batch(observations, actions, learned, reached, terminations.float()))
+            batch = Batch(observations, actions, learned, reached, terminations.float())
+            state.experience.add(batch, dones, step_info, info)
             losses = self._learn()
             if losses:
                 state.history.add_loss(losses["qf1_loss"])
@@ -248,6 +251,11 @@ class Trainer:
         while state.updates_owed >= 1.0:
             state.updates_owed -= 1.0
             batch = state.replay.sample(config.batch_size, state.generator)
+            if config.success_threshold_start is not None:
+                threshold = success_threshold(
+                    config.success_threshold_start, state.step, config.success_threshold_steps
+                )
+                batch = label_successes(batch, threshold, config.gamma)
             logs = update(state.agent, batch, state.updates, state.generator)
             state.updates += 1
             for name, value in logs.items():

@@ -15,11 +15,11 @@ from maniskill_tomato.learning.env_state import (
     tensor_attributes,
 )
 from maniskill_tomato.learning.envs import LearnerEnv
+from maniskill_tomato.learning.experience import Experience, make_replay
 from maniskill_tomato.learning.exploration import make_exploration
 from maniskill_tomato.learning.history import TrainingHistory
 from maniskill_tomato.learning.presets import TrainConfig
 from maniskill_tomato.learning.random_state import global_random_state, set_global_random_state
-from maniskill_tomato.learning.replay import ReplayBuffer
 from maniskill_tomato.learning.run_folder import RUN_STATE_FORMAT
 
 
@@ -48,7 +48,9 @@ class TrainingState:
         device = observations.device
         self.env = env
         self.agent = make_agent(config, *dims, device)
-        self.replay = ReplayBuffer(config.buffer_size, *dims, device)
+        self.replay = make_replay(config, *dims, device)
+        self.experience = Experience(config, self.replay, env.num_envs, dims, device)
+        self.experience.begin(info)
         self.generator = torch.Generator(device=device).manual_seed(seed)
         self.exploration = make_exploration(config, self.generator, device)
         self.history = TrainingHistory(env.num_envs)
@@ -70,6 +72,7 @@ class TrainingState:
             "torch_version": str(torch.__version__),
             "updates_owed": self.updates_owed,
             "replay": self.replay.state_dict(),
+            "experience": self.experience.state_dict(),
             "exploration": tensor_attributes(self.exploration),
             "history": self.history.state_dict(),
             "log": log_state,
@@ -92,6 +95,7 @@ class TrainingState:
             for name in ("actor", "normalizer", *TRAINING_PARTS):
                 getattr(self.agent, name).load_state_dict(saved[name])
             self.replay.load_state_dict(run["replay"])
+            self.experience.load_state_dict(run["experience"])
             set_tensor_attributes(self.exploration, run["exploration"], device)
             self.history.load_state_dict(run["history"])
             self.observations = run["observations"].to(device)

@@ -57,6 +57,9 @@ class PolicyDescription:
     """What the normaliser, which is part of the graph, maps to 0."""
     normalizer_half_range: tuple[float, ...]
     """What it maps to 1, as a distance from the centre."""
+    normalizer_kind: str
+    """Where both come from: `none` (the identity), `fixed` ranges, or the `running` mean and standard deviation of
+    the training's observations; `unknown` in files that do not say."""
     action: tuple[ActionComponent, ...]
     """The output, in order: increments of the end-effector pose."""
     training: dict[str, Any]
@@ -84,6 +87,7 @@ class PolicyDescription:
             "normalizer": {
                 "formula": "(observation - centre) / half_range",
                 "part_of_the_graph": True,
+                "kind": self.normalizer_kind,
                 "centre": list(self.normalizer_centre),
                 "half_range": list(self.normalizer_half_range),
             },
@@ -129,6 +133,7 @@ class PolicyDescription:
                 observation=tuple(Component(**_component(c)) for c in content["observation"]["components"]),
                 normalizer_centre=tuple(_number(v) for v in content["normalizer"]["centre"]),
                 normalizer_half_range=tuple(_number(v) for v in content["normalizer"]["half_range"]),
+                normalizer_kind=_text(content["normalizer"].get("kind", "unknown")),
                 action=tuple(
                     ActionComponent(scale=_number(c["scale"]), **_component(c))
                     for c in content["action"]["components"]
