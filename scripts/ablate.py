@@ -11,6 +11,7 @@ import logging
 import sys
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import tyro
 
@@ -52,17 +53,16 @@ def main(argv: list[str] | None = None) -> None:
         runs = plan(
             args.preset, variants, args.env_ids, args.seeds, args.out, args.episodes, args.total_timesteps
         )
-        results = []
-        table = ""
+        results: list[dict[str, Any]] = []
         for number, (run, result) in enumerate(execute_all(runs, args.jobs), start=1):
             results.append(result)
-            table = write_ablation(args.preset, variants, results, args.out)
+            write_ablation(args.preset, variants, results, args.out)
             print(
                 f"{number} of {len(runs)}: {run.env_id} {run.variant.name}, seed {run.seed}: "
                 f"success {result['success_rate']:.0%}, {result['training_cpu_seconds']:.0f} s of CPU",
                 flush=True,
             )
-        print(table)
+        print((args.out / "ablation.md").read_text())
     except TomatoError as error:
         print(f"error: {error}", file=sys.stderr)
         raise SystemExit(2) from None

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from maniskill_tomato.errors import InvalidInputError
+from maniskill_tomato.errors import InvalidInputError, SeedsFailedError
 from maniskill_tomato.evaluation.ablation import (
     VARIANTS,
     choose_variants,
@@ -64,6 +64,17 @@ def test_a_run_is_done_once_and_kept(tmp_path: Path) -> None:
     for other in (replace(run, episodes=3), replace(run, config=replace(run.config, gamma=0.5))):
         with pytest.raises(InvalidInputError, match="holds a run of other settings"):
             execute(other)
+
+
+@pytest.mark.slow
+def test_a_run_that_fails_does_not_stop_the_others(tmp_path: Path) -> None:
+    good, bad = plan("td3", choose_variants(["base", "no-delay"]), [GUIDED], [0], tmp_path, 1, 40)
+    bad = replace(bad, config=replace(bad.config, action_scale=(0.1, 0.1)))
+    done = []
+    with pytest.raises(SeedsFailedError, match="1 of 2 runs failed: .*no-delay"):
+        for run, _ in execute_all([bad, good], jobs=2):
+            done.append(run)
+    assert done == [good] and good.finished() is not None
 
 
 def curves(success: list[float], lengths: list[int]) -> TrainingCurves:

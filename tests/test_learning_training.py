@@ -283,6 +283,25 @@ def test_a_folder_that_holds_a_run_is_not_overwritten(tmp_path: Path) -> None:
         train(ReachTask(), small_config(total_timesteps=10), tmp_path / "run")
 
 
+def test_an_environment_without_what_an_option_needs_is_refused_before_anything_is_written(
+    tmp_path: Path,
+) -> None:
+    with pytest.raises(InvalidInputError, match="needs an environment made with other_targets=1"):
+        train(ReachTask(), small_config(hindsight_targets=1), tmp_path / "run")
+    assert not list((tmp_path / "run").iterdir())
+
+
+def test_auxiliary_losses_are_logged(tmp_path: Path) -> None:
+    config = small_config(aux_distance_weight=0.1, aux_visibility_weight=0.1)
+    train(ReachTask(), config, tmp_path / "run")
+    accumulators = importlib.import_module("tensorboard.backend.event_processing.event_accumulator")
+    events = accumulators.EventAccumulator(str(tmp_path / "run/tensorboard"))
+    events.Reload()
+    for name in ("aux_distance_loss", "aux_visibility_loss"):
+        values = [event.value for event in events.Scalars(f"losses/{name}")]
+        assert len(values) > 1 and values[-1] < values[0]
+
+
 def test_tensorboard_gets_the_documented_metrics(tmp_path: Path) -> None:
     train(ReachTask(), small_config(), tmp_path / "run")
     accumulators = importlib.import_module("tensorboard.backend.event_processing.event_accumulator")

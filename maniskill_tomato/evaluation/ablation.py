@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from maniskill_tomato.errors import InvalidInputError
+from maniskill_tomato.errors import InvalidInputError, SeedsFailedError, TomatoError
 from maniskill_tomato.evaluation.metrics import make_metrics, write_metrics
 from maniskill_tomato.evaluation.reproduction import EVALUATION_SEED
 from maniskill_tomato.evaluation.rollout import run_episodes
@@ -235,6 +235,7 @@ def execute_all(runs: Sequence[AblationRun], jobs: int) -> Iterator[tuple[Ablati
 
     Raises:
         InvalidInputError: `jobs` is not positive, or a folder holds a run of other settings.
+        SeedsFailedError: Some failed; the others are done by then.
         KeyboardInterrupt: One of them was stopped; those that ended before stay.
     """
     if jobs < 1:
@@ -249,16 +250,25 @@ def execute_all(runs: Sequence[AblationRun], jobs: int) -> Iterator[tuple[Ablati
     # The processes read this when they load their numerical libraries.
     os.environ.setdefault("OMP_NUM_THREADS", "1")
     context = multiprocessing.get_context("spawn")
+    failed: list[str] = []
     with ProcessPoolExecutor(jobs, mp_context=context, initializer=_warm_up) as pool:
         futures = {pool.submit(execute, run): run for run in waiting}
         try:
             for future in as_completed(futures):
-                result = future.result()
+                run = futures[future]
+                try:
+                    result = future.result()
+                except TomatoError as error:
+                    logger.error("%s failed: %s", run.folder, error)
+                    failed.append(str(run.folder))
+                    continue
                 if result is None:
                     raise KeyboardInterrupt
-                yield futures[future], result
+                yield run, result
         finally:
             pool.shutdown(wait=True, cancel_futures=True)
+    if failed:
+        raise SeedsFailedError(f"{len(failed)} of {len(runs)} runs failed: {', '.join(failed)}")
 
 
 def _warm_up() -> None:

@@ -126,6 +126,7 @@ class Trainer:
         once. However it ends, `resume` goes on from its newest checkpoint.
 
         Raises:
+            InvalidInputError: The environment does not tell what an option needs; nothing was written.
             TrainingDivergedError: A loss, reward, action or weight is not finite; the last good checkpoint stays.
             CheckpointError: The disk does not take a file, another process trains in the folder, or there is
                 nothing to go on from. What was saved before stays.
@@ -146,11 +147,11 @@ class Trainer:
         seed_global_random_state(self._seed)
         seed_action_spaces(self._env, self._seed)
         saved = self._saved_run()
-        write_config(self._run_dir, self._env_id, self._seed, self._env_options, self._config.to_dict())
         observations, info = self._env.reset(seed=self._seed)
         self._state = state = TrainingState(
             self._env, self._config, self._dims, self._seed, observations, info
         )
+        write_config(self._run_dir, self._env_id, self._seed, self._env_options, self._config.to_dict())
         self._scale = torch.tensor(self._config.action_scale, device=observations.device)
         self._start = self._checkpoint_time = time.perf_counter()
         if saved is not None:
