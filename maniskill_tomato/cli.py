@@ -214,7 +214,7 @@ class Eval:
     def run(self) -> None:
         """Evaluates and says where the report is."""
         from maniskill_tomato.evaluation.evaluate import EvaluationConfig, evaluate
-        from maniskill_tomato.evaluation.exported import open_policy
+        from maniskill_tomato.evaluation.exported import open_policy, origin
         from maniskill_tomato.evaluation.rollout import ActingPolicy
         from maniskill_tomato.learning.envs import check_env_id
         from maniskill_tomato.learning.policy import RandomPolicy
@@ -224,7 +224,9 @@ class Eval:
         policy: ActingPolicy = RandomPolicy(self.seed)
         if self.policy != "random":
             path = Path(self.policy) if self.policy else shipped_policy(self.env_id)
-            policy = open_policy(path, env_id=None if self.allow_other_task else self.env_id)
+            opened = open_policy(path, env_id=None if self.allow_other_task else self.env_id)
+            print(f"policy  {origin(opened)}")
+            policy = opened
         run_dir = path.parent if path is not None and (path.parent / "history.npz").is_file() else None
         config = EvaluationConfig(
             env_id=self.env_id,

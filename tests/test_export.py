@@ -19,7 +19,7 @@ import maniskill_tomato
 from maniskill_tomato.assets import asset_path
 from maniskill_tomato.cli import main
 from maniskill_tomato.errors import CheckpointError, InvalidInputError, PolicyError
-from maniskill_tomato.evaluation.exported import open_policy
+from maniskill_tomato.evaluation.exported import ExportedPolicy, open_policy, origin
 from maniskill_tomato.evaluation.rollout import run_episodes
 from maniskill_tomato.learning.agent import make_agent
 from maniskill_tomato.learning.checkpoint import make_checkpoint, save_checkpoint
@@ -167,6 +167,34 @@ def test_the_description_says_what_the_numbers_mean(exported: Path) -> None:
     training = content["training"]
     assert (training["algorithm"], training["seed"], training["steps"]) == ("TD3", 3, 12)
     assert content["onnx"]["sha256"] == hashlib.sha256(exported.read_bytes()).hexdigest()
+
+
+def test_the_description_says_what_plant_the_training_had(tmp_path: Path) -> None:
+    agent = make_agent(get_preset("td3"), 9, 6)
+    bounds = (-torch.ones(6), torch.ones(6))
+    options = {"plant": {"preset": "full"}, "plant_pose": (0.8, 0.1, 0.5)}
+    lines = []
+    for given in (options, {}, None):
+        save_checkpoint(tmp_path / "p.pt", make_checkpoint(agent, GUIDED, bounds, {}, env_options=given))
+        model = export_policy(tmp_path / "p.pt", tmp_path).model
+        kept = None if given is None else json.loads(json.dumps(given))
+        content = json.loads(model.with_suffix(".json").read_text())
+        assert content["task"]["trained_with"] == kept
+        assert content["task"]["default_plant"]["preset"] == "one_tomato"
+        policy = open_policy(model)
+        assert isinstance(policy, ExportedPolicy) and policy.description.trained_with == kept
+        lines.append(origin(policy))
+        assert origin(load_policy(tmp_path / "p.pt")) == lines[-1].replace("TD3, ONNX", "TD3")
+    assert lines == [
+        f'TD3, ONNX, trained on {GUIDED} with plant={{"preset": "full"}}, plant_pose=[0.8, 0.1, 0.5]',
+        f"TD3, ONNX, trained on {GUIDED} with the task's own plant and options",
+        f"TD3, ONNX, trained on {GUIDED} with options that its file does not say",
+    ]
+
+
+def test_a_description_of_an_earlier_version_still_loads(exported: Path) -> None:
+    edit(exported, lambda content: content["task"].pop("trained_with"))
+    assert OnnxPolicy.load(exported).description.trained_with is None
 
 
 def test_the_configuration_hash_tells_configurations_apart(tmp_path: Path) -> None:

@@ -140,6 +140,7 @@ def describe_policy(policy: Policy, model: bytes) -> PolicyDescription:
         env_id=policy.env_id,
         success_threshold=task.full_visibility if task else None,
         default_plant={**asdict(task.plant), "pose": asdict(task.plant_pose)} if task else None,
+        trained_with=policy.env_options,
         observation=tuple(
             Component(name=name, unit=unit, low=None, high=None)
             for name, unit in zip(OBSERVATION_NAMES, OBSERVATION_UNITS, strict=True)

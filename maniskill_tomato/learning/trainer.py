@@ -384,7 +384,12 @@ class Trainer:
         weights = (*self._agent.actor.parameters(), *self._agent.critics.parameters())
         self._check_finite(weights=torch.cat([w.detach().flatten() for w in weights]))
         data = make_checkpoint(
-            self._agent, self._env_id, self._action_bounds, self._counters(), run=self._run_state()
+            self._agent,
+            self._env_id,
+            self._action_bounds,
+            self._counters(),
+            run=self._run_state(),
+            env_options=self._env_options,
         )
         save_checkpoint(checkpoint_path(self._run_dir, self._step), data)
         for old in checkpoints(self._run_dir)[: -self._config.checkpoints_kept]:
@@ -398,7 +403,12 @@ class Trainer:
         path = self._run_dir / "policy.pt"
         counters = self._counters()
         data = make_checkpoint(
-            self._agent, self._env_id, self._action_bounds, counters, with_training_state=False
+            self._agent,
+            self._env_id,
+            self._action_bounds,
+            counters,
+            with_training_state=False,
+            env_options=self._env_options,
         )
         save_checkpoint(path, data)
         return path
