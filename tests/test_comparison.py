@@ -14,6 +14,7 @@ import pytest
 import scipy.stats
 from torch.utils.tensorboard import SummaryWriter
 
+from maniskill_tomato.cli import main
 from maniskill_tomato.errors import InvalidInputError
 from maniskill_tomato.evaluation.comparison import (
     Group,
@@ -293,7 +294,7 @@ def test_the_script_compares_and_refuses_with_one_line(tmp_path: Path) -> None:
     assert "holds no run" in refused.stderr and "Traceback" not in refused.stderr
 
 
-def test_ppo_trains_evaluates_and_can_be_compared(tmp_path: Path) -> None:
+def test_ppo_trains_evaluates_and_can_be_compared(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     arguments = (
         "--no-progress",
         "--episodes",
@@ -313,5 +314,15 @@ def test_ppo_trains_evaluates_and_can_be_compared(tmp_path: Path) -> None:
     (group,) = group_runs([run])
     assert group.label == "PPO"
     assert training_curve(group, "success", wall_time=True) is not None
+    evaluated = tmp_path / "again"
+    exported = str(tmp_path / "seed-3" / "policy.onnx")
+    main(["eval", SPARSE, "--policy", exported, "--episodes", "2", "--out", str(evaluated), "--no-video"])
+    assert f"PPO, ONNX, trained on {SPARSE} with the task's own plant" in capsys.readouterr().out
+    metrics = json.loads((evaluated / "metrics.json").read_text())
+    # The same policy on the same seeds: its actions agree to 1e-5, and so do the views that they lead to.
+    assert metrics["per_episode"]["steps"] == run.metrics["per_episode"]["steps"]
+    largest = metrics["per_episode"]["max_visible_fraction"]
+    np.testing.assert_allclose(largest, run.metrics["per_episode"]["max_visible_fraction"], atol=0.02)
+    assert "Training" in (evaluated / "report.html").read_text()
     again = run_script("scripts/train_ppo.py", SPARSE, "--seeds", "3", "--out", str(tmp_path), *arguments)
     assert again.returncode == 2 and "already holds a run" in again.stderr

@@ -14,6 +14,7 @@ import pytest
 import torch
 from numpy.typing import NDArray
 from onnx import helper
+from torch import nn
 
 import maniskill_tomato
 from maniskill_tomato.assets import asset_path
@@ -24,7 +25,8 @@ from maniskill_tomato.evaluation.rollout import run_episodes
 from maniskill_tomato.learning.agent import make_agent
 from maniskill_tomato.learning.checkpoint import make_checkpoint, save_checkpoint
 from maniskill_tomato.learning.envs import make_env
-from maniskill_tomato.learning.export import export_policy
+from maniskill_tomato.learning.export import DenseActor, export_actor, export_policy
+from maniskill_tomato.learning.networks import ObservationNormalizer
 from maniskill_tomato.learning.policy import load_policy
 from maniskill_tomato.learning.presets import PRESETS, TrainConfig, get_preset
 from maniskill_tomato.policy.onnx_policy import OnnxPolicy
@@ -119,6 +121,61 @@ def test_an_export_follows_a_calculation_by_hand(tmp_path: Path) -> None:
     (action,) = policy.act(observation[None])
     # tanh(2 * 0.5) * 0.1; dz saturates at 0.3 and dyaw at tanh(1) * 0.6 = 0.457, both above the bound.
     np.testing.assert_allclose(action, [0.1 * np.tanh(1.0), 0.0, 0.25, 0.0, 0.0, 0.25], rtol=0.0, atol=1e-6)
+
+
+def make_foreign_actor(act: Callable[[torch.Tensor], torch.Tensor], weights: list[Any]) -> DenseActor:
+    """A policy of another learner: tanh layers and a clipped output."""
+    layers = []
+    for weight, bias in weights:
+        layers.append(nn.Linear(weight.shape[1], weight.shape[0]))
+        layers[-1].weight.data = torch.tensor(weight, dtype=torch.float32)
+        layers[-1].bias.data = torch.tensor(bias, dtype=torch.float32)
+    return DenseActor(
+        act=act,
+        normalizer=ObservationNormalizer([0.5] * 9, [2.0] * 9),
+        layers=layers,
+        activation="Tanh",
+        output="Clip",
+        action_scale=torch.full((6,), 0.4),
+        action_low=torch.full((6,), -0.3),
+        action_high=torch.ones(6),
+        env_id=SPARSE,
+        env_options={"plant": "full"},
+        package_version="9",
+        algorithm="PPO",
+        counters={"steps": 7},
+        config={"n_steps": 500},
+    )
+
+
+def test_policies_of_other_learners_can_be_exported(tmp_path: Path) -> None:
+    rng = np.random.default_rng(5)
+    weights = [
+        (rng.normal(size=(12, 9)), rng.normal(size=12)),
+        (rng.normal(size=(6, 12)), rng.normal(size=6)),
+    ]
+
+    def by_hand(observations: torch.Tensor) -> torch.Tensor:
+        x = (observations.numpy() - 0.5) / 2.0
+        x = np.tanh(x @ weights[0][0].T + weights[0][1])
+        x = np.clip(x @ weights[1][0].T + weights[1][1], -1.0, 1.0)
+        return torch.from_numpy(np.clip(0.4 * x, -0.3, 1.0))
+
+    result = export_actor(make_foreign_actor(by_hand, weights), tmp_path / "out" / "ppo.onnx")
+    policy = OnnxPolicy.load(result.model, SPARSE)
+    observations = rng.normal(size=(200, 9))
+    reference = by_hand(torch.from_numpy(observations)).numpy()
+    assert (np.unique(reference).size > 100) and {-0.3, 0.4} <= set(np.unique(reference))
+    np.testing.assert_allclose(policy.act(observations), reference, rtol=0.0, atol=1e-5)
+    assert policy.description.training == {
+        "algorithm": "PPO",
+        **{"seed": None, "steps": 7, "episodes": None, "updates": None},
+        "config_sha256": hashlib.sha256(b'{"n_steps": 500}').hexdigest(),
+    }
+    other = make_foreign_actor(lambda o: by_hand(o) + 1e-3, weights)
+    with pytest.raises(PolicyError, match="differ by 1"):
+        export_actor(other, tmp_path / "other.onnx")
+    assert not list(tmp_path.glob("other.*"))
 
 
 def test_a_batch_of_any_size_is_answered_row_by_row(exported: Path) -> None:
