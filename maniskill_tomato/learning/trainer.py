@@ -46,6 +46,7 @@ from maniskill_tomato.learning.run_folder import (
     remove_results,
     write_config,
 )
+from maniskill_tomato.learning.wandb_log import import_wandb
 
 logger = logging.getLogger(__name__)
 
@@ -101,8 +102,8 @@ class Trainer:
             report: Called about twice a second with where the run is.
 
         Raises:
-            InvalidInputError: `run_dir` already holds a run and `resume` is off, or holds none and it is on, or
-                `config` does not fit `env`.
+            InvalidInputError: `run_dir` already holds a run and `resume` is off, or holds none and it is on,
+                `config` does not fit `env`, or it asks for Weights & Biases and that is not installed.
         """
         observation_space, action_space = env.single_observation_space, env.single_action_space
         if not isinstance(observation_space, gym.spaces.Box) or not isinstance(action_space, gym.spaces.Box):
@@ -112,6 +113,8 @@ class Trainer:
             raise InvalidInputError(
                 f"action_scale must have {action_dim} values, one per action, got {len(config.action_scale)}"
             )
+        if config.wandb_project is not None:
+            import_wandb(config.wandb_project)
         if not resume:
             check_run_dir(run_dir)
         elif not (run_dir / "config.json").is_file():
