@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 import scipy.stats
+import torch
 from torch.utils.tensorboard import SummaryWriter
 
 from maniskill_tomato.cli import main
@@ -29,6 +30,8 @@ from maniskill_tomato.evaluation.comparison import (
 )
 from maniskill_tomato.evaluation.comparison_report import make_rows, markdown_table, write_comparison
 from maniskill_tomato.evaluation.evaluate import evaluate_run
+from maniskill_tomato.learning.agent import make_agent
+from maniskill_tomato.learning.checkpoint import make_checkpoint, save_checkpoint
 from maniskill_tomato.learning.envs import make_env
 from maniskill_tomato.learning.presets import get_preset
 from maniskill_tomato.tasks import TASK_IDS
@@ -297,19 +300,24 @@ def test_the_script_compares_and_refuses_with_one_line(tmp_path: Path) -> None:
 
 
 def test_runs_without_an_evaluation_get_one_on_the_plants_of_their_training(tmp_path: Path) -> None:
-    short = ("--total-timesteps", "60", "--learning-starts", "50", "--batch-size", "32")
-    plant = ("--plant", "three_tomatoes", "--plant-seed", "4")
-    main(["train", GUIDED, "--out", str(tmp_path / "runs" / "new"), *plant, *short])
+    options = {"plant": {"preset": "three_tomatoes", "seed": 4}}
+    new = make_run(tmp_path / "runs" / "new", success=None)
+    config = json.loads((new / "config.json").read_text())
+    (new / "config.json").write_text(json.dumps({**config, "env_options": options}))
+    checkpoint = make_checkpoint(
+        make_agent(get_preset("td3"), 9, 6), GUIDED, (-torch.ones(6), torch.ones(6)), {}, env_options=options
+    )
+    save_checkpoint(new / "policy.pt", checkpoint)
     kept = make_run(tmp_path / "runs" / "old", success=0.25)
     arguments = ("--evaluate", "2", "--eval-seed", "7", "--out", str(tmp_path / "out"))
     done = run_script("scripts/compare_runs.py", str(tmp_path / "runs"), *arguments)
     assert done.returncode == 0, done.stderr
-    metrics = json.loads((tmp_path / "runs" / "new" / "eval" / "metrics.json").read_text())
+    metrics = json.loads((new / "eval" / "metrics.json").read_text())
     assert (metrics["episodes"], metrics["per_episode"]["seed"]) == (2, [7, 8])
-    assert metrics["policy"]["trained_with"] == {"plant": {"preset": "three_tomatoes", "seed": 4}}
-    with np.load(tmp_path / "runs" / "new" / "eval" / "trajectories.npz") as data:
+    assert metrics["policy"]["trained_with"] == options
+    with np.load(new / "eval" / "trajectories.npz") as data:
         heights = set(np.round(data["target"][:, 2], 3))
-    env = make_env(GUIDED, plant={"preset": "three_tomatoes", "seed": 4})
+    env = make_env(GUIDED, **options)
     observations = [env.reset(seed=seed)[0] for seed in (7, 8)]
     env.close()
     assert heights == {round(float(o[0, 8]), 3) for o in observations}
@@ -317,7 +325,7 @@ def test_runs_without_an_evaluation_get_one_on_the_plants_of_their_training(tmp_
         r["path"]: r["success_rate"]
         for r in json.loads((tmp_path / "out/comparison.json").read_text())["runs"]
     }
-    assert rates[str(kept)] == 0.25 and rates[str(tmp_path / "runs" / "new")] == metrics["success_rate"]
+    assert rates[str(kept)] == 0.25 and rates[str(new)] == metrics["success_rate"]
     (kept / "eval" / "metrics.json").unlink()
     with pytest.raises(InvalidInputError, match="holds no policy to evaluate"):
         evaluate_run(load_run(kept), 2, 7)

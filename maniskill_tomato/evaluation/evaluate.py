@@ -147,7 +147,7 @@ def evaluate_run(run: Run, episodes: int, seed: int) -> EvaluationResult:
         baseline=False,
         video=False,
         title=f"Evaluation of {run.path.name}",
-        training_run=run.path,
+        training_run=run.path if (run.path / "history.npz").is_file() else None,
     )
     logger.info("evaluating %s", run.path)
     return evaluate(config, open_policy(policies[0], env_id=run.env_id), policies[0])
