@@ -300,7 +300,7 @@ def test_the_script_compares_and_refuses_with_one_line(tmp_path: Path) -> None:
 
 
 def test_runs_without_an_evaluation_get_one_on_the_plants_of_their_training(tmp_path: Path) -> None:
-    options = {"plant": {"preset": "three_tomatoes", "seed": 4}}
+    options: dict[str, Any] = {"plant": {"preset": "three_tomatoes", "seed": 4}}
     new = make_run(tmp_path / "runs" / "new", success=None)
     config = json.loads((new / "config.json").read_text())
     (new / "config.json").write_text(json.dumps({**config, "env_options": options}))
