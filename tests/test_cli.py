@@ -211,6 +211,22 @@ def test_evaluation_writes_metrics_that_follow_from_its_trajectories(
     assert again["per_episode"] == metrics["per_episode"]
 
 
+def test_a_run_on_another_plant_leaves_policies_that_say_so(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    plant = ("--plant", "three_tomatoes", "--plant-seed", "4", "--plant-pose", "0.8", "0.1", "0.5")
+    main(["train", GUIDED, "--out", str(tmp_path), *plant, *SHORT])
+    options = {"plant": {"preset": "three_tomatoes", "seed": 4}, "plant_pose": [0.8, 0.1, 0.5]}
+    (newest, *_) = sorted((tmp_path / "checkpoints").iterdir(), reverse=True)
+    for path in (tmp_path / "policy.pt", newest):
+        assert load_policy(path).env_options == options
+    capsys.readouterr()
+    short = ("--episodes", "1", "--no-video", "--no-baseline", "--out", str(tmp_path / "eval"))
+    main(["eval", GUIDED, "--policy", str(tmp_path / "policy.pt"), *short])
+    assert f"policy  TD3, trained on {GUIDED} with plant={{" in capsys.readouterr().out
+    assert json.loads((tmp_path / "eval/metrics.json").read_text())["policy"]["trained_with"] == options
+
+
 def test_the_demo_names_its_report_and_its_policy(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     for _ in range(2):  # A second demo replaces the first.
         main(["demo", "--out", str(tmp_path), "--minutes", "0.05", "--episodes", "2", "--no-video"])

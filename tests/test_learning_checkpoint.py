@@ -37,6 +37,17 @@ def test_a_policy_comes_back_as_it_was(tmp_path: Path, preset: str) -> None:
     assert policy.counters == {"steps": 12, "seed": 3}
 
 
+def test_a_policy_knows_the_options_of_its_task(tmp_path: Path) -> None:
+    options = {"plant": {"preset": "full", "seed": "train"}, "plant_pose": (0.8, 0.1, 0.5)}
+    agent = make_agent(get_preset("td3"), 9, 6)
+    for given, kept in ((options, {**options, "plant_pose": [0.8, 0.1, 0.5]}), ({}, {}), (None, None)):
+        save_checkpoint(tmp_path / "p.pt", make_checkpoint(agent, ENV_ID, BOUNDS, {}, env_options=given))
+        assert load_policy(tmp_path / "p.pt").env_options == kept
+    saved(tmp_path / "p.pt", env_options="full")
+    with pytest.raises(CheckpointError, match="env_options is 'full'"):
+        load_policy(tmp_path / "p.pt")
+
+
 def test_a_training_checkpoint_holds_critics_targets_and_optimisers(tmp_path: Path) -> None:
     agent, _ = saved(tmp_path / "p.pt")
     data = load_checkpoint(tmp_path / "p.pt")

@@ -177,6 +177,7 @@ def load_run(path: Path) -> Run:
         raise InvalidInputError(
             f"{path / 'config.json'} does not describe a run ({error!r}); it must hold env_id, seed and config"
         ) from error
+    config.pop("wandb_project", None)  # Where a run logs does not make it another one.
     if content.get("env_options"):
         config["env_options"] = content["env_options"]
     metrics = None

@@ -5,6 +5,7 @@ import fcntl
 import json
 import logging
 import os
+import shutil
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -22,7 +23,7 @@ RUN_STATE_FORMAT = 2
 LOG_NAME = "train.log"
 """What a run in a process of its own says."""
 
-_FILES = ("config.json", "episodes.csv", "history.npz", "policy.pt")
+_FILES = ("config.json", "episodes.csv", "history.npz", "policy.pt", "wandb.json")
 _PATTERNS = (
     "checkpoints/step_*.pt",
     "checkpoints/damaged_step_*.pt",
@@ -67,6 +68,7 @@ def remove_results(run_dir: Path) -> None:
     for pattern in _PATTERNS:
         for path in run_dir.glob(pattern):
             path.unlink()
+    shutil.rmtree(run_dir / "wandb", ignore_errors=True)
 
 
 @contextlib.contextmanager

@@ -15,8 +15,9 @@ MAY_CHANGE = (
     "checkpoint_every",
     "checkpoint_seconds",
     "checkpoints_kept",
+    "wandb_project",
 )
-"""Options that may differ when a run is continued: its length, and how often it is saved."""
+"""Options that may differ when a run is continued: its length, how often it is saved, where it also logs."""
 
 _AT_LEAST_ONE = (
     "n_step",
@@ -157,6 +158,8 @@ class TrainConfig:
     """Newest checkpoints that stay on the disk."""
     torch_threads: int = 1
     """CPU threads of PyTorch; these networks are too small to gain from more."""
+    wandb_project: str | None = None
+    """Log to this project of Weights & Biases too, which needs the package wandb."""
 
     def __post_init__(self) -> None:
         for name in ("total_episodes", "total_timesteps", "max_minutes", "checkpoint_seconds"):

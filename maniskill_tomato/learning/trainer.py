@@ -35,6 +35,7 @@ from maniskill_tomato.learning.run_folder import (
 )
 from maniskill_tomato.learning.threshold import label_successes, success_threshold
 from maniskill_tomato.learning.training_state import TrainingState
+from maniskill_tomato.learning.wandb_log import import_wandb
 
 logger = logging.getLogger(__name__)
 
@@ -90,8 +91,8 @@ class Trainer:
             report: Called about twice a second with where the run is.
 
         Raises:
-            InvalidInputError: `run_dir` already holds a run and `resume` is off, or holds none and it is on, or
-                `config` does not fit `env`.
+            InvalidInputError: `run_dir` already holds a run and `resume` is off, or holds none and it is on,
+                `config` does not fit `env`, or it asks for Weights & Biases and that is not installed.
         """
         observation_space, action_space = env.single_observation_space, env.single_action_space
         if not isinstance(observation_space, gym.spaces.Box) or not isinstance(action_space, gym.spaces.Box):
@@ -101,6 +102,8 @@ class Trainer:
             raise InvalidInputError(
                 f"action_scale must have {action_dim} values, one per action, got {len(config.action_scale)}"
             )
+        if config.wandb_project is not None:
+            import_wandb(config.wandb_project)
         if not resume:
             check_run_dir(run_dir)
         elif not (run_dir / "config.json").is_file():
@@ -314,6 +317,7 @@ class Trainer:
             self._action_bounds,
             self._counters(),
             run=state.run_state(self._log.state_dict()),
+            env_options=self._env_options,
         )
         save_checkpoint(checkpoint_path(self._run_dir, state.step), data)
         for old in checkpoints(self._run_dir)[: -self._config.checkpoints_kept]:
@@ -327,7 +331,12 @@ class Trainer:
         path = self._run_dir / "policy.pt"
         counters = self._counters()
         data = make_checkpoint(
-            self._state.agent, self._env_id, self._action_bounds, counters, with_training_state=False
+            self._state.agent,
+            self._env_id,
+            self._action_bounds,
+            counters,
+            with_training_state=False,
+            env_options=self._env_options,
         )
         save_checkpoint(path, data)
         return path

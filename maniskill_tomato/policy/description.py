@@ -50,7 +50,7 @@ class PolicyDescription:
     """The target counts as fully visible when V_f is above this; None if the exporting version does not know the
     task."""
     default_plant: dict[str, Any] | None
-    """The task's own plant and where it stands, or None; a run may have used another."""
+    """The task's own plant and where it stands, or None; `trained_with` says whether another was used."""
     observation: tuple[Component, ...]
     """The input, in order; world frame."""
     normalizer_centre: tuple[float, ...]
@@ -66,6 +66,9 @@ class PolicyDescription:
     """Algorithm, seed, steps and episodes of its training, and the SHA-256 of its configuration."""
     onnx_sha256: str
     """SHA-256 of the ONNX file that belongs to this description."""
+    trained_with: dict[str, Any] | None = None
+    """Options of the task in the training, such as `plant`, `plant_pose`; empty if it was as it is, None if not
+    known."""
 
     def to_json(self) -> str:
         """The file's text."""
@@ -76,6 +79,7 @@ class PolicyDescription:
                 "id": self.env_id,
                 "success_threshold": self.success_threshold,
                 "default_plant": self.default_plant,
+                "trained_with": self.trained_with,
             },
             "observation": {
                 "input": INPUT_NAME,
@@ -125,6 +129,7 @@ class PolicyDescription:
             )
         try:
             plant = content["task"]["default_plant"]
+            trained_with = content["task"].get("trained_with")  # Older descriptions lack it.
             description = cls(
                 package_version=_text(content["package_version"]),
                 env_id=_text(content["task"]["id"]),
@@ -140,6 +145,7 @@ class PolicyDescription:
                 ),
                 training=dict(content["training"]),
                 onnx_sha256=_text(content["onnx"]["sha256"]),
+                trained_with=None if trained_with is None else dict(trained_with),
             )
         except KeyError as error:
             raise PolicyError(f"it lacks the entry {error}") from error
