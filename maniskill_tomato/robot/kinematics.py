@@ -24,12 +24,14 @@ LARGEST_KEPT_BATCH = 4096
 class RecordedLaunch:
     """A Warp kernel with its arguments, ready to run again and again at little cost."""
 
-    def __init__(self, kernel: Any, threads: int, device: torch.device, arguments: list[Any]):
+    def __init__(
+        self, kernel: Any, threads: int | tuple[int, ...], device: torch.device, arguments: list[Any]
+    ) -> None:
         """Records the launch without running it.
 
         Args:
             kernel: The Warp kernel.
-            threads: Number of kernel threads.
+            threads: Number of kernel threads, along each dimension of the launch.
             device: Where it runs.
             arguments: Warp arrays, structs and numbers, in the order of the kernel's parameters.
         """

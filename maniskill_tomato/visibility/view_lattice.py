@@ -1,0 +1,188 @@
+"""A fixed lattice of camera positions round a target, from which planners choose and on which reach is known.
+
+Directions are those from the target to the camera: azimuth 0 points along -x of the world, where the robot stands, and
+grows to the right of a robot that faces the plant (towards -y); elevation grows upwards. Distances grow by a constant
+factor. The axes do not follow the target or the camera, so that a table of numbers per candidate keeps its meaning.
+"""
+
+import math
+from typing import Final
+
+import torch
+from torch import Tensor
+
+from maniskill_tomato.errors import InvalidInputError
+from maniskill_tomato.robot.iiwa14 import NUM_JOINTS
+from maniskill_tomato.robot.inverse_kinematics import InverseKinematics, Reach
+from maniskill_tomato.robot.look_at import CAMERA_ROLLS, camera_to_flange, look_at_pose
+
+AZIMUTHS: Final = 13
+"""Candidates from -90 to 90 degrees of azimuth."""
+ELEVATIONS: Final = 9
+"""Candidates from -60 to 60 degrees of elevation."""
+DISTANCES: Final = 4
+"""Candidates by distance."""
+ANGLE_STEP: Final = math.radians(15.0)
+"""Between neighbouring directions, in [rad]."""
+FIRST_DISTANCE: Final = 0.22
+"""From the target to the nearest candidates, in [m]: a little more than the smallest distance of a move."""
+DISTANCE_RATIO: Final = 1.5
+"""Between neighbouring distances: the last is 0.74 m, beyond which the arm reaches less than a third of the
+directions."""
+
+_FAR_AWAY = 100.0
+
+
+class ViewLattice:
+    """K = 13 x 9 x 4 camera positions round each target: azimuths, elevations, distances, the last fastest."""
+
+    shape: Final = (AZIMUTHS, ELEVATIONS, DISTANCES)
+    size: Final = AZIMUTHS * ELEVATIONS * DISTANCES
+
+    def __init__(self, device: str | torch.device = "cpu") -> None:
+        """Works out the candidates.
+
+        Args:
+            device: Where all tensors live.
+        """
+        self.device = torch.device(device)
+        self.azimuths = (torch.arange(AZIMUTHS, device=self.device) - AZIMUTHS // 2) * ANGLE_STEP
+        """In [rad]. Shape (13,)."""
+        self.elevations = (torch.arange(ELEVATIONS, device=self.device) - ELEVATIONS // 2) * ANGLE_STEP
+        """In [rad]. Shape (9,)."""
+        self.distances = FIRST_DISTANCE * DISTANCE_RATIO ** torch.arange(DISTANCES, device=self.device)
+        """In [m]. Shape (4,)."""
+        azimuth, elevation, distance = torch.meshgrid(
+            self.azimuths, self.elevations, self.distances, indexing="ij"
+        )
+        direction = torch.stack(
+            [
+                -torch.cos(azimuth) * torch.cos(elevation),
+                -torch.sin(azimuth) * torch.cos(elevation),
+                torch.sin(elevation),
+            ],
+            dim=-1,
+        )
+        self.offsets = (distance[..., None] * direction).reshape(-1, 3)
+        """From the target to each candidate, in the world frame, in [m]. Shape (K, 3)."""
+        self.neighbours = self._neighbours()
+        """One step down and up in azimuth, elevation and distance; -1 where the lattice ends. Shape (K, 6)."""
+        self._inverse_kinematics = InverseKinematics(self.device)
+
+    def positions(self, target_position: Tensor) -> Tensor:
+        """The candidates' camera positions round each target, in the world frame, in [m].
+
+        Args:
+            target_position: In the world frame, in [m]. Shape (B, 3).
+
+        Returns:
+            Shape (B, K, 3).
+        """
+        return target_position[:, None] + self.offsets
+
+    def index(self, azimuth: Tensor | int, elevation: Tensor | int, distance: Tensor | int) -> Tensor:
+        """The candidate at given steps along the three axes of `shape`."""
+        steps = [torch.as_tensor(step, device=self.device) for step in (azimuth, elevation, distance)]
+        return (steps[0] * ELEVATIONS + steps[1]) * DISTANCES + steps[2]
+
+    def coordinates(self, target_position: Tensor, camera_positions: Tensor) -> Tensor:
+        """Where cameras stand on the lattice, in fractional steps of azimuth, elevation and distance from its first.
+
+        Args:
+            target_position: In the world frame, in [m]. Shape (B, 3).
+            camera_positions: In the world frame, in [m]. Shape (B, M, 3).
+
+        Returns:
+            Within the lattice from 0 to 12, 8 and 3. Shape (B, M, 3).
+        """
+        offset = camera_positions - target_position[:, None]
+        distance = offset.norm(dim=-1).clamp_min(1e-6)
+        azimuth = torch.atan2(-offset[..., 1], -offset[..., 0])
+        elevation = torch.asin((offset[..., 2] / distance).clamp(-1.0, 1.0))
+        return torch.stack(
+            [
+                azimuth / ANGLE_STEP + AZIMUTHS // 2,
+                elevation / ANGLE_STEP + ELEVATIONS // 2,
+                torch.log(distance / FIRST_DISTANCE) / math.log(DISTANCE_RATIO),
+            ],
+            dim=-1,
+        )
+
+    def nearest(self, target_position: Tensor, camera_positions: Tensor) -> Tensor:
+        """The candidate nearest to each camera in steps of the lattice. Shape (B, M), int64."""
+        coordinates = self.coordinates(target_position, camera_positions).round().long()
+        last = torch.tensor(self.shape, device=self.device) - 1
+        return self.index(*torch.minimum(coordinates.clamp_min(0), last).unbind(-1))
+
+    def resample(
+        self, table: Tensor, target_position: Tensor, camera_positions: Tensor, outside: float
+    ) -> Tensor:
+        """A number per candidate, interpolated linearly at other camera positions.
+
+        Args:
+            table: Shape (B, K).
+            target_position: In the world frame, in [m]. Shape (B, 3).
+            camera_positions: In the world frame, in [m]. Shape (B, M, 3).
+            outside: The answer more than half a step outside the lattice; nearer ones take the lattice's edge.
+
+        Returns:
+            Shape (B, M).
+
+        Raises:
+            InvalidInputError: A shape does not fit.
+        """
+        batch = table.shape[0]
+        if table.shape != (batch, self.size) or camera_positions.shape[:1] != (batch,):
+            raise InvalidInputError(
+                f"table must have shape (B, {self.size}) and camera_positions (B, M, 3); "
+                f"got {tuple(table.shape)} and {tuple(camera_positions.shape)}"
+            )
+        coordinates = self.coordinates(target_position, camera_positions)
+        last = torch.tensor(self.shape, device=self.device) - 1
+        is_outside = ((coordinates < -0.5) | (coordinates > last + 0.5)).any(dim=-1)
+        coordinates = torch.minimum(coordinates.clamp_min(0.0), last.to(coordinates.dtype))
+        lower = torch.minimum(coordinates.floor().long(), last - 1)
+        share = coordinates - lower
+        values = torch.zeros_like(coordinates[..., 0])
+        for corner in range(8):
+            step = torch.tensor([corner >> 2 & 1, corner >> 1 & 1, corner & 1], device=self.device)
+            weight = torch.where(step.bool(), share, 1.0 - share).prod(dim=-1)
+            values += weight * table.gather(1, self.index(*(lower + step).unbind(-1))).to(values.dtype)
+        return torch.where(is_outside, outside, values)
+
+    def reachable(self, target_position: Tensor) -> Tensor:
+        """Which candidates the arm can look at its target from, with any of `CAMERA_ROLLS`.
+
+        Exact poses only, and kinematics only: collisions are not asked for.
+
+        Args:
+            target_position: In the robot's base frame, in [m]. Shape (B, 3).
+
+        Returns:
+            Shape (B, K), bool.
+        """
+        targets = target_position.double().repeat_interleave(self.size, dim=0)
+        positions = self.positions(target_position.double()).reshape(-1, 3)
+        reached = torch.zeros(len(positions), dtype=torch.bool, device=self.device)
+        reference = torch.zeros(len(positions), NUM_JOINTS, dtype=torch.float64, device=self.device)
+        for roll in CAMERA_ROLLS:
+            T_base_flange = camera_to_flange(look_at_pose(positions, targets, roll))
+            # What is known to be reached is sent out of reach, where the solver takes no time.
+            T_base_flange[reached, 0, 3] = _FAR_AWAY
+            solution = self._inverse_kinematics.solve(T_base_flange, reference, neighbour=False)
+            reached |= solution.reach == Reach.REACHABLE
+        return reached.view(-1, self.size)
+
+    def _neighbours(self) -> Tensor:
+        steps = torch.stack(
+            torch.meshgrid(*(torch.arange(n, device=self.device) for n in self.shape), indexing="ij"), dim=-1
+        ).reshape(-1, 3)
+        last = torch.tensor(self.shape, device=self.device) - 1
+        columns = []
+        for axis in range(3):
+            for sign in (-1, 1):
+                moved = steps.clone()
+                moved[:, axis] += sign
+                valid = ((moved >= 0) & (moved <= last)).all(dim=-1)
+                columns.append(torch.where(valid, self.index(*moved.unbind(-1)), -1))
+        return torch.stack(columns, dim=-1)
