@@ -282,7 +282,7 @@ def test_bad_options_are_refused(env: Any, tmp_path: Path) -> None:
         ({"layout": ("everything",)}, "everything"),
     ):
         with pytest.raises(InvalidInputError, match=message):
-            make(**options)  # type: ignore[arg-type]
+            make(**options)
     for reset, message in (
         ({"episode": 3}, "episodes="),
         ({"camera_position": [0.3, 0.0]}, "three finite"),
