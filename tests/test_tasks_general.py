@@ -211,7 +211,7 @@ def test_looking_twice_at_the_observation_changes_nothing(env: Any) -> None:
 def test_restored_state_continues_exactly(env_id: str, flat: bool) -> None:
     env: Any = make(env_id, plant={"seed": 3})
     base, rng = env.unwrapped, np.random.default_rng(1)
-    env.reset(seed=5)
+    obs, _ = env.reset(seed=5)
     for _ in range(4):
         obs, *_ = env.step(action(rng))
     saved = base.get_state().clone() if flat else base.get_state_dict()
@@ -279,14 +279,15 @@ def test_the_lists_of_the_package_hold_plants_of_their_split_only(name: str) -> 
 
 
 def test_bad_options_are_refused(env: Any, tmp_path: Path) -> None:
-    for options, message in (
+    bad: list[tuple[dict[str, Any], str]] = [
         ({"episodes": "test"}, "held_out"),
         ({"episodes": []}, "one or more"),
         ({"start_visibility": (0.5, 0.2)}, "low, high"),
         ({"start_visibility": (0.5, 1.2)}, "0 <= low"),
         ({"contact_penalty": -1.0}, "contact_penalty"),
         ({"layout": ("everything",)}, "everything"),
-    ):
+    ]
+    for options, message in bad:
         with pytest.raises(InvalidInputError, match=message):
             make(**options)
     for reset, message in (
