@@ -19,7 +19,7 @@ from maniskill_tomato.errors import TomatoError
 from maniskill_tomato.evaluation.ablation import choose_variants, execute_all, plan
 from maniskill_tomato.evaluation.ablation_report import write_ablation
 from maniskill_tomato.learning.presets import PresetName
-from maniskill_tomato.tasks import TASK_IDS
+from maniskill_tomato.tasks import THESIS_IDS
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -30,7 +30,7 @@ class Args:
     """The configuration that is varied."""
     variants: tuple[str, ...] = ()
     """Names of variants; by default all."""
-    env_ids: tuple[str, ...] = TASK_IDS
+    env_ids: tuple[str, ...] = THESIS_IDS
     """Tasks."""
     seeds: tuple[int, ...] = (0, 1, 2, 3, 4)
     """Training seeds."""

@@ -43,7 +43,7 @@ from maniskill_tomato.learning.interrupt import stop_on_signals
 from maniskill_tomato.learning.networks import ObservationNormalizer
 from maniskill_tomato.learning.presets import OBSERVATION_CENTRE, OBSERVATION_HALF_RANGE, get_preset
 from maniskill_tomato.learning.run_folder import check_run_dir
-from maniskill_tomato.tasks import TASK_IDS
+from maniskill_tomato.tasks import THESIS_IDS
 
 SPS_EVERY = 100
 """Environment steps between two points of charts/SPS."""
@@ -265,7 +265,7 @@ class Args:
     """Train PPO with one or more seeds, one after the other, and evaluate each."""
 
     env_id: Annotated[
-        str, tyro.conf.Positional, tyro.conf.arg(metavar="ENV_ID", help=f"One of {', '.join(TASK_IDS)}.")
+        str, tyro.conf.Positional, tyro.conf.arg(metavar="ENV_ID", help=f"One of {', '.join(THESIS_IDS)}.")
     ]
     """Id of the task."""
     out: Path

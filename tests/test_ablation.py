@@ -21,9 +21,9 @@ from maniskill_tomato.evaluation.ablation_report import ablation_rows, write_abl
 from maniskill_tomato.evaluation.comparison import find_runs, load_run
 from maniskill_tomato.learning.history import TrainingCurves
 from maniskill_tomato.learning.presets import get_preset
-from maniskill_tomato.tasks import TASK_IDS
+from maniskill_tomato.tasks import THESIS_IDS
 
-GUIDED, SPARSE = TASK_IDS
+GUIDED, SPARSE = THESIS_IDS
 
 
 def test_every_variant_changes_what_it_says_and_nothing_else() -> None:
@@ -37,7 +37,7 @@ def test_every_variant_changes_what_it_says_and_nothing_else() -> None:
 
 
 def test_the_plan_leaves_out_what_makes_no_sense_and_names_what_it_does_not_know(tmp_path: Path) -> None:
-    runs = plan("td3", VARIANTS, TASK_IDS, (0, 1), tmp_path)
+    runs = plan("td3", VARIANTS, THESIS_IDS, (0, 1), tmp_path)
     assert len(runs) == 2 * (2 * len(VARIANTS) - 1)
     assert len({run.folder for run in runs}) == len(runs)
     assert all(run.env_id == SPARSE for run in runs if run.variant.name == "hindsight-targets")
@@ -45,7 +45,7 @@ def test_the_plan_leaves_out_what_makes_no_sense_and_names_what_it_does_not_know
     with pytest.raises(InvalidInputError, match="a variant must be one of 'base'.*; got 'her'"):
         choose_variants(["her"])
     with pytest.raises(InvalidInputError, match="seeds must be one or more different numbers"):
-        plan("td3", VARIANTS, TASK_IDS, (1, 1), tmp_path)
+        plan("td3", VARIANTS, THESIS_IDS, (1, 1), tmp_path)
     with pytest.raises(InvalidInputError, match="a task must be one of"):
         plan("td3", VARIANTS, ["Reach-v0"], (1,), tmp_path)
 

@@ -34,10 +34,10 @@ from maniskill_tomato.learning.agent import make_agent
 from maniskill_tomato.learning.checkpoint import make_checkpoint, save_checkpoint
 from maniskill_tomato.learning.envs import make_env
 from maniskill_tomato.learning.presets import get_preset
-from maniskill_tomato.tasks import TASK_IDS
+from maniskill_tomato.tasks import THESIS_IDS
 
 ROOT = Path(__file__).resolve().parent.parent
-GUIDED, SPARSE = TASK_IDS
+GUIDED, SPARSE = THESIS_IDS
 TD3 = get_preset("td3").to_dict()
 HEADER = "episode,end_step,steps,success\n"
 

@@ -19,9 +19,9 @@ from maniskill_tomato.learning.envs import make_learner_env
 from maniskill_tomato.learning.presets import TrainConfig, get_preset
 from maniskill_tomato.learning.run import train
 from maniskill_tomato.learning.run_folder import clear_run
-from maniskill_tomato.tasks import TASK_IDS
+from maniskill_tomato.tasks import THESIS_IDS
 
-GUIDED = TASK_IDS[0]
+GUIDED = THESIS_IDS[0]
 
 
 def short_config(**changes: Any) -> TrainConfig:

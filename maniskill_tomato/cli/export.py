@@ -4,7 +4,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from maniskill_tomato.cli.options import shipped_policy
-from maniskill_tomato.tasks import TASK_IDS
+from maniskill_tomato.tasks import THESIS_IDS
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -20,7 +20,7 @@ class Export:
         """Exports and says where the files are."""
         from maniskill_tomato.learning.export import export_policy
 
-        for path in [self.policy] if self.policy else [shipped_policy(env_id) for env_id in TASK_IDS]:
+        for path in [self.policy] if self.policy else [shipped_policy(env_id) for env_id in THESIS_IDS]:
             result = export_policy(path, self.out)
             print(f"model       {result.model}")
             print(f"description {result.description}")

@@ -27,7 +27,7 @@ from maniskill_tomato.learning.presets import TrainConfig, get_preset
 from maniskill_tomato.learning.run import make_training_env
 from maniskill_tomato.learning.run_folder import clear_run
 from maniskill_tomato.learning.trainer import Trainer
-from maniskill_tomato.tasks import TASK_IDS
+from maniskill_tomato.tasks import THESIS_IDS
 
 logger = logging.getLogger(__name__)
 
@@ -47,7 +47,7 @@ class LearnerVariant:
     """What differs, for tables."""
     changes: dict[str, Any]
     """Fields of `TrainConfig` and their new values; none for the preset itself."""
-    env_ids: tuple[str, ...] = TASK_IDS
+    env_ids: tuple[str, ...] = THESIS_IDS
     """The tasks that it makes sense on."""
 
 
@@ -155,8 +155,8 @@ def plan(
     if episodes < 1:
         raise InvalidInputError(f"episodes must be 1 or more, got {episodes}")
     for env_id in env_ids:
-        if env_id not in TASK_IDS:
-            raise InvalidInputError.choice("a task", env_id, TASK_IDS)
+        if env_id not in THESIS_IDS:
+            raise InvalidInputError.choice("a task", env_id, THESIS_IDS)
     base = get_preset(preset)
     if total_timesteps is not None:
         base = dataclasses.replace(base, total_timesteps=total_timesteps)
@@ -274,7 +274,7 @@ def execute_all(runs: Sequence[AblationRun], jobs: int) -> Iterator[tuple[Ablati
 def _warm_up() -> None:
     """Loads the simulator and compiles its kernels, which no run shall be charged for."""
     torch.set_num_threads(1)
-    for env_id in TASK_IDS:
+    for env_id in THESIS_IDS:
         env = make_env(env_id)
         env.reset(seed=0)
         env.close()
