@@ -136,7 +136,7 @@ def test_fast_td3_in_small_solves_the_toy_task(tmp_path: Path) -> None:
     """Several steps, running normalisation, categorical critics and a noise level for each environment together."""
     config = replace(
         get_preset("fast-td3"),
-        total_timesteps=5000,
+        total_timesteps=8000,
         num_envs=8,
         n_step=2,
         learning_starts=400,
