@@ -10,6 +10,9 @@ from numpy.typing import NDArray
 
 from maniskill_tomato.errors import InvalidInputError
 from maniskill_tomato.plants.config import PRESETS
+from maniskill_tomato.plants.generator import generate_plant
+from maniskill_tomato.plants.organs import Plant
+from maniskill_tomato.plants.row import generate_row, leaf_density_of
 
 SEED_SPLITS: dict[str, tuple[int, int]] = {
     "train": (0, 1_000_000),
@@ -18,6 +21,9 @@ SEED_SPLITS: dict[str, tuple[int, int]] = {
 }
 """Half-open, disjoint ranges of plant seeds; a choice with a split's name as seed takes a new plant at every
 reset."""
+
+ROW_NEIGHBOURS = 32
+"""Neighbours in a row are among this number of plants of each split, so that a new row takes one new plant."""
 
 MAX_SEED = 2**24 - 1
 """The largest plant seed: a saved state holds it as a float32."""
@@ -34,10 +40,14 @@ class PlantChoice:
     pool: int | None = None
     """With a split, draw only from this number of its seeds, the first ones; None draws from all. A plant that was
     seen before is ready at once, a new one takes 0.1 to 0.2 s to grow."""
-    leaf_density: float | None = None
-    """Share of the preset's leaves, 0 or more; None keeps the preset's own."""
+    leaf_density: float | tuple[float, float] | None = None
+    """Share of the preset's leaves, 0 or more; a range, from which each plant draws its own by its seed; None keeps
+    the preset's own."""
     detail: Literal["training", "picture"] = "training"
     """Level of the triangles, both rendered and cast against."""
+    row: bool = False
+    """Whether the plant stands between two neighbours of its row (`plants.row`), drawn by its seed from the first
+    `ROW_NEIGHBOURS` seeds of the same split."""
 
     def __post_init__(self) -> None:
         if self.preset not in PRESETS:
@@ -55,11 +65,12 @@ class PlantChoice:
                 "plant pool must be an integer from 1 to the size of a split, and needs a split's name as seed; "
                 f"got pool={self.pool!r} with seed={self.seed!r}"
             )
-        if self.leaf_density is not None and not (
-            math.isfinite(self.leaf_density) and self.leaf_density >= 0.0
-        ):
+        if isinstance(self.leaf_density, list):
+            object.__setattr__(self, "leaf_density", tuple(self.leaf_density))
+        if self.leaf_density is not None and not _is_density(self.leaf_density):
             raise InvalidInputError(
-                f"leaf_density must be a finite number of 0 or more; got {self.leaf_density!r}"
+                "leaf_density must be a finite number of 0 or more, or a range (low, high) of such; "
+                f"got {self.leaf_density!r}"
             )
         if self.detail not in ("training", "picture"):
             raise InvalidInputError.choice("plant detail", self.detail, ("training", "picture"))
@@ -74,6 +85,14 @@ class PlantChoice:
     def changes(self) -> bool:
         """Whether every reset draws a new plant."""
         return isinstance(self.seed, str)
+
+    def grow(self, seed: int) -> Plant:
+        """Grows the plant of a seed, with its neighbours if it has any."""
+        if not self.row:
+            return generate_plant(self.preset, seed, self.detail, leaf_density_of(self.leaf_density, seed))
+        low = next((low for low, high in SEED_SPLITS.values() if low <= seed < high), 0)
+        neighbours = (low, low + ROW_NEIGHBOURS)
+        return generate_row(self.preset, seed, self.detail, self.leaf_density, seeds=neighbours)
 
     def draw_seed(self, rng: np.random.RandomState) -> int:
         """The seed itself, or one drawn from the split with `rng`."""
@@ -115,6 +134,12 @@ class PlantChoice:
             f"plant must be None, a preset's name ({', '.join(PRESETS)}) or a mapping of "
             f"{', '.join(f.name for f in fields(cls))}; got {value!r}"
         )
+
+
+def _is_density(value: object) -> bool:
+    bounds = value if isinstance(value, tuple) else (value, value)
+    numbers = all(isinstance(v, int | float) and math.isfinite(v) and v >= 0.0 for v in bounds)
+    return numbers and len(bounds) == 2 and bounds[0] <= bounds[1]
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -13,20 +13,19 @@ from mani_skill.utils.structs.pose import Pose
 from torch import Tensor
 from torch.nn.functional import pad
 
-from maniskill_tomato.plants.generator import generate_plant
 from maniskill_tomato.plants.organs import Plant, SemanticClass
 from maniskill_tomato.plants.rendering import build_plant_actors
 from maniskill_tomato.tasks import scene_mask
 from maniskill_tomato.tasks.plant_choice import PlantChoice
 
 GROWN_PLANTS = 128
-"""How many plants are kept, of 1 MB or less each, for environments that show them again."""
+"""How many plants are kept, of 1 MB or less each (a row: 3 MB), for environments that show them again."""
 
 
 @lru_cache(maxsize=GROWN_PLANTS)
 def grow(choice: PlantChoice, seed: int) -> Plant:
     """The plant of a choice and seed; the last few are kept, as environments often share them."""
-    return generate_plant(choice.preset, seed, choice.detail, choice.leaf_density)
+    return choice.grow(seed)
 
 
 class Planting:

@@ -16,6 +16,8 @@ class Stream(IntEnum):
     VIEW = 4
     SIDE_LEAF = 5
     CURTAIN = 6
+    NEIGHBOUR = 7
+    DENSITY = 8
 
 
 def stream(seed: int, kind: Stream, index: int = 0) -> Generator:

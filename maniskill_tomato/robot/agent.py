@@ -18,6 +18,7 @@ from mani_skill.sensors.camera import CameraConfig
 from maniskill_tomato.errors import InvalidInputError
 from maniskill_tomato.robot import d435, iiwa14, urdf
 from maniskill_tomato.robot.description import urdf_path
+from maniskill_tomato.robot.look_at_controller import LookAtControllerConfig
 from maniskill_tomato.robot.viewpoint_controller import ViewpointControllerConfig
 
 STIFFNESS = (10000.0, 10000.0, 5000.0, 5000.0, 2500.0, 1600.0, 800.0)
@@ -111,7 +112,14 @@ class Iiwa14D435(BaseAgent):  # type: ignore[misc]
     Every size up to 16:9, square ones too, keeps the vertical field of view of 42.5 degrees.
     """
 
-    CONTROL_MODES = ("pd_viewpoint", "pd_joint_pos", "pd_joint_delta_pos", "pd_ee_delta_pose", "pd_ee_pose")
+    CONTROL_MODES = (
+        "pd_viewpoint",
+        "pd_look_at",
+        "pd_joint_pos",
+        "pd_joint_delta_pos",
+        "pd_ee_delta_pose",
+        "pd_ee_pose",
+    )
     """The control modes; the first is the default."""
 
     uid = "iiwa14_d435"
@@ -156,6 +164,7 @@ class Iiwa14D435(BaseAgent):  # type: ignore[misc]
         viewpoint = ViewpointControllerConfig(joints, **drives)
         return {
             "pd_viewpoint": viewpoint,
+            "pd_look_at": LookAtControllerConfig(joints, **drives),
             "pd_joint_pos": PDJointPosControllerConfig(joints, None, None, normalize_action=False, **drives),
             "pd_joint_delta_pos": PDJointPosControllerConfig(
                 joints, -JOINT_STEP, JOINT_STEP, use_delta=True, **drives

@@ -145,16 +145,16 @@ class VisibilityCaster:
         return self._device
 
     @property
-    def scene(self) -> kernels.Scene:
-        """The tables of plants and links, for other kernels over the same meshes.
+    def scene(self) -> Any:
+        """The tables of plants and links (`kernels.Scene`), for other kernels over the same meshes.
 
         They follow `replace_plant`; a plant with more fruits than any before brings a new object.
         """
         return self._scene
 
     @property
-    def camera(self) -> kernels.Camera:
-        """What the image covers."""
+    def camera(self) -> Any:
+        """What the image covers (`kernels.Camera`)."""
         return self._camera
 
     def plant(self, env_index: int) -> Plant:

@@ -41,8 +41,8 @@ class OcclusionMemory:
         self,
         num_envs: int,
         device: str | torch.device = "cpu",
-        unknown_probability: float = 0.03,
-        prior_length: float = 1.0,
+        unknown_probability: float = 0.01,
+        prior_length: float = 0.2,
     ) -> None:
         """Begins with nothing known and all targets at the origin.
 

@@ -95,11 +95,11 @@ class SegmentedPlant:
         centre = np.linalg.inv(T_plant_camera) @ np.append(fruit.centre.astype(np.float64), 1.0)
         column = round(i.fx * centre[0] / centre[2] + i.cx) - _SILHOUETTE_SIZE // 2
         row = round(i.fy * centre[1] / centre[2] + i.cy) - _SILHOUETTE_SIZE // 2
-        visible = self._draw(self._image, T_plant_camera, i.cx, i.cy) == target_id
+        visible = self._draw(self._image, T_plant_camera, i.cx, i.cy)[..., 3] == target_id
         for body in self._bodies:
             body.visibility = 0.0
         self._bodies[fruit.organ_index].visibility = 1.0
-        whole = self._draw(self._silhouette, T_plant_camera, i.cx - column, i.cy - row) == target_id
+        whole = self._draw(self._silhouette, T_plant_camera, i.cx - column, i.cy - row)[..., 3] == target_id
         for body in self._bodies:
             body.visibility = 1.0
         edge = np.concatenate([whole[0], whole[-1], whole[:, 0], whole[:, -1]])
@@ -109,11 +109,19 @@ class SegmentedPlant:
 
     def picture(self, T_plant_camera: Float64) -> NDArray[np.int64]:
         """Index into the plant's organs for every pixel, -1 where there is none. Shape (height, width)."""
+        return self.picture_with_depth(T_plant_camera)[0]
+
+    def picture_with_depth(self, T_plant_camera: Float64) -> tuple[NDArray[np.int64], Float64]:
+        """What `picture` gives, and the depth of every pixel, in [m] and whole millimetres as a D435 gives it.
+
+        Pixels that show nothing have the depth infinity.
+        """
         drawn = self._draw(self._image, T_plant_camera, self._intrinsics.cx, self._intrinsics.cy)
-        organs = np.full(drawn.shape, -1, dtype=np.int64)
+        organs = np.full(drawn.shape[:2], -1, dtype=np.int64)
         for index, segmentation_id in enumerate(self._ids):
-            organs[drawn == segmentation_id] = index
-        return organs
+            organs[drawn[..., 3] == segmentation_id] = index
+        # The picture holds positions in the renderer's camera frame, which looks along -z, in millimetres.
+        return organs, np.where(organs >= 0, -drawn[..., 2] / 1000.0, np.inf)
 
     def _draw(self, camera: Any, T_plant_camera: Float64, cx: float, cy: float) -> NDArray[np.int16]:
         T_plant_frame = T_plant_camera.copy()
@@ -123,7 +131,7 @@ class SegmentedPlant:
         camera.local_pose = sapien.Pose(T_plant_frame)
         self._scene.update_render()
         camera.take_picture()
-        drawn: NDArray[np.int16] = camera.get_picture("PositionSegmentation")[..., 3]
+        drawn: NDArray[np.int16] = camera.get_picture("PositionSegmentation")
         return drawn
 
 

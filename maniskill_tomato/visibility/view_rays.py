@@ -21,10 +21,16 @@ import warp as wp
 from torch import Tensor
 
 from maniskill_tomato.errors import InvalidInputError
-from maniskill_tomato.robot.d435 import CameraIntrinsics, depth_intrinsics, depth_noise_std, min_depth
+from maniskill_tomato.robot.d435 import (
+    CAMERA_NEAR,
+    CameraIntrinsics,
+    depth_intrinsics,
+    depth_noise_std,
+    min_depth,
+)
 from maniskill_tomato.robot.iiwa14 import LINK_NAMES
 from maniskill_tomato.robot.look_at import look_frame
-from maniskill_tomato.visibility import kernels, view_ray_kernels
+from maniskill_tomato.visibility import view_ray_kernels
 from maniskill_tomato.visibility.caster import VisibilityCaster
 from maniskill_tomato.visibility.view_buffers import make_view
 
@@ -72,7 +78,7 @@ def ray_pattern() -> npt.NDArray[np.float32]:
     """Where the rays cross the plane through the target: to the right and up from its centre, in [m].
 
     With u evenly spaced in (-1, 1), a coordinate is 0.28 m times u / 4 + 3 u^3 / 4: near the middle neighbours are
-    9 mm apart, so that some 30 rays meet a tomato, at the edge 80 mm.
+    9 mm apart, so that a dozen rays meet a whole tomato, at the edge 69 mm.
 
     Returns:
         Row by row from the upper left. Shape (N, 2).
@@ -330,7 +336,7 @@ def disturb(
     z = rays.direction_c[..., 2]
     normal = torch.randn(rays.distance.shape, generator=generator, device=rays.distance.device)
     noisy = rays.distance + at_one_metre * rays.distance.square() * z * normal
-    distance = torch.where(is_target | is_other, noisy.clamp(kernels.CAMERA_NEAR, RANGE), rays.distance)
+    distance = torch.where(is_target | is_other, noisy.clamp(CAMERA_NEAR, RANGE), rays.distance)
     label = torch.where(is_other & chance(false_target), int(RayLabel.TARGET), rays.label)
     label = torch.where(is_target & chance(missed_target), int(RayLabel.OTHER), label)
     lost = chance(dropout)
