@@ -10,7 +10,8 @@ import torch
 from torch import Tensor
 
 from maniskill_tomato.planners.base import Planner, RandomPlanner
-from maniskill_tomato.planners.moves import MAX_MOVE, Goals
+from maniskill_tomato.planners.moves import Goals
+from maniskill_tomato.robot.look_at_move import MAX_MOVE
 from maniskill_tomato.visibility.situation import Situation
 from maniskill_tomato.visibility.view_rays import RayLabel, ray_pattern
 

@@ -27,9 +27,10 @@ from torch import Tensor
 from torch.nn.functional import grid_sample
 
 from maniskill_tomato.planners.base import Planner
-from maniskill_tomato.planners.moves import MAX_MOVE, MIN_DISTANCE, move_towards
+from maniskill_tomato.planners.moves import move_towards
 from maniskill_tomato.planners.reach import CameraReach
 from maniskill_tomato.robot.look_at import look_frame
+from maniskill_tomato.robot.look_at_move import MAX_MOVE, MIN_DISTANCE
 from maniskill_tomato.visibility.occlusion_memory import CELL_SIZE, GRID_CELLS, TARGET_RADIUS, OcclusionMemory
 from maniskill_tomato.visibility.situation import Situation
 

@@ -6,9 +6,9 @@ import torch
 from torch import Tensor
 
 from maniskill_tomato.planners.base import GroundTruth, Planner
-from maniskill_tomato.planners.moves import MAX_MOVE, MIN_DISTANCE
 from maniskill_tomato.planners.reach import CameraReach
 from maniskill_tomato.robot.look_at import look_at_pose, look_frame
+from maniskill_tomato.robot.look_at_move import MAX_MOVE, MIN_DISTANCE
 from maniskill_tomato.visibility.situation import Situation
 
 

@@ -29,8 +29,8 @@ import torch
 from torch import Tensor
 
 from maniskill_tomato.planners.base import GroundTruth, Planner
-from maniskill_tomato.planners.moves import MAX_MOVE
 from maniskill_tomato.robot.look_at import look_at_pose, look_frame
+from maniskill_tomato.robot.look_at_move import MAX_MOVE
 from maniskill_tomato.visibility.situation import Situation
 
 ARRAY_RADIUS = 0.07

@@ -6,12 +6,8 @@ import torch
 from torch import Tensor
 
 from maniskill_tomato.robot.look_at import look_frame
+from maniskill_tomato.robot.look_at_move import MAX_MOVE
 from maniskill_tomato.visibility.situation import Situation
-
-MAX_MOVE = 0.12
-"""Longest move, in [m]."""
-MIN_DISTANCE = 0.2
-"""Smallest distance of the camera from the target, in [m]."""
 
 NEAR_ENOUGH = 0.01
 """A goal within this distance is reached, in [m]."""

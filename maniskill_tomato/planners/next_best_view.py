@@ -19,7 +19,8 @@ from torch import Tensor
 
 from maniskill_tomato.errors import InvalidInputError
 from maniskill_tomato.planners.base import Planner
-from maniskill_tomato.planners.moves import MAX_MOVE, move_towards
+from maniskill_tomato.planners.moves import move_towards
+from maniskill_tomato.robot.look_at_move import MAX_MOVE
 from maniskill_tomato.visibility.situation import Situation
 
 

@@ -13,17 +13,13 @@ import torch
 from torch import Tensor
 
 from maniskill_tomato.planners.base import GroundTruth, Planner
-from maniskill_tomato.planners.moves import (
-    MAX_MOVE,
-    MIN_DISTANCE,
-    NEAR_ENOUGH,
-    move_towards,
-    moves_needed,
-    stops,
-)
+from maniskill_tomato.planners.moves import NEAR_ENOUGH, move_towards, moves_needed, stops
 from maniskill_tomato.planners.reach import CameraReach
 from maniskill_tomato.robot.look_at import look_at_pose
+from maniskill_tomato.robot.look_at_move import MAX_MOVE, MIN_DISTANCE
 from maniskill_tomato.visibility.situation import Situation
+
+AcceptWay = Callable[[Tensor, Tensor, Tensor, int], bool]
 
 SPACINGS = (0.02, 0.03, 0.04, 0.05)
 """Distance of neighbouring samples after 1, 2, 3 and more moves, in [m]."""
@@ -39,6 +35,9 @@ BENDS = 128
 
 _BLOCK = 192
 """Views cast at a time, nearest first, so that a near solution ends the search early."""
+
+_BENT_WAYS = 6
+"""Ways with a bend that may be turned down before the view is given up."""
 
 _WAYS = 12
 """Good views for which ways are tried before the next block."""
@@ -68,6 +67,7 @@ class OracleSearch:
         threshold: float,
         device: str | torch.device = "cpu",
         reachable: Callable[[Tensor, Tensor], Tensor] | None = None,
+        accept: AcceptWay = lambda start, way, target, env_index: True,
     ) -> None:
         """Keeps what it asks.
 
@@ -76,10 +76,12 @@ class OracleSearch:
             threshold: V_f above which a view is good.
             device: Of all tensors.
             reachable: Which positions (N, 3) can be taken when looking at a target (3,); the arm's if None.
+            accept: The last word on a way: start (3,), stops (n, 3), target (3,) and environment.
         """
         self._truth = ground_truth
         self._threshold = threshold
         self._reachable = reachable or CameraReach(device).reachable
+        self._accept = accept
 
     def solve(
         self,
@@ -132,25 +134,37 @@ class OracleSearch:
             seen = self._truth.visible_fraction(look_at_pose(block, target), env_index)
             good = torch.nonzero(seen > self._threshold)[:, 0]
             for index in good[:_WAYS].tolist():
-                way = self._way(start, block[index], target, moves, reached, excluded)
+                way = self._way(start, block[index], target, env_index, moves, reached, excluded)
                 if way is not None:
                     return Solution(stops=way, visible_fraction=float(seen[index]))
         return None
 
     def _way(
-        self, start: Tensor, goal: Tensor, target: Tensor, moves: int, reached: Tensor, excluded: Tensor
+        self,
+        start: Tensor,
+        goal: Tensor,
+        target: Tensor,
+        env_index: int,
+        moves: int,
+        reached: Tensor,
+        excluded: Tensor,
     ) -> Tensor | None:
         """Stops of a straight way or of one with a bend that needs no more moves."""
         straight = stops(start, goal)
-        if self._free(straight, target, excluded):
+        if self._free(straight, target, excluded) and self._accept(start, straight, target, env_index):
             return straight
+        tried = 0
         first, second = (reached - start).norm(dim=1), (reached - goal).norm(dim=1)
         fits = torch.nonzero(moves_needed(first) + moves_needed(second) <= moves)[:, 0]
         fits = fits[(first + second)[fits].argsort()][:BENDS]
         for bend in reached[fits]:
             way = torch.cat([stops(start, bend), stops(bend, goal)])
             if self._free(way, target, excluded):
-                return way
+                if self._accept(start, way, target, env_index):
+                    return way
+                tried += 1
+                if tried == _BENT_WAYS:
+                    break
         return None
 
     def _free(self, way: Tensor, target: Tensor, excluded: Tensor) -> bool:

@@ -6,13 +6,17 @@ from torch import Tensor
 from maniskill_tomato.robot.iiwa14 import NUM_JOINTS
 from maniskill_tomato.robot.inverse_kinematics import InverseKinematics, Reach
 from maniskill_tomato.robot.look_at import CAMERA_ROLLS, camera_to_flange, look_at_pose
+from maniskill_tomato.robot.look_at_move import keeps_clear
 
 _BLOCK = 256
 """Poses solved at a time; the kernel keeps its buffers for a few batch sizes."""
 
 
 class CameraReach:
-    """Asks the inverse kinematics, with any of the rolls that the `pd_look_at` control mode tries."""
+    """Asks the inverse kinematics, with any of the rolls that the `pd_look_at` control mode tries.
+
+    A single move may still be refused, because the joints would turn too far for it.
+    """
 
     def __init__(self, device: str | torch.device = "cpu") -> None:
         self._kinematics = InverseKinematics(device)
@@ -33,7 +37,7 @@ class CameraReach:
             if not len(left):
                 break
             poses = camera_to_flange(look_at_pose(positions[left].double(), target.double(), roll))
-            found[left] = self._solve(poses)
+            found[left] = self._solve(poses) & keeps_clear(poses)
         return found
 
     def _solve(self, T_base_flange: Tensor) -> Tensor:
