@@ -24,28 +24,34 @@ SETTINGS = "settings.json"
 class EpisodeStore:
     """The episodes of one benchmark."""
 
-    def __init__(self, folder: Path, settings: dict[str, Any]) -> None:
+    def __init__(self, folder: Path, settings: dict[str, Any], policies: dict[str, str]) -> None:
         """Opens the folder, or makes it.
 
         Args:
             folder: Of the benchmark.
             settings: What every episode depends on; plain JSON values.
+            policies: What tells the policies apart by their labels; the folder remembers those of earlier calls.
 
         Raises:
-            InvalidInputError: The folder holds episodes of other settings.
+            InvalidInputError: The folder holds episodes of other settings, or of another policy with the same label.
         """
         self._folder = folder
         path = folder / SETTINGS
+        found: dict[str, Any] = {"settings": settings, "policies": {}}
         if path.is_file():
             found = json.loads(path.read_text(encoding="utf-8"))
-            differing = sorted(k for k in found.keys() | settings.keys() if found.get(k) != settings.get(k))
-            if differing:
-                raise InvalidInputError(
-                    f"{folder} holds episodes of another benchmark ({', '.join(differing)} differ); choose another "
-                    "--out, or delete it"
-                )
-        else:
-            write_atomically(path, (json.dumps(settings, indent=2) + "\n").encode())
+        differing = _differing(found["settings"], settings)
+        known = found["policies"]
+        differing += [
+            f"policy {name}" for name in policies if known.get(name, policies[name]) != policies[name]
+        ]
+        if differing:
+            raise InvalidInputError(
+                f"{folder} holds episodes of another benchmark ({', '.join(differing)} differ); choose another --out, "
+                "or delete it"
+            )
+        content = {"settings": settings, "policies": {**known, **policies}}
+        write_atomically(path, (json.dumps(content, indent=2) + "\n").encode())
 
     def read(self, condition: str, policy: str) -> list[ViewEpisode]:
         """The finished episodes in the order of their numbers."""
@@ -82,6 +88,10 @@ class EpisodeStore:
 
     def _path(self, condition: str, policy: str) -> Path:
         return self._folder / "episodes" / _file_name(condition) / f"{_file_name(policy)}.jsonl"
+
+
+def _differing(found: dict[str, Any], wanted: dict[str, Any]) -> list[str]:
+    return sorted(name for name in found.keys() | wanted.keys() if found.get(name) != wanted.get(name))
 
 
 def _last_byte(file: Any) -> bytes:

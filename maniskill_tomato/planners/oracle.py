@@ -67,7 +67,7 @@ class OracleSearch:
         threshold: float,
         device: str | torch.device = "cpu",
         reachable: Callable[[Tensor, Tensor], Tensor] | None = None,
-        accept: AcceptWay = lambda start, way, target, env_index: True,
+        accept: AcceptWay | None = None,
     ) -> None:
         """Keeps what it asks.
 
@@ -76,12 +76,12 @@ class OracleSearch:
             threshold: V_f above which a view is good.
             device: Of all tensors.
             reachable: Which positions (N, 3) can be taken when looking at a target (3,); the arm's if None.
-            accept: The last word on a way: start (3,), stops (n, 3), target (3,) and environment.
+            accept: The last word on a way: start (3,), stops (n, 3), target (3,) and environment; any is good if None.
         """
         self._truth = ground_truth
         self._threshold = threshold
         self._reachable = reachable or CameraReach(device).reachable
-        self._accept = accept
+        self._accept: AcceptWay = accept or (lambda start, way, target, env_index: True)
 
     def solve(
         self,

@@ -12,17 +12,23 @@ from maniskill_tomato.planners.gradient_view import GradientView
 from maniskill_tomato.planners.greedy_truth import GreedyTruth
 from maniskill_tomato.planners.move_to_see import MoveToSee, MoveToSeeOnMemory
 from maniskill_tomato.planners.next_best_view import NextBestDirection, NextBestView
-from maniskill_tomato.planners.oracle import Oracle, OracleSearch
+from maniskill_tomato.planners.oracle import AcceptWay, Oracle, OracleSearch
 
 
 class _Setting:
     """What a planner may need to be made."""
 
     def __init__(
-        self, ground_truth: GroundTruth | None, threshold: float, seed: int, device: str | torch.device
+        self,
+        ground_truth: GroundTruth | None,
+        threshold: float,
+        accept_way: AcceptWay | None,
+        seed: int,
+        device: str | torch.device,
     ) -> None:
         self._truth = ground_truth
         self.threshold = threshold
+        self.accept_way = accept_way
         self.seed = seed
         self.device = device
 
@@ -48,11 +54,14 @@ _MAKERS: dict[str, Callable[[_Setting], Planner]] = {
     NextBestView.name: lambda s: NextBestView(s.device),
     MoveToSee.name: lambda s: MoveToSee(s.truth, s.device),
     GreedyTruth.name: lambda s: GreedyTruth(s.truth, s.device),
-    Oracle.name: lambda s: Oracle(OracleSearch(s.truth, s.threshold, s.device)),
+    Oracle.name: lambda s: Oracle(OracleSearch(s.truth, s.threshold, s.device, accept=s.accept_way)),
 }
 
 PLANNERS = tuple(_MAKERS)
-"""All names; the last ones know the truth."""
+"""All names."""
+
+PRIVILEGED = (MoveToSee.name, GreedyTruth.name, Oracle.name)
+"""Those that know the truth."""
 
 
 def make_planner(
@@ -60,6 +69,7 @@ def make_planner(
     *,
     ground_truth: GroundTruth | None = None,
     threshold: float = 0.8,
+    accept_way: AcceptWay | None = None,
     seed: int = 0,
     device: str | torch.device = "cpu",
 ) -> Planner:
@@ -69,6 +79,7 @@ def make_planner(
         name: One of `PLANNERS`.
         ground_truth: The simulator's knowledge, for planners with `needs_truth`.
         threshold: V_f above which the task counts the target as fully visible, for the oracle.
+        accept_way: Whether the arm can follow a way, for the oracle; any if None.
         seed: Of its random numbers.
         device: Where the environment's tensors are.
 
@@ -77,4 +88,4 @@ def make_planner(
     """
     if name not in _MAKERS:
         raise InvalidInputError.choice("the planner", name, PLANNERS)
-    return _MAKERS[name](_Setting(ground_truth, threshold, seed, device))
+    return _MAKERS[name](_Setting(ground_truth, threshold, accept_way, seed, device))
