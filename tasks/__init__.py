@@ -15,7 +15,18 @@ if __name__ != "maniskill_tomato.tasks":
 MAX_EPISODE_STEPS = 30
 """The thesis's horizon T (Tables 5-1 and 5-2)."""
 
-TASK_IDS = ("TomatoViewpointGuided-v1", "TomatoViewpointSparse-v1")
+MAX_GENERAL_STEPS = 20
+"""Moves of an episode of the general task."""
+
+MAX_ROW_STEPS = 120
+"""Moves of a whole row."""
+
+TASK_IDS = (
+    "TomatoViewpointGuided-v1",
+    "TomatoViewpointSparse-v1",
+    "TomatoViewpoint-v1",
+    "TomatoViewpointRow-v1",
+)
 
 
 def _register(env_id: str, entry_point: str, max_episode_steps: int) -> None:
@@ -42,3 +53,5 @@ _register(
 _register(
     "TomatoViewpointSparse-v1", "maniskill_tomato.tasks.viewpoint:TomatoViewpointSparseEnv", MAX_EPISODE_STEPS
 )
+_register("TomatoViewpoint-v1", "maniskill_tomato.tasks.general:TomatoViewpointGeneralEnv", MAX_GENERAL_STEPS)
+_register("TomatoViewpointRow-v1", "maniskill_tomato.tasks.row_search:TomatoViewpointRowEnv", MAX_ROW_STEPS)

@@ -105,3 +105,14 @@ def rendering_failure(error: RuntimeError) -> str | None:
     if any(word in text for word in ("render", "vulkan", "vk::", "find device", "find a device")):
         return f"{NO_RENDERING_HINT}; obs_mode='state' with render_mode=None needs none ({error})"
     return None
+
+
+def check_range(name: str, values: Sequence[float]) -> tuple[float, float]:
+    """`values` as two finite numbers, the first below the second."""
+    try:
+        numbers = tuple(float(v) for v in values)
+    except (TypeError, ValueError):
+        numbers = ()
+    if len(numbers) != 2 or not all(math.isfinite(v) for v in numbers) or numbers[0] >= numbers[1]:
+        raise InvalidInputError(f"{name} must be a range (low, high) of finite numbers; got {values!r}")
+    return numbers[0], numbers[1]

@@ -129,7 +129,10 @@ class PlantChoice:
                 raise InvalidInputError(
                     f"plant has no field {', '.join(map(repr, unknown))}; the fields are {', '.join(names)}"
                 )
-            return cls(**{**asdict(default), **value})
+            replaced = dict(value)
+            if not isinstance(replaced.get("seed", ""), str):
+                replaced.setdefault("pool", None)  # The default's pool is one of its split.
+            return cls(**{**asdict(default), **replaced})
         raise InvalidInputError(
             f"plant must be None, a preset's name ({', '.join(PRESETS)}) or a mapping of "
             f"{', '.join(f.name for f in fields(cls))}; got {value!r}"

@@ -138,7 +138,8 @@ class TomatoEnv(BaseEnv):  # type: ignore[misc]
 
     def _load_scene(self, options: dict[str, Any]) -> None:
         scenery.build(self.scene)
-        seeds = [self._choice.draw_seed(self._batched_episode_rng[i]) for i in range(self.num_envs)]
+        rngs: Any = self._batched_episode_rng
+        seeds = [self._plant_seed(i, rngs[i], options) for i in range(self.num_envs)]
         self.planting = Planting(
             self.scene, self._choice, seeds, self.device, with_actors=not self._swaps_plants
         )
@@ -185,10 +186,22 @@ class TomatoEnv(BaseEnv):  # type: ignore[misc]
 
     # ---------------------------------------------------------------- episode
 
-    def _place_plants(self, env_idx: Tensor, indices: list[int], rngs: list[np.random.RandomState]) -> None:
+    def _plant_seed(self, env_index: int, rng: np.random.RandomState, options: dict[str, Any]) -> int:
+        """The seed of an environment's next plant; the first draw of its episode."""
+        return self._choice.draw_seed(rng)
+
+    def _place_plants(
+        self,
+        env_idx: Tensor,
+        indices: list[int],
+        rngs: list[np.random.RandomState],
+        options: dict[str, Any],
+    ) -> None:
         """New plants where every reset has one, and all of them at their drawn poses."""
         if self._choice.changes:
-            self._change_plants(indices, rngs)
+            # The same draw that a new scene was built with just before.
+            for i, rng in zip(indices, rngs, strict=True):
+                self._show_plant(i, self._plant_seed(i, rng, options))
         noise = np.array(self._plant_pose_noise)
         poses = [self._plant_pose.as_array() + noise * rng.uniform(-1.0, 1.0, 3) for rng in rngs]
         self._put_plants(env_idx, np.stack(poses))
@@ -196,12 +209,6 @@ class TomatoEnv(BaseEnv):  # type: ignore[misc]
     def _put_plants(self, env_idx: Tensor, poses: NDArray[np.float64]) -> None:
         x, y, yaw = torch.as_tensor(poses, dtype=torch.float32, device=self.device).unbind(-1)
         self.planting.place(env_idx, x, y, yaw)
-
-    def _change_plants(self, indices: list[int], rngs: list[np.random.RandomState]) -> None:
-        # The first draw of an episode is its plant's seed, the same that a new scene was built with just before.
-        for i, rng in zip(indices, rngs, strict=True):
-            seed = self._choice.draw_seed(rng)
-            self._show_plant(i, seed)
 
     def _show_plant(self, env_index: int, seed: int) -> None:
         if self._swaps_plants and seed != self.planting.seeds[env_index]:
@@ -292,6 +299,17 @@ class TomatoEnv(BaseEnv):  # type: ignore[misc]
         self._viewpoint = torch.cat([T_w_ee[:, :3, 3], rpy], dim=-1)
 
     # ------------------------------------------------------------ observation
+
+    def _get_obs_agent(self) -> dict[str, Tensor]:
+        """Nothing in the state modes, whose observation is the task's own vector; joints beside pictures."""
+        if self._obs_mode in ("state", "state_dict"):
+            return {}
+        return {"qpos": self.agent.robot.get_qpos(), "qvel": self.agent.robot.get_qvel()}
+
+    def _flatten_raw_obs(self, obs: Any) -> Any:
+        if self._obs_mode == "state":
+            return torch.cat(tuple(obs["extra"].values()), dim=-1)
+        return super()._flatten_raw_obs(obs)
 
     @property
     def target_position_w(self) -> Tensor:

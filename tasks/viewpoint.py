@@ -66,7 +66,7 @@ class TomatoViewpointEnv(TomatoEnv):
         indices = [int(i) for i in env_idx]
         episode_rngs: Any = self._batched_episode_rng
         rngs = [episode_rngs[i] for i in indices]
-        self._place_plants(env_idx, indices, rngs)
+        self._place_plants(env_idx, indices, rngs, options)
         targets = [ripe_fruit_at_random(self.planting, i, rng) for i, rng in zip(indices, rngs, strict=True)]
         if "target" in options:
             targets = [self._checked_target(i, options["target"]) for i in indices]
@@ -111,18 +111,6 @@ class TomatoViewpointEnv(TomatoEnv):
     def compute_normalized_dense_reward(self, obs: Any, action: Tensor, info: dict[str, Tensor]) -> Tensor:
         """The reward over its largest value. Shape (num_envs,)."""
         return self.compute_dense_reward(obs, action, info) / self.task.reward_bounds[1]
-
-    def _get_obs_agent(self) -> dict[str, Tensor]:
-        """Nothing in the state modes, whose observation is the thesis's nine numbers; joints and viewpoint
-        beside pictures."""
-        if self._obs_mode in ("state", "state_dict"):
-            return {}
-        return {"qpos": self.agent.robot.get_qpos(), "qvel": self.agent.robot.get_qvel()}
-
-    def _flatten_raw_obs(self, obs: Any) -> Any:
-        if self._obs_mode == "state":
-            return torch.cat(tuple(obs["extra"].values()), dim=-1)
-        return super()._flatten_raw_obs(obs)
 
     def _get_obs_extra(self, info: dict[str, Tensor]) -> dict[str, Tensor]:
         return {

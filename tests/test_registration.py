@@ -12,7 +12,12 @@ from gymnasium.envs.registration import EnvSpec, load_env_creator
 import maniskill_tomato
 from maniskill_tomato.tasks import MAX_EPISODE_STEPS, TASK_IDS
 
-EXPECTED_IDS = ("TomatoViewpointGuided-v1", "TomatoViewpointSparse-v1")
+EXPECTED_IDS = (
+    "TomatoViewpointGuided-v1",
+    "TomatoViewpointSparse-v1",
+    "TomatoViewpoint-v1",
+    "TomatoViewpointRow-v1",
+)
 
 
 def run_python(code: str, cwd: Path, *arguments: str) -> "subprocess.CompletedProcess[str]":

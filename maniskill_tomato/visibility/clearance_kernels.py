@@ -15,6 +15,7 @@ wp.set_module_options({"enable_backward": False})
 @wp.kernel
 def sphere_clearance(
     scene: Scene,
+    environments: wp.array[wp.int32],
     plant_poses: wp.array[wp.mat44],
     link_poses: wp.array3d[wp.mat44],
     sphere_links: wp.array[wp.int32],
@@ -22,19 +23,19 @@ def sphere_clearance(
     furthest: float,
     clearance: wp.array[wp.float32],
 ):
-    """The smallest distance of an environment's spheres over all samples of its path, at most `furthest`."""
-    env, sample, index = wp.tid()
+    """The smallest distance of the spheres over all samples of a path, at most `furthest`."""
+    path, sample, index = wp.tid()
     sphere = spheres[index]
-    link = link_poses[env, sample, sphere_links[index]]
+    link = link_poses[path, sample, sphere_links[index]]
     centre_w = rotation(link) * wp.vec3(sphere[0], sphere[1], sphere[2]) + translation(link)
-    pose = plant_poses[env]
+    pose = plant_poses[path]
     centre = wp.transpose(rotation(pose)) * (centre_w - translation(pose))
-    mesh = scene.plant_meshes[env]
+    mesh = scene.plant_meshes[environments[path]]
     # Only what can make the result smaller is looked for.
-    within = sphere[3] + wp.min(furthest, clearance[env])
+    within = sphere[3] + wp.min(furthest, clearance[path])
     if within <= 0.0:
         return
     found = wp.mesh_query_point_no_sign(mesh, centre, within)
     if found.result:
         nearest = wp.mesh_eval_position(mesh, found.face, found.u, found.v)
-        wp.atomic_min(clearance, env, wp.length(nearest - centre) - sphere[3])
+        wp.atomic_min(clearance, path, wp.length(nearest - centre) - sphere[3])

@@ -1,0 +1,93 @@
+"""Fixed lists of episodes: which plant, where it stands, which target, where the camera starts, and who solves it."""
+
+import json
+from collections.abc import Iterable
+from dataclasses import asdict, dataclass, fields
+from functools import cache
+from pathlib import Path
+
+from maniskill_tomato.assets import asset_path
+from maniskill_tomato.errors import InvalidInputError
+
+EPISODE_LISTS = ("validation", "held_out")
+"""The lists in the package, named like the split of seeds that their plants come from."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Episode:
+    """One episode of the general task."""
+
+    plant_seed: int
+    """The middle plant, which also draws its neighbours."""
+    leaf_density: float
+    """Of the middle plant, for sorting: it follows from the seed."""
+    plant_pose: tuple[float, float, float]
+    """x, y of the stem and yaw, world frame, in [m, m, rad]."""
+    target: int
+    """Index of the fruit in `Plant.fruits`."""
+    camera_position: tuple[float, float, float]
+    """Where the camera starts, world frame, in [m]; it looks at the target."""
+    start_visibility: float
+    """V_f of the first view."""
+    oracle_moves: int | None = None
+    """Fewest moves that the oracle needs within the task's limit; None if it finds no way, or was not asked."""
+    certified: bool = False
+    """Whether the oracle was asked."""
+
+    def __post_init__(self) -> None:
+        # Lists of JSON become what the annotations say.
+        object.__setattr__(self, "plant_pose", tuple(float(v) for v in self.plant_pose))
+        object.__setattr__(self, "camera_position", tuple(float(v) for v in self.camera_position))
+        if len(self.plant_pose) != 3 or len(self.camera_position) != 3:
+            raise InvalidInputError("plant_pose and camera_position must be three numbers each")
+        if self.oracle_moves is not None and not self.certified:
+            raise InvalidInputError("an episode with oracle_moves must be certified")
+
+
+def episode_path(name: str) -> Path:
+    """The file of a list of `EPISODE_LISTS`.
+
+    Raises:
+        InvalidInputError: There is no such list.
+    """
+    if name not in EPISODE_LISTS:
+        raise InvalidInputError.choice("episodes", name, EPISODE_LISTS)
+    return Path(asset_path(f"episodes/{name}.json"))
+
+
+@cache
+def load_episodes(name: str) -> tuple[Episode, ...]:
+    """A list of the package.
+
+    Args:
+        name: One of `EPISODE_LISTS`.
+
+    Raises:
+        InvalidInputError: There is no such list.
+    """
+    return read_episodes(episode_path(name))
+
+
+def read_episodes(path: Path) -> tuple[Episode, ...]:
+    """The episodes of a file that `write_episodes` wrote.
+
+    Raises:
+        InvalidInputError: The file is of another form.
+    """
+    try:
+        rows = json.loads(path.read_text(encoding="utf-8"))["episodes"]
+        known = {field.name for field in fields(Episode)}
+        if not rows or any(set(row) - known for row in rows):
+            raise KeyError
+        return tuple(Episode(**row) for row in rows)
+    except (KeyError, TypeError, ValueError) as error:
+        raise InvalidInputError(
+            f"{path} is no list of episodes; it must hold {{'episodes': [...]}} with the fields of Episode"
+        ) from error
+
+
+def write_episodes(path: Path, episodes: Iterable[Episode]) -> None:
+    """Writes a list, one episode a line."""
+    lines = ",\n".join(json.dumps(asdict(episode)) for episode in episodes)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(f'{{"episodes": [\n{lines}\n]}}\n', encoding="utf-8")

@@ -1,0 +1,337 @@
+"""The general viewpoint task: a tomato on a plant never seen before, hidden at the start, and a memory to look with."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import torch
+from mani_skill.utils.registration import register
+from torch import Tensor
+
+from maniskill_tomato.errors import InvalidInputError
+from maniskill_tomato.plants.row import Row
+from maniskill_tomato.robot.kinematics import link_transforms
+from maniskill_tomato.robot.look_at import camera_to_viewpoint
+from maniskill_tomato.tasks import MAX_GENERAL_STEPS, options
+from maniskill_tomato.tasks.episode_list import EPISODE_LISTS, Episode, load_episodes
+from maniskill_tomato.tasks.general_config import GeneralTaskConfig
+from maniskill_tomato.tasks.general_rewards import view_gain_reward
+from maniskill_tomato.tasks.ground_truth import GroundTruth
+from maniskill_tomato.tasks.hard_starts import HardStarts, Start
+from maniskill_tomato.tasks.plant_choice import PlantChoice
+from maniskill_tomato.tasks.tomato_env import TomatoEnv
+from maniskill_tomato.visibility.cast_views import CastViews
+from maniskill_tomato.visibility.caster import Visibility
+from maniskill_tomato.visibility.clearance import PlantClearance
+from maniskill_tomato.visibility.observation import ObservationLayout, ViewpointObserver
+from maniskill_tomato.visibility.situation import Situation
+from maniskill_tomato.visibility.view_rays import ViewRayCaster
+
+MAX_VIEWS = 64
+"""Views of a target that are remembered; as many as the memory counts."""
+
+START_RPY = (0.0, torch.pi / 2, 0.0)
+"""The angles that those of a first view are near to, in [rad]: along +x, upright."""
+
+
+class TomatoViewpointGeneralEnv(TomatoEnv):
+    """**Task Description:**
+    A ripe tomato of a plant between its neighbours in the row is hidden from the first view. Move the camera to where
+    it is fully visible, in 20 moves or fewer.
+
+    **Randomizations:**
+    - A new plant at every reset out of a split of seeds, its leaf density, its neighbours and its pose.
+    - The target is a ripe fruit of the middle plant.
+    - The camera starts uniformly in a box before the plant and looks at the target, redrawn until the arm reaches the
+      pose, touches nothing, and V_f is below 0.3.
+
+    **Success Conditions:**
+    - V_f of the target is above 0.8.
+
+    **Options** beside those of the thesis's tasks:
+
+    - `episodes`: `"validation"` or `"held_out"` takes the episodes of a fixed list, `reset(seed=i)` its i-th (modulo
+      its length).
+    - `layout`: an `ObservationLayout`, or the parts' names, says what the observation holds.
+    - `start_visibility`: range of V_f of the first view.
+    - `contact_penalty`: what a move with plant contact costs.
+
+    `reset(options=...)` takes `episode` (index in the list), `target` (index of a ripe fruit in `Plant.fruits`) and
+    `camera_position` (x, y, z [m], world frame).
+
+    **Observation** (`state`): the vector of `ViewpointObserver`; `state_dict` has its parts by name.
+    **Action** (`pd_look_at`, 3 numbers in [-1, 1]): right, up, forward in the look frame, norm 1 meaning 0.12 m.
+    **Info**, each of shape (num_envs,): `success`, `fail`, `visible_fraction`, `visible_fraction_gain`, `target_id`,
+    `target_seen`, `tomato_seen`, `reachability` (`Reach`; neighbour: the move was shortened), `clearance` [m],
+    `plant_contact`, `moves`, `path_length` [m].
+    """
+
+    task: GeneralTaskConfig
+
+    def __init__(
+        self,
+        *args: Any,
+        task: GeneralTaskConfig | None = None,
+        episodes: str | None = None,
+        layout: ObservationLayout | Sequence[str] | None = None,
+        start_visibility: Sequence[float] | None = None,
+        contact_penalty: float | None = None,
+        plant: PlantChoice | Mapping[str, object] | str | None = None,
+        plant_pose_noise: Sequence[float] | None = None,
+        control_mode: str | None = "pd_look_at",
+        **kwargs: Any,
+    ) -> None:
+        task = task or GeneralTaskConfig()
+        if start_visibility is not None:
+            low, high = options.check_range("start_visibility", start_visibility)
+            task = replace(task, start_visibility=(low, high))
+        if contact_penalty is not None:
+            task = replace(task, contact_penalty=float(contact_penalty))
+        choice = PlantChoice.parse(plant, task.plant)
+        self._episodes: tuple[Episode, ...] | None = None
+        if episodes is not None:
+            options.check_choice("episodes", episodes, EPISODE_LISTS)
+            self._episodes = load_episodes(episodes)
+            choice = replace(choice, seed=episodes, pool=None)
+        if layout is not None and not isinstance(layout, ObservationLayout):
+            layout = ObservationLayout(parts=tuple(layout))  # type: ignore[arg-type]
+        self.layout: ObservationLayout = layout or ObservationLayout()
+        super().__init__(
+            *args,
+            task=task,
+            plant=choice,
+            plant_pose_noise=task.plant_pose_noise if plant_pose_noise is None else plant_pose_noise,
+            control_mode=control_mode,
+            **kwargs,
+        )
+
+    def _make_tools(self) -> None:
+        n, device = self.num_envs, self.device
+        self._ray_caster = ViewRayCaster(self._caster)
+        self._cast_views = CastViews(self._caster)
+        self._plant_clearance = PlantClearance(self._caster)
+        self._observer = ViewpointObserver(n, device, self.layout, self.task.max_moves)
+        self._hard_starts = HardStarts(self.task, self._cast_views, self._plant_clearance, device)
+        self.ground_truth = GroundTruth(
+            self._cast_views, self._plant_clearance, lambda: self.planting, lambda: self._target
+        )
+        """What only the simulator knows; for planners that need the truth."""
+        self.soft_starts = 0
+        """Episodes so far that no drawn start made as hard as asked for."""
+        self._views = torch.zeros(n, MAX_VIEWS, 7, device=device)
+        self._view_count = torch.zeros(n, dtype=torch.int64, device=device)
+        self._moves = torch.zeros(n, dtype=torch.int64, device=device)
+        self._path_length = torch.zeros(n, device=device)
+        self._clearance = torch.zeros(n, device=device)
+        self._gain = torch.zeros(n, device=device)
+        self._camera_position = torch.zeros(n, 3, device=device)
+        self._observation = torch.zeros(n, self.layout.size, device=device)
+
+    # ---------------------------------------------------------------- episode
+
+    @property
+    def situation(self) -> Situation:
+        """What is known after the last look, for policies."""
+        return self._observer.situation
+
+    def episode(self, env_index: int, options: Mapping[str, Any]) -> Episode | None:
+        """The episode of the list that a reset with these options begins; None without a list."""
+        if self._episodes is None:
+            if "episode" in options:
+                raise InvalidInputError(
+                    f"reset option episode needs a list: make the task with episodes= one of {', '.join(EPISODE_LISTS)}"
+                )
+            return None
+        index = options.get("episode", None)
+        if index is None:
+            index = int(self._episode_seed[env_index])
+        elif isinstance(index, Sequence | np.ndarray | Tensor):
+            index = index[env_index]
+        if isinstance(index, bool) or int(index) != index or int(index) < 0:
+            raise InvalidInputError(f"reset option episode must be an index of 0 or more; got {index!r}")
+        return self._episodes[int(index) % len(self._episodes)]
+
+    def _plant_seed(self, env_index: int, rng: np.random.RandomState, options: dict[str, Any]) -> int:
+        episode = self.episode(env_index, options)
+        return self._choice.draw_seed(rng) if episode is None else episode.plant_seed
+
+    def _candidates(self, env_index: int) -> list[int]:
+        """The fruits that can become targets."""
+        plant, ripe = self.planting.plants[env_index], self.planting.ripe_fruits[env_index]
+        return [j for j in ripe if j < plant.middle_fruits] if isinstance(plant, Row) else ripe
+
+    def _initialize_episode(self, env_idx: Tensor, options: dict[str, Any]) -> None:
+        indices = [int(i) for i in env_idx]
+        episode_rngs: Any = self._batched_episode_rng
+        rngs = [episode_rngs[i] for i in indices]
+        self._place_plants(env_idx, indices, rngs, options)
+        episodes = [self.episode(i, options) for i in indices]
+        if self._episodes is not None:
+            self._put_plants(env_idx, np.array([e.plant_pose for e in episodes if e is not None]))
+        starts = [
+            self._start(i, rng, episode, options)
+            for i, rng, episode in zip(indices, rngs, episodes, strict=True)
+        ]
+        self.soft_starts += sum(not start.is_hard for start in starts)
+        self._target[env_idx] = torch.tensor([start.target for start in starts], device=self.device)
+        self._look_up_target()
+        poses = torch.stack([start.T_world_camera for start in starts]).double()
+        near = torch.tensor([START_RPY], dtype=torch.float64, device=self.device).expand(len(starts), 3)
+        viewpoint = camera_to_viewpoint(poses, near).float()
+        self._set_arm(env_idx, viewpoint, torch.stack([start.qpos for start in starts]))
+        self._begin(env_idx)
+
+    def _start(
+        self, env_index: int, rng: np.random.RandomState, episode: Episode | None, options: dict[str, Any]
+    ) -> Start:
+        targets = self._candidates(env_index)
+        camera_position = options.get("camera_position", None)
+        if episode is not None:
+            targets = [episode.target]
+            camera_position = episode.camera_position if camera_position is None else camera_position
+        if "target" in options:
+            targets = [self._checked_target(env_index, options["target"])]
+        positions = self._fruit_positions(env_index, targets)
+        if camera_position is not None:
+            k = int(rng.randint(len(targets))) if len(targets) > 1 else 0
+            return self._hard_starts.given(camera_position, targets[k], positions[k])
+        T_world_plant = self.planting.T_world_plant[env_index]
+        return self._hard_starts.draw(env_index, rng, targets, positions, T_world_plant)
+
+    def _fruit_positions(self, env_index: int, fruits: list[int]) -> Tensor:
+        plant, T = self.planting.plants[env_index], self.planting.T_world_plant[env_index]
+        centres = np.array([plant.fruits[j].centre for j in fruits], dtype=np.float32).reshape(-1, 3)
+        return torch.as_tensor(centres, device=self.device) @ T[:3, :3].T + T[:3, 3]
+
+    def _begin(self, env_idx: Tensor) -> None:
+        """Begins the episodes of some environments where plants, targets and arms are now."""
+        self._moves[env_idx] = 0
+        self._path_length[env_idx] = 0.0
+        self._gain[env_idx] = 0.0
+        qpos = self.agent.robot.get_qpos()
+        clearance = self._plant_clearance.at(qpos, self.planting.T_world_plant)
+        self._clearance[env_idx] = clearance[env_idx]
+        self._look_anew(env_idx)
+        self._visible_fraction = self._seen.visible_fraction.clone()
+
+    def _look_anew(self, env_idx: Tensor) -> None:
+        """Forgets what was seen in some environments and takes a first look at their targets."""
+        self._observer.begin(env_idx, self._target_position_w[env_idx])
+        self._view_count[env_idx] = 0
+        mask = torch.zeros(self.num_envs, dtype=torch.bool, device=self.device)
+        mask[env_idx] = True
+        self._look(self.agent.robot.get_qpos(), mask)
+
+    # ------------------------------------------------------------------- step
+
+    def _look(self, qpos: Tensor, mask: Tensor | None) -> None:
+        """Looks from where the arm stands and takes the view into the memory, once for every view."""
+        rows = torch.arange(self.num_envs, device=self.device) if mask is None else mask.nonzero()[:, 0]
+        self._views[rows, self._view_count[rows].clamp_max(MAX_VIEWS - 1)] = qpos[rows]
+        self._view_count[rows] += 1
+        self._observe(qpos, mask)
+
+    def _observe(self, qpos: Tensor, mask: Tensor | None) -> None:
+        T_w_links = link_transforms(qpos)
+        T_w_camera = T_w_links[:, -1] @ self._T_ee_camera
+        T_w_plant = self.planting.T_world_plant
+        self._seen: Visibility = self._caster.cast(T_w_camera, self._target, T_w_plant, T_w_links)
+        rays = self._ray_caster.cast(T_w_camera, self._target, self._target_position_w, T_w_plant, T_w_links)
+        self._camera_position = T_w_camera[:, :3, 3]
+        self._observation = self._observer.observe(
+            self._viewpoint, T_w_camera, rays, self._seen.visible_fraction, self._moves_left(), mask
+        )
+
+    def _moves_left(self) -> Tensor:
+        return (self.task.max_moves - self._moves).clamp_min(0)
+
+    def _step_action(self, action: Any) -> Tensor | None:
+        before, position = self.agent.robot.get_qpos().clone(), self._camera_position
+        fraction = self._seen.visible_fraction
+        batch = super()._step_action(action)
+        if batch is None:
+            return None
+        qpos = self.agent.robot.get_qpos()
+        self._clearance = self._plant_clearance.along(before, qpos, self.planting.T_world_plant)
+        self._moves = self._moves + 1
+        self._look(qpos, None)
+        self._path_length = self._path_length + (self._camera_position - position).norm(dim=-1)
+        self._visible_fraction = self._seen.visible_fraction
+        self._gain = self._visible_fraction - fraction
+        return batch
+
+    def evaluate(self) -> dict[str, Tensor]:
+        """What came of the last move: V_f, whether that is a success, and what the move touched."""
+        fraction = self._visible_fraction
+        return {
+            "success": fraction > self.task.full_visibility,
+            "fail": torch.zeros_like(fraction, dtype=torch.bool),
+            "visible_fraction": fraction.clone(),
+            "visible_fraction_gain": self._gain.clone(),
+            "target_id": self._target_id.clone(),
+            "target_seen": fraction > 0.0,
+            "tomato_seen": self._seen.any_visible,
+            "reachability": self._reach.clone(),
+            "clearance": self._clearance.clone(),
+            "plant_contact": self._clearance <= 0.0,
+            "moves": self._moves.clone(),
+            "path_length": self._path_length.clone(),
+        }
+
+    def compute_dense_reward(self, obs: Any, action: Tensor, info: dict[str, Tensor]) -> Tensor:
+        """`view_gain_reward` of the last move. Shape (num_envs,)."""
+        fraction = info["visible_fraction"]
+        return view_gain_reward(
+            fraction,
+            fraction - info["visible_fraction_gain"],
+            info["success"],
+            info["plant_contact"],
+            step_cost=self.task.step_cost,
+            success_reward=self.task.success_reward,
+            contact_penalty=self.task.contact_penalty,
+        )
+
+    def compute_normalized_dense_reward(self, obs: Any, action: Tensor, info: dict[str, Tensor]) -> Tensor:
+        """The reward over the largest that a move can have. Shape (num_envs,)."""
+        return self.compute_dense_reward(obs, action, info) / (1.0 + self.task.success_reward)
+
+    def _get_obs_extra(self, info: dict[str, Tensor]) -> dict[str, Tensor]:
+        return {name: self._observation[:, part].clone() for name, part in self.layout.slices.items()}
+
+    # ------------------------------------------------------------------ state
+
+    def _task_state(self) -> dict[str, Tensor]:
+        # The views say all: what the memory holds follows from them.
+        return {
+            **super()._task_state(),
+            "views": self._views.flatten(1).clone(),
+            "counts": torch.stack([self._view_count, self._moves], dim=-1).float(),
+            "last_move": torch.stack([self._clearance, self._gain, self._path_length], dim=-1),
+        }
+
+    def _set_task_state(self, indices: Tensor, task: dict[str, Tensor]) -> None:
+        super()._set_task_state(indices, task)
+        self._views[indices] = task["views"].view(-1, MAX_VIEWS, 7)
+        counts, last = task["counts"].long(), task["last_move"]
+        self._view_count[indices], self._moves[indices] = counts[:, 0], counts[:, 1]
+        self._clearance, self._gain = self._clearance.clone(), self._gain.clone()
+        self._path_length = self._path_length.clone()
+        self._clearance[indices], self._gain[indices], self._path_length[indices] = last.unbind(-1)
+        self._replay(indices)
+
+    def _replay(self, indices: Tensor) -> None:
+        """Looks again from where some environments looked, so that their memory is what it was."""
+        self._observer.begin(indices, self._target_position_w[indices])
+        chosen = torch.zeros(self.num_envs, dtype=torch.bool, device=self.device)
+        chosen[indices] = True
+        count = self._view_count.clamp_max(MAX_VIEWS)
+        for k in range(int(count[indices].max())):
+            self._observe(self._views[:, k], chosen & (k < count))
+        # Once more for the numbers alone, with all arms where they are now.
+        self._observe(self.agent.robot.get_qpos(), torch.zeros_like(chosen))
+        self._visible_fraction = self._seen.visible_fraction
+
+
+# Gymnasium's registry has the id already, lazily; this line tells ManiSkill's own.
+register("TomatoViewpoint-v1", TomatoViewpointGeneralEnv, max_episode_steps=MAX_GENERAL_STEPS)
