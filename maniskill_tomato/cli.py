@@ -1,10 +1,11 @@
-"""The command `maniskill-tomato`: train, evaluate, demonstrate, export.
+"""The command `maniskill-tomato`: train, evaluate, compare, demonstrate, export.
 
 Examples:
     maniskill-tomato train TomatoViewpointGuided-v1
     maniskill-tomato train TomatoViewpointSparse-v1 --preset thesis-sparse --seeds 0..4 --jobs 2
     maniskill-tomato train --resume runs/guided
     maniskill-tomato eval TomatoViewpointGuided-v1 --policy runs/demo/training/policy.pt --episodes 100
+    maniskill-tomato benchmark --policies nbv,oracle,runs/general/policy.pt --episodes 500
     maniskill-tomato demo
     maniskill-tomato export --policy runs/demo/training/policy.pt --out exported
 """
@@ -20,6 +21,7 @@ from typing import Annotated, Any
 
 import tyro
 
+from maniskill_tomato.benchmark_command import Benchmark
 from maniskill_tomato.errors import InvalidInputError, SeedsFailedError, TomatoError
 from maniskill_tomato.learning.config_file import RunFile, parse_seeds, read_run_config, read_run_file
 from maniskill_tomato.learning.presets import MAY_CHANGE, PRESETS, PresetName, TrainConfig
@@ -362,7 +364,7 @@ def summary(metrics: dict[str, Any]) -> str:
     )
 
 
-def parse(argv: Sequence[str]) -> Train | Eval | Demo | Export:
+def parse(argv: Sequence[str]) -> Train | Eval | Benchmark | Demo | Export:
     """The command that the arguments describe.
 
     The options of `train` default to those of the run that it continues or of its `--config` file, and these to
@@ -375,13 +377,14 @@ def parse(argv: Sequence[str]) -> Train | Eval | Demo | Export:
     commands: Any = (
         Annotated[Train, tyro.conf.subcommand("train", default=train_default)]
         | Annotated[Eval, tyro.conf.subcommand("eval")]
+        | Annotated[Benchmark, tyro.conf.subcommand("benchmark")]
         | Annotated[Demo, tyro.conf.subcommand("demo")]
         | Annotated[Export, tyro.conf.subcommand("export")]
     )
-    command: Train | Eval | Demo | Export = tyro.cli(
+    command: Train | Eval | Benchmark | Demo | Export = tyro.cli(
         commands,
         prog="maniskill-tomato",
-        description="Active perception for tomato harvesting: train, evaluate, demonstrate, export.",
+        description="Active perception for tomato harvesting: train, evaluate, compare, demonstrate, export.",
         args=list(argv),
         config=(tyro.conf.OmitArgPrefixes,),
     )
