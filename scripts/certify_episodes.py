@@ -98,6 +98,11 @@ def describe(episodes: list[Episode]) -> str:
     return f"{text}, mean moves {moves.mean():.3f} ({shares})"
 
 
+def _tell_drawn(count: int) -> None:
+    if count % 50 == 0:
+        logger.info("%d drawn", count)
+
+
 def _start_process() -> None:
     os.environ["OMP_NUM_THREADS"] = "1"
     torch.set_num_threads(1)
@@ -113,9 +118,7 @@ def main(args: Args) -> None:
     if out.is_file():
         episodes = list(read_episodes(out))
     else:
-        episodes = draw_episodes(
-            args.list, args.count, on_episode=lambda n: n % 50 or logger.info("%d drawn", n)
-        )
+        episodes = draw_episodes(args.list, args.count, on_episode=_tell_drawn)
         write_episodes(out, episodes)
     started = time.monotonic()
     for known in certify_all(episodes, args):

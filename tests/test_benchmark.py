@@ -205,6 +205,7 @@ class LineWorld:
     spec = None
 
     def __init__(self) -> None:
+        self.x = torch.zeros(1)
         self.agent = SimpleNamespace(robot=SimpleNamespace(get_qpos=lambda: self.x * torch.ones(1, 7)))
         self.resets = 0
 
@@ -243,7 +244,9 @@ class LineWorld:
 
 
 class Runner:
-    """Moves forward by a fixed share; draws a random number first, which must not matter to other episodes."""
+    """Moves forward by a fixed share."""
+
+    needs_truth = False
 
     def __init__(self, name: str, share: float) -> None:
         self.name = name
@@ -310,7 +313,8 @@ def test_a_benchmark_runs_what_is_missing_and_nothing_twice(
 
 def test_bad_numbers_are_refused() -> None:
     base: dict[str, Any] = {"policies": (), "conditions": (Condition(name="a"),), "episodes": {"a": 1}}
-    for change in ({"jobs": 0}, {"seed": -1}, {"episodes": {}}):
+    changes: list[dict[str, Any]] = [{"jobs": 0}, {"seed": -1}, {"episodes": {}}]
+    for change in changes:
         with pytest.raises(InvalidInputError):
             BenchmarkConfig(**{**base, **change})
 
