@@ -83,12 +83,13 @@ def test_demonstrations_can_be_replayed(tmp_path: Path) -> None:
     again: Any = make_env("TomatoViewpoint-v1", plant=PLANTS)
     with h5py.File(result.path) as file:
         for entry in description["episodes"]:
-            group = file[f"traj_{entry['episode_id']}"]
+            group: Any = file[f"traj_{entry['episode_id']}"]
             actions = group["actions"][()]
             assert group["success"][-1] and entry["success"]
             assert group["obs"].shape[0] == len(actions) + 1
             observation, _ = again.reset(**entry["reset_kwargs"])
             np.testing.assert_allclose(observation[0].numpy(), group["obs"][0], atol=1e-5)
+            info: dict[str, Any] = {}
             for step, action in enumerate(actions):
                 observation, _, _, _, info = again.step(torch.from_numpy(action))
                 np.testing.assert_allclose(observation[0].numpy(), group["obs"][step + 1], atol=1e-4)

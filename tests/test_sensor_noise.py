@@ -20,7 +20,8 @@ def world(**noise: float) -> Any:
 
 def test_errors_repeat_with_the_seed_and_leave_the_truth_alone() -> None:
     clean, noisy = world(), world(depth_noise=2.0, missed_target=0.5, target_position=0.02)
-    first, again = [], []
+    first: list[torch.Tensor] = []
+    again: list[torch.Tensor] = []
     for kept in (first, again):
         observation, info = noisy.reset(seed=5)
         kept.append(observation)
