@@ -86,13 +86,13 @@ class TomatoViewpointGeneralEnv(TomatoEnv):
         control_mode: str | None = "pd_look_at",
         **kwargs: Any,
     ) -> None:
+        self._sensor_noise = SensorNoise.parse(sensor_noise)
         task = task or GeneralTaskConfig()
         if start_visibility is not None:
             low, high = options.check_range("start_visibility", start_visibility)
             task = replace(task, start_visibility=(low, high))
         if contact_penalty is not None:
             task = replace(task, contact_penalty=float(contact_penalty))
-        self._sensor_noise = SensorNoise.parse(sensor_noise)
         choice = PlantChoice.parse(plant, task.plant)
         self._episodes: tuple[Episode, ...] | None = None
         if episodes is not None:
