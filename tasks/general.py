@@ -52,8 +52,8 @@ class TomatoViewpointGeneralEnv(TomatoEnv):
 
     **Options** beside those of the thesis's tasks:
 
-    - `episodes`: `"validation"` or `"held_out"` takes the episodes of a fixed list, `reset(seed=i)` its i-th (modulo
-      its length).
+    - `episodes`: `"validation"` or `"held_out"` (or `Episode` objects) takes the episodes of a fixed list,
+      `reset(seed=i)` its i-th (modulo its length).
     - `layout`: an `ObservationLayout`, or the parts' names, says what the observation holds.
     - `start_visibility`: range of V_f of the first view.
     - `contact_penalty`: what a move with plant contact costs.
@@ -76,7 +76,7 @@ class TomatoViewpointGeneralEnv(TomatoEnv):
         self,
         *args: Any,
         task: GeneralTaskConfig | None = None,
-        episodes: str | None = None,
+        episodes: str | Sequence[Episode] | None = None,
         layout: ObservationLayout | Sequence[str] | None = None,
         start_visibility: Sequence[float] | None = None,
         contact_penalty: float | None = None,
@@ -95,10 +95,15 @@ class TomatoViewpointGeneralEnv(TomatoEnv):
             task = replace(task, contact_penalty=float(contact_penalty))
         choice = PlantChoice.parse(plant, task.plant)
         self._episodes: tuple[Episode, ...] | None = None
-        if episodes is not None:
+        if isinstance(episodes, str):
             options.check_choice("episodes", episodes, EPISODE_LISTS)
             self._episodes = load_episodes(episodes)
             choice = replace(choice, seed=episodes, pool=None)
+        elif episodes is not None:
+            self._episodes = tuple(episodes)
+            if not self._episodes or not all(isinstance(e, Episode) for e in self._episodes):
+                raise InvalidInputError("episodes must be the name of a list or one or more Episode objects")
+            choice = replace(choice, seed="train", pool=None)
         if layout is not None and not isinstance(layout, ObservationLayout):
             layout = ObservationLayout(parts=tuple(layout))  # type: ignore[arg-type]
         self.layout: ObservationLayout = layout or ObservationLayout()
@@ -227,6 +232,7 @@ class TomatoViewpointGeneralEnv(TomatoEnv):
         """Forgets what was seen in some environments and takes a first look at their targets."""
         self._observer.begin(env_idx, self._known_target_position()[env_idx])
         self._view_count[env_idx] = 0
+        self._views[env_idx] = 0.0
         mask = torch.zeros(self.num_envs, dtype=torch.bool, device=self.device)
         mask[env_idx] = True
         self._look(self.agent.robot.get_qpos(), mask)

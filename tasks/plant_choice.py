@@ -141,8 +141,8 @@ class PlantChoice:
 
 def _is_density(value: object) -> bool:
     bounds = value if isinstance(value, tuple) else (value, value)
-    numbers = all(isinstance(v, int | float) and math.isfinite(v) and v >= 0.0 for v in bounds)
-    return numbers and len(bounds) == 2 and bounds[0] <= bounds[1]
+    numbers = [float(v) for v in bounds if isinstance(v, int | float) and math.isfinite(v) and v >= 0.0]
+    return len(bounds) == len(numbers) == 2 and numbers[0] <= numbers[1]
 
 
 @dataclass(frozen=True, kw_only=True)

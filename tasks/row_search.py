@@ -37,9 +37,7 @@ class TomatoViewpointRowEnv(TomatoViewpointGeneralEnv):
 
     def __init__(self, *args: Any, episodes: None = None, **kwargs: Any) -> None:
         if episodes is not None:
-            raise InvalidInputError(
-                "TomatoViewpointRow-v1 has no episode lists; choose plants with plant={'seed': ...}"
-            )
+            raise InvalidInputError("TomatoViewpointRow-v1 has no episode lists; choose plants with plant=")
         super().__init__(*args, **kwargs)
 
     def _make_tools(self) -> None:

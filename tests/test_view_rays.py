@@ -13,13 +13,14 @@ from torch.testing import assert_close
 from maniskill_tomato.errors import InvalidInputError
 from maniskill_tomato.plants.generator import generate_plant
 from maniskill_tomato.plants.organs import Fruit, MeshPart, Organ, Plant, SemanticClass
-from maniskill_tomato.robot.d435 import CameraIntrinsics, color_intrinsics, depth_intrinsics, depth_noise_std
+from maniskill_tomato.robot.d435 import CameraIntrinsics, color_intrinsics, depth_noise_std
 from maniskill_tomato.robot.description import link_meshes
 from maniskill_tomato.robot.iiwa14 import LINK_NAMES
 from maniskill_tomato.robot.look_at import look_at_pose, look_frame
 from maniskill_tomato.visibility.cast_views import CastViews
 from maniskill_tomato.visibility.caster import VisibilityCaster
 from maniskill_tomato.visibility.view_rays import (
+    DEPTH_MODE,
     NEAREST_DEPTH,
     PATTERN_HALF_WIDTH,
     RANGE,
@@ -369,7 +370,7 @@ def test_disturbed_rays_err_as_often_and_as_far_as_asked() -> None:
     hit = label >= RayLabel.TARGET
     assert_close(noisy.distance[~hit], rays.distance[~hit])
     # The noise of the depth 0.8 * 0.8 m, along the ray.
-    wanted = 2.0 * float(depth_noise_std(0.64, depth_intrinsics())) / 0.8
+    wanted = 2.0 * float(depth_noise_std(0.64, DEPTH_MODE)) / 0.8
     error = noisy.distance[hit] - 0.8
     assert float(error.std()) == pytest.approx(wanted, rel=0.02)
     assert float(error.mean()) == pytest.approx(0.0, abs=wanted / 50)

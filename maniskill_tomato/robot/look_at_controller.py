@@ -22,8 +22,6 @@ class LookAtController(ViewpointController):
     A task sets `target_position` before every action.
     """
 
-    config: "LookAtControllerConfig"
-
     target_position: Tensor | None
     """What the camera looks at, base frame, in [m]. Shape (num_envs, 3)."""
 

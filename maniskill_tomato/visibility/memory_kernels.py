@@ -13,7 +13,7 @@ import warp as wp
 from maniskill_tomato.visibility.kernels import rotation, translation
 from maniskill_tomato.visibility.view_ray_kernels import OTHER, OUTSIDE, look_axes
 
-wp.set_module_options({"enable_backward": False})
+wp.set_module_options({"enable_backward": False, "max_unroll": 4})
 
 CELLS = wp.constant(32)
 """Voxels along each edge of the grid."""
@@ -23,10 +23,17 @@ PASS_UNIT = wp.constant(256.0)
 """Passed lengths are kept as integers of this many to a voxel edge: their sum does not depend on the order."""
 KNOWN_LENGTH = wp.constant(64)
 """A voxel without a hit through which less than this has passed (a quarter of its edge) is unknown."""
+BLOCK = wp.constant(4)
+"""Voxels along each edge of the largest block whose density stands in for what is not seen of it."""
+BLOCKS = wp.constant(512)
+"""Number of such blocks."""
 DISC_RAYS = wp.constant(8)
 """Rays from the target's disc towards a candidate."""
 MAX_VISITS = wp.constant(64)
 """Camera positions that are remembered; later ones replace the first."""
+
+
+vec8 = wp.types.vector(length=8, dtype=wp.float32)
 
 
 @wp.struct
@@ -37,6 +44,8 @@ class Grid:
     """Rays that ended at something other than the target, by voxel. Shape (B, 32768)."""
     passes: wp.array2d[wp.int32]
     """Length that rays went through the voxel, in `PASS_UNIT`. Shape (B, 32768)."""
+    densities: wp.array2d[wp.float32]
+    """Estimated hits per voxel edge, less than 0 (its negative) where the voxel is unknown. Shape (B, 32768)."""
     centres: wp.array[wp.vec3]
     """The target, in the world frame, in [m]. Shape (B,)."""
     visited: wp.array2d[wp.vec3]
@@ -51,8 +60,10 @@ class Foliage:
 
     density: wp.float32
     """Expected hits per voxel edge in an unknown voxel."""
-    weight: wp.float32
-    """Length after which observations outweigh that expectation, in voxel edges."""
+    voxel_weight: wp.float32
+    """Length after which a voxel's own observations outweigh its surroundings, in voxel edges."""
+    block_weight: wp.float32
+    """The same for blocks of 2 and 4 voxels along each edge."""
     radius: wp.float32
     """Radius of the target's disc, in [m]."""
 
@@ -189,6 +200,59 @@ def integrate(
 
 
 @wp.func
+def posterior(hits: float, passes: float, expected: float, weight: float) -> float:
+    """Hits per length: the mean of a gamma posterior with a given prior mean."""
+    return (hits + weight * expected) / (passes / PASS_UNIT + weight)
+
+
+@wp.func
+def first_voxel(block: int) -> int:
+    side = CELLS // BLOCK
+    x = block // (side * side)
+    y = (block // side) % side
+    return BLOCK * ((x * CELLS + y) * CELLS + block % side)
+
+
+@wp.kernel
+def estimate(grid: Grid, foliage: Foliage):
+    """The densities of one block's voxels: leaves are larger than voxels, so that neighbours tell of each other."""
+    env, block = wp.tid()
+    first = first_voxel(block)
+    half = BLOCK // 2
+    hits = vec8()
+    passes = vec8()
+    for i in range(BLOCK):
+        for j in range(BLOCK):
+            row = first + (i * CELLS + j) * CELLS
+            part = (i // half) * 4 + (j // half) * 2
+            for k in range(BLOCK):
+                hits[part + k // half] += float(grid.hits[env, row + k])
+                passes[part + k // half] += float(grid.passes[env, row + k])
+    all_hits = wp.float32(0.0)
+    all_passes = wp.float32(0.0)
+    for part in range(8):
+        all_hits += hits[part]
+        all_passes += passes[part]
+    whole = posterior(all_hits, all_passes, foliage.density, foliage.block_weight)
+    around = vec8()
+    for part in range(8):
+        around[part] = posterior(hits[part], passes[part], whole, foliage.block_weight)
+    for i in range(BLOCK):
+        for j in range(BLOCK):
+            row = first + (i * CELLS + j) * CELLS
+            part = (i // half) * 4 + (j // half) * 2
+            for k in range(BLOCK):
+                density = around[part + k // half]
+                hit = grid.hits[env, row + k]
+                passed = grid.passes[env, row + k]
+                if hit != 0 or passed != 0:
+                    density = posterior(float(hit), float(passed), density, foliage.voxel_weight)
+                if hit == 0 and passed < KNOWN_LENGTH:
+                    density = -density
+                grid.densities[env, row + k] = density
+
+
+@wp.func
 def disc_point(index: int) -> wp.vec2:
     """Points of the unit disc that stand for equal areas (a sunflower, Vogel 1979)."""
     radius = wp.sqrt((float(index) + 0.5) / float(DISC_RAYS))
@@ -219,16 +283,10 @@ def predicted_view(grid: Grid, foliage: Foliage, env: int, position: wp.vec3) ->
             before = walk.travelled
             walk = next_voxel(walk, direction, inverse_direction)
             stretch = wp.min(walk.travelled, length) - before
-            hits = grid.hits[env, voxel]
-            passes = grid.passes[env, voxel]
-            density = foliage.density
-            if hits != 0 or passes != 0:
-                density = (float(hits) + foliage.weight * foliage.density) / (
-                    float(passes) / PASS_UNIT + foliage.weight
-                )
-            depth += density * stretch
+            density = grid.densities[env, voxel]
+            depth += wp.abs(density) * stretch
             whole += stretch
-            if hits == 0 and passes < KNOWN_LENGTH:
+            if density < 0.0:
                 unknown += stretch
         seen += wp.exp(-depth)
     return wp.vec2(seen / float(DISC_RAYS), unknown / wp.max(whole, 1.0e-6))

@@ -133,6 +133,7 @@ class ViewpointObserver:
         self.max_moves = max_moves
         self.memory = memory or OcclusionMemory(num_envs, self.device)
         self.lattice = ViewLattice(self.device)
+        self._needs_memory = bool({"map", "near_map"} & set(self.layout.parts))
         self._situation: Situation | None = None
         self._allocate()
 
@@ -202,6 +203,8 @@ class ViewpointObserver:
         self._directions.copy_(rays.direction_c)
         self._distances.copy_(rays.distance)
         self._labels.copy_(rays.label)
+        if self._needs_memory:
+            self.memory.estimate()
         self._launch()
         observation = self._observation.clone()
         self._situation = Situation(

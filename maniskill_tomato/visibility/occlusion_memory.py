@@ -3,7 +3,8 @@
 The foliage in a voxel is taken for many small leaves at random places, as when leaf area density is estimated from
 laser scans: hits divided by the length that rays went through the voxel estimate its density lambda, the expected
 hits per length (Beland et al., Agricultural and Forest Meteorology 151, 2011), and a ray of length s through it stays
-free with the probability exp(-lambda s). A gamma prior stands for what is assumed before anything is seen.
+free with the probability exp(-lambda s). Leaves are larger than voxels, so the estimate of a voxel begins from that of
+the 4 cm around it, and that from the 8 cm around those: each time the mean of a gamma posterior.
 """
 
 import math
@@ -42,7 +43,8 @@ class OcclusionMemory:
         num_envs: int,
         device: str | torch.device = "cpu",
         unknown_probability: float = 0.01,
-        prior_length: float = 0.2,
+        voxel_weight: float = 0.5,
+        block_weight: float = 1.0,
     ) -> None:
         """Begins with nothing known and all targets at the origin.
 
@@ -50,7 +52,9 @@ class OcclusionMemory:
             num_envs: Number of environments B.
             device: Where it lives.
             unknown_probability: That something stands on a 2 cm long way through an unknown voxel.
-            prior_length: How much observed way, in voxel edges, counts as much as that assumption.
+            voxel_weight: How much way observed in a voxel, in voxel edges, counts as much as its surroundings.
+            block_weight: The same for the 4 cm around a voxel against the 8 cm around it, and those against the
+                assumption.
 
         Raises:
             InvalidInputError: A number is out of range.
@@ -59,29 +63,37 @@ class OcclusionMemory:
             raise InvalidInputError(f"num_envs must be at least 1, got {num_envs}")
         if not 0.0 <= unknown_probability < 1.0:
             raise InvalidInputError(f"unknown_probability must lie in [0, 1), got {unknown_probability}")
-        if not 0.0 < prior_length < math.inf:
-            raise InvalidInputError(f"prior_length must be a positive number, got {prior_length}")
+        for name, weight in (("voxel_weight", voxel_weight), ("block_weight", block_weight)):
+            if not 0.0 < weight < math.inf:
+                raise InvalidInputError(f"{name} must be a positive number, got {weight}")
         start_warp()
         self.num_envs = num_envs
         self.device = torch.device(device)
         voxels = GRID_CELLS**3
         self._hits = torch.zeros(num_envs, voxels, dtype=torch.int32, device=self.device)
         self._passes = torch.zeros(num_envs, voxels, dtype=torch.int32, device=self.device)
+        self._densities = torch.zeros(num_envs, voxels, device=self.device)
+        self._is_estimated = False
         self._centres = torch.zeros(num_envs, 3, device=self.device)
         self._visited = torch.full((num_envs, MAX_VISITS, 3), math.nan, device=self.device)
         self._visits = torch.zeros(num_envs, dtype=torch.int32, device=self.device)
         grid: Any = memory_kernels.Grid()
         grid.hits = wp.from_torch(self._hits)
         grid.passes = wp.from_torch(self._passes)
+        grid.densities = wp.from_torch(self._densities)
         grid.centres = wp.from_torch(self._centres, dtype=wp.vec3)
         grid.visited = wp.from_torch(self._visited, dtype=wp.vec3)
         grid.visits = wp.from_torch(self._visits)
         foliage: Any = memory_kernels.Foliage()
         foliage.density = -math.log1p(-unknown_probability)
-        foliage.weight = prior_length
+        foliage.voxel_weight = voxel_weight
+        foliage.block_weight = block_weight
         foliage.radius = TARGET_RADIUS
         self.grid, self.foliage = grid, foliage
         """The same as the kernels see it."""
+        self._estimate = RecordedLaunch(
+            memory_kernels.estimate, (num_envs, int(memory_kernels.BLOCKS)), self.device, [grid, foliage]
+        )
         self._integrations: dict[int, _Integration] = {}
         self._predictions: dict[int, _Prediction] = {}
 
@@ -123,6 +135,7 @@ class OcclusionMemory:
                 f"target_position must have shape ({env_idx.shape[0]}, 3), a row per environment; "
                 f"got {tuple(target_position.shape)}"
             )
+        self._is_estimated = False
         self._hits[env_idx] = 0
         self._passes[env_idx] = 0
         self._visited[env_idx] = math.nan
@@ -156,6 +169,7 @@ class OcclusionMemory:
         if integration is None:
             integration = self._integrations[count] = _Integration(self, count)
         integration.run(T_world_camera, rays, mask)
+        self._is_estimated = False
 
     def predict(self, camera_positions: Tensor) -> Tensor:
         """What cameras elsewhere that look at the target would see of it, by what is known.
@@ -182,7 +196,14 @@ class OcclusionMemory:
             if len(self._predictions) >= _LARGEST_PREDICTION_KEPT:
                 self._predictions.clear()
             prediction = self._predictions[shape[1]] = _Prediction(self, shape[1])
+        self.estimate()
         return prediction.run(camera_positions)
+
+    def estimate(self) -> None:
+        """Brings the densities that predictions rest on up to date, if anything has changed."""
+        if not self._is_estimated:
+            self._estimate()
+            self._is_estimated = True
 
     def state(self) -> dict[str, Tensor]:
         """All that is remembered, for `load_state`; copies, each with B rows."""
@@ -205,6 +226,7 @@ class OcclusionMemory:
             if name not in state or tuple(state[name].shape) != wanted:
                 found = tuple(state[name].shape) if name in state else "nothing"
                 raise InvalidInputError(f"state[{name!r}] must have shape {wanted}, got {found}")
+        self._is_estimated = False
         for name, tensor in own.items():
             tensor[slice(None) if env_idx is None else env_idx] = state[name].to(tensor)
 

@@ -68,6 +68,12 @@ class ViewLattice:
         self.neighbours = self._neighbours()
         """One step down and up in azimuth, elevation and distance; -1 where the lattice ends. Shape (K, 6)."""
         self._inverse_kinematics = InverseKinematics(self.device)
+        turns = torch.eye(4, dtype=torch.float64, device=self.device).repeat(len(CAMERA_ROLLS), 1, 1)
+        rolls = torch.tensor(CAMERA_ROLLS, dtype=torch.float64, device=self.device)
+        turns[:, 0, 0] = turns[:, 1, 1] = torch.cos(rolls)
+        turns[:, 1, 0] = torch.sin(rolls)
+        turns[:, 0, 1] = -turns[:, 1, 0]
+        self._rolled_flanges = camera_to_flange(turns).unbind(0)
 
     def positions(self, target_position: Tensor) -> Tensor:
         """The candidates' camera positions round each target, in the world frame, in [m].
@@ -165,8 +171,9 @@ class ViewLattice:
         positions = self.positions(target_position.double()).reshape(-1, 3)
         reached = torch.zeros(len(positions), dtype=torch.bool, device=self.device)
         reference = torch.zeros(len(positions), NUM_JOINTS, dtype=torch.float64, device=self.device)
-        for roll in CAMERA_ROLLS:
-            T_base_flange = camera_to_flange(look_at_pose(positions, targets, roll))
+        upright = look_at_pose(positions, targets)
+        for T_upright_flange in self._rolled_flanges:
+            T_base_flange = upright @ T_upright_flange
             # What is known to be reached is sent out of reach, where the solver takes no time.
             T_base_flange[reached, 0, 3] = _FAR_AWAY
             solution = self._inverse_kinematics.solve(T_base_flange, reference, neighbour=False)
