@@ -414,7 +414,8 @@ def test_the_oracles_way_keeps_to_reachable_stops_and_bends_where_it_must() -> N
             return ((place - torch.tensor([0.3, 0.3, 1.0])).norm(dim=1) < 0.06).float()
 
     def allowed(positions: Tensor, target: Tensor) -> Tensor:
-        return (positions[:, 1] - 0.15).abs() > 0.04
+        free: Tensor = (positions[:, 1] - 0.15).abs() > 0.04
+        return free
 
     start, target = torch.tensor([0.3, 0.0, 1.0]), torch.tensor([1.2, 0.0, 1.0])
     solution = OracleSearch(BehindTheWall(), GOOD, reachable=allowed).solve(start, target)

@@ -2,7 +2,7 @@
 
 import time
 from collections.abc import Callable, Sequence
-from typing import Any, Protocol
+from typing import Any
 
 import gymnasium as gym
 import numpy as np
@@ -12,32 +12,14 @@ from torch import Tensor
 from maniskill_tomato.errors import InvalidInputError
 from maniskill_tomato.evaluation.view_episode import ViewEpisode
 from maniskill_tomato.robot.inverse_kinematics import Reach
+from maniskill_tomato.visibility.situation import ViewpointPolicy
 
 Reset = Callable[[gym.Env[Any, Any], int], Any]
 """Starts the episode with a number."""
 
 
-class ViewpointPolicy(Protocol):
-    """What chooses the moves; see `visibility.situation`."""
-
-    name: str
-
-    def begin(self, situation: Any, env_idx: Tensor) -> None:
-        """Forgets the last episode of some environments."""
-        ...
-
-    def act(self, situation: Any) -> Tensor:
-        """Moves of shape (B, 3)."""
-        ...
-
-
-def reset_to_episode(env: gym.Env[Any, Any], episode: int) -> Any:
-    """Starts episode `episode` of the environment's list, with the seed of the same number."""
-    return env.reset(seed=episode, options={"episode": episode})
-
-
 def reset_to_seed(env: gym.Env[Any, Any], episode: int) -> Any:
-    """Starts the episode that belongs to a seed."""
+    """Starts the episode of a seed, which is the one of that number where the environment has a list."""
     return env.reset(seed=episode)
 
 

@@ -1,7 +1,7 @@
 """What every planner offers, and what a planner that knows the truth may ask."""
 
 from abc import ABC, abstractmethod
-from typing import ClassVar, Protocol
+from typing import Protocol
 
 import torch
 from torch import Tensor
@@ -28,9 +28,9 @@ class GroundTruth(Protocol):
 class Planner(ABC):
     """A `ViewpointPolicy` for environments that may start their episodes at different times."""
 
-    name: ClassVar[str]
+    name: str
     """As in `registry.PLANNERS`."""
-    needs_truth: ClassVar[bool] = False
+    needs_truth: bool = False
     """Whether it knows what no camera could tell it."""
 
     def reseed(self, seed: int) -> None:  # noqa: B027

@@ -56,8 +56,9 @@ def record_demonstrations(
     if path.exists():
         raise InvalidInputError(f"{path} exists; choose another folder, or delete it")
     folder.mkdir(parents=True, exist_ok=True)
+    task: Any = env
     recorder = RecordEpisode(
-        env,
+        task,
         output_dir=str(folder),
         save_video=False,
         save_on_reset=False,

@@ -28,8 +28,8 @@ from maniskill_tomato.visibility.situation import Situation
 class NextBestViewConfig:
     """What a view is worth."""
 
-    move_cost: float = 0.05
-    """Expected V_f that one move of the way is worth."""
+    move_cost: float = 0.1
+    """Expected V_f that one move of the way is worth; tuned on validation plants (`docs/planners.md`)."""
     unknown_gain: float = 0.0
     """Worth of a way from target to view that is wholly unknown."""
     similar_angle: float = math.radians(8.0)
@@ -169,6 +169,10 @@ class NextBestDirection(NextBestView):
     """Chooses the direction and keeps the distance: greedy on the view sphere."""
 
     name = "nbv_direction"
+
+    def __init__(self, device: str | torch.device = "cpu", config: NextBestViewConfig | None = None) -> None:
+        """Begins with its own tuned cost of a move, 0.05."""
+        super().__init__(device, config or NextBestViewConfig(move_cost=0.05))
 
     def _candidates(self, situation: Situation) -> Tensor:
         offsets = super()._candidates(situation) - situation.target_position[:, None]
