@@ -5,7 +5,7 @@ Usage:
     python scripts/reproduce.py sparse --seeds 0 1 2 3 4 --out runs/thesis
     python scripts/reproduce.py guided --variant small-actions
     python scripts/reproduce.py guided --ablate
-    python scripts/reproduce.py guided --ablate --variant exact tau-0.01
+    python scripts/reproduce.py guided --ablate --variant exact tau-0.01 tau-0.01+gamma-0.9 td3-without-gamma-0.9
 """
 
 import json
@@ -51,7 +51,8 @@ class Args:
     out: Path = Path("runs/thesis")
     """Folder of the results; each experiment and variant gets one in it."""
     variant: tuple[str, ...] = ()
-    """Names of variants; by default the exact settings alone, or all of them with --ablate."""
+    """Names of variants; by default the exact settings alone, or all of them with --ablate. A+B makes two changes, and
+    td3-without-A+B puts two parts of the preset td3 back to the exact settings."""
     ablate: bool = False
     """Judge each variant at the training pose only, draw nothing, and write the table ablation.md."""
     episodes: int = 100

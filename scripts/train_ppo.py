@@ -1,7 +1,8 @@
 """Trains PPO (Stable-Baselines3) on a task as the on-policy comparison and evaluates it like every other policy.
 
 Actions, observations and reward are those of the `td3` preset, so that only the algorithm differs. Every seed gets a
-run folder with config.json, episodes.csv, history.npz, tensorboard/, ppo.pt and eval/metrics.json.
+run folder with config.json, episodes.csv, history.npz, tensorboard/, ppo.pt, eval/metrics.json, and the policy as
+policy.onnx and policy.json, which `maniskill-tomato eval` takes.
 
 Examples:
     python scripts/train_ppo.py TomatoViewpointGuided-v1 --seeds 0 1 2 --out runs/ppo-guided
@@ -24,7 +25,7 @@ import tyro
 from stable_baselines3 import PPO
 from stable_baselines3.common.logger import Logger
 from stable_baselines3.common.policies import ActorCriticPolicy
-from torch import Tensor
+from torch import Tensor, nn
 from torch.utils.tensorboard import SummaryWriter
 from tqdm import tqdm
 
@@ -35,12 +36,14 @@ from maniskill_tomato.evaluation.metrics import make_metrics, write_metrics
 from maniskill_tomato.evaluation.rollout import run_episodes
 from maniskill_tomato.learning.checkpoint import save_checkpoint, write_atomically
 from maniskill_tomato.learning.envs import make_env
+from maniskill_tomato.learning.export import DenseActor, export_actor
 from maniskill_tomato.learning.gymnasium_env import Array, make_gymnasium_env, normalize_observation
 from maniskill_tomato.learning.history import TrainingHistory
 from maniskill_tomato.learning.interrupt import stop_on_signals
-from maniskill_tomato.learning.presets import get_preset
+from maniskill_tomato.learning.networks import ObservationNormalizer
+from maniskill_tomato.learning.presets import OBSERVATION_CENTRE, OBSERVATION_HALF_RANGE, get_preset
 from maniskill_tomato.learning.run_folder import check_run_dir
-from maniskill_tomato.tasks import TASK_IDS
+from maniskill_tomato.tasks import THESIS_IDS
 
 SPS_EVERY = 100
 """Environment steps between two points of charts/SPS."""
@@ -195,7 +198,33 @@ def train(env_id: str, config: PPOConfig, run_dir: Path, seed: int, progress: bo
         run_dir / "ppo.pt", {**content, "counters": counters, "policy": model.policy.state_dict()}
     )
     env.close()
-    return PPOPolicy(model.policy, config.action_scale) if stop.reason is None else None
+    policy = PPOPolicy(model.policy, config.action_scale)
+    export_actor(dense_actor(model.policy, policy, content, counters), run_dir / "policy.onnx")
+    return policy if stop.reason is None else None
+
+
+def dense_actor(
+    policy: ActorCriticPolicy, acting: PPOPolicy, run: dict[str, Any], counters: dict[str, Any]
+) -> DenseActor:
+    """The parts of a policy for its export; `run` is the content of config.json."""
+    layers = [layer for layer in policy.mlp_extractor.policy_net if isinstance(layer, nn.Linear)]
+    return DenseActor(
+        act=acting.act,
+        normalizer=ObservationNormalizer(OBSERVATION_CENTRE, OBSERVATION_HALF_RANGE),
+        normalizer_kind="fixed",
+        layers=[*layers, policy.action_net],
+        activation="Tanh",
+        output="Clip",
+        action_scale=torch.tensor(run["config"]["action_scale"]),
+        action_low=-torch.ones(6),
+        action_high=torch.ones(6),
+        env_id=run["env_id"],
+        env_options={},
+        package_version=run["package_version"],
+        algorithm="PPO",
+        counters=counters,
+        config=run["config"],
+    )
 
 
 def evaluate(env_id: str, policy: PPOPolicy, run_dir: Path, episodes: int, seed: int, progress: bool) -> None:
@@ -236,7 +265,7 @@ class Args:
     """Train PPO with one or more seeds, one after the other, and evaluate each."""
 
     env_id: Annotated[
-        str, tyro.conf.Positional, tyro.conf.arg(metavar="ENV_ID", help=f"One of {', '.join(TASK_IDS)}.")
+        str, tyro.conf.Positional, tyro.conf.arg(metavar="ENV_ID", help=f"One of {', '.join(THESIS_IDS)}.")
     ]
     """Id of the task."""
     out: Path

@@ -67,6 +67,12 @@ def check_rays_per_side(rays_per_side: int) -> None:
         raise InvalidInputError(f"rays_per_side must be an integer from 4 to 256; got {rays_per_side!r}")
 
 
+def check_other_targets(count: object) -> None:
+    """Accepts how many other fruits are judged."""
+    if isinstance(count, bool) or not isinstance(count, int) or count < 0:
+        raise InvalidInputError(f"other_targets must be an integer of 0 or more, got {count!r}")
+
+
 def check_half_ranges(name: str, values: Sequence[float], size: int) -> tuple[float, ...]:
     """`values` as `size` finite numbers of 0 or more."""
     try:

@@ -10,8 +10,9 @@ from torch import Tensor
 from maniskill_tomato.robot.inverse_kinematics import Reach
 from maniskill_tomato.robot.kinematics import link_transforms
 from maniskill_tomato.robot.viewpoint_controller import ViewpointController
-from maniskill_tomato.tasks import MAX_EPISODE_STEPS
+from maniskill_tomato.tasks import MAX_EPISODE_STEPS, options
 from maniskill_tomato.tasks.config import ViewpointTaskConfig, guided_task, sparse_task
+from maniskill_tomato.tasks.other_targets import other_ripe_fruits
 from maniskill_tomato.tasks.planting import ripe_fruit_at_random
 from maniskill_tomato.tasks.rewards import in_forbidden_zone
 from maniskill_tomato.tasks.starts import Starts
@@ -29,6 +30,7 @@ class TomatoViewpointEnv(TomatoEnv):
     - `plant_pose_noise`: half ranges of a uniform addition to it at every reset, in [m, m, rad].
     - `motion`: `"kinematic"` puts the joints at the solution, `"dynamic"` drives them there through physics.
     - `rays_per_side`: the visibility query casts this number squared.
+    - `other_targets`: how many other ripe fruits are judged at every step as if each were the target (below).
     - `render_backend`: `"auto"` renders on the GPU if there is one, else on the CPU, and not at all where no
       picture is asked for.
 
@@ -40,12 +42,17 @@ class TomatoViewpointEnv(TomatoEnv):
     **Action** (`pd_viewpoint`, 6 numbers in [-1, 1]): increments of the first six, 1 meaning 1 m or 1 rad.
     **Info**, each of shape (num_envs,): `success`, `fail`, `visible_fraction`, `target_id` (segmentation id),
     `target_seen`, `tomato_seen`, `reachability` (`Reach`), `in_forbidden_zone`, `reward_visual`,
-    `reward_penalty`.
+    `reward_penalty`. With `other_targets` K also what another target in the same place would have given, for the K
+    ripe fruits that follow the target in the plant's order: `other_visible_fraction`, `other_success`,
+    `other_reward`, `other_exists` (the plant has that many), each of shape (num_envs, K), and `other_position` in
+    the world frame, in [m], of shape (num_envs, K, 3).
     """
 
     task: ViewpointTaskConfig
 
-    def __init__(self, *args: Any, task: ViewpointTaskConfig, **kwargs: Any) -> None:
+    def __init__(self, *args: Any, task: ViewpointTaskConfig, other_targets: int = 0, **kwargs: Any) -> None:
+        options.check_other_targets(other_targets)
+        self._other_targets = other_targets
         super().__init__(*args, task=task, **kwargs)
 
     def _load_agent(self, options: dict[str, Any], *args: Any, **kwargs: Any) -> None:
@@ -78,12 +85,27 @@ class TomatoViewpointEnv(TomatoEnv):
             viewpoint, qpos = self._starts.draw(rngs)
         self._set_arm(env_idx, viewpoint, qpos)
 
+    def _look_up_target(self) -> None:
+        super()._look_up_target()
+        if self._other_targets:
+            self._others, self._others_exist = other_ripe_fruits(
+                self.planting, self._target, self._other_targets
+            )
+
     def evaluate(self) -> dict[str, Tensor]:
         """What the camera sees from where it is: V_f, whether that is a success, and the terms of the
         reward."""
         T_w_links = link_transforms(self.agent.robot.get_qpos())
+        info = self._judge(self._target, T_w_links)
+        info["target_id"] = self._target_id.clone()
+        if self._other_targets:
+            info |= self._judge_others(T_w_links)
+        return info
+
+    def _judge(self, target: Tensor, T_w_links: Tensor) -> dict[str, Tensor]:
+        """The present view as one of `target`, indices in `Plant.fruits`. Shape (num_envs,)."""
         seen = self._caster.cast(
-            T_w_links[:, -1] @ self._T_ee_camera, self._target, self.planting.T_world_plant, T_w_links
+            T_w_links[:, -1] @ self._T_ee_camera, target, self.planting.T_world_plant, T_w_links
         )
         fraction, tomato_seen = seen.visible_fraction, seen.any_visible
         target_seen = fraction > 0.0
@@ -94,13 +116,25 @@ class TomatoViewpointEnv(TomatoEnv):
             "success": (fraction > self.task.full_visibility) & ~fail,
             "fail": fail,
             "visible_fraction": fraction,
-            "target_id": self._target_id.clone(),
             "target_seen": target_seen,
             "tomato_seen": tomato_seen,
             "reachability": self._reach.clone(),
             "in_forbidden_zone": forbidden,
             "reward_visual": self.task.visual_reward(fraction, target_seen, tomato_seen, self._reach),
             "reward_penalty": self.task.pose_penalty(self._reach, forbidden),
+        }
+
+    def _judge_others(self, T_w_links: Tensor) -> dict[str, Tensor]:
+        """The present view as one of each of the other ripe fruits."""
+        fruits = self._others.unbind(-1)
+        judged = [self._judge(fruit, T_w_links) for fruit in fruits]
+        rewards: list[Tensor] = [self.get_reward(obs=None, action=torch.empty(0), info=j) for j in judged]
+        return {
+            "other_visible_fraction": torch.stack([j["visible_fraction"] for j in judged], dim=-1),
+            "other_success": torch.stack([j["success"] for j in judged], dim=-1),
+            "other_reward": torch.stack(rewards, dim=-1),
+            "other_exists": self._others_exist.clone(),
+            "other_position": torch.stack([self.planting.fruit_position_w(f) for f in fruits], dim=-2),
         }
 
     def compute_dense_reward(self, obs: Any, action: Tensor, info: dict[str, Tensor]) -> Tensor:

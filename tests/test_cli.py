@@ -19,10 +19,10 @@ from maniskill_tomato.learning.agent import make_agent
 from maniskill_tomato.learning.checkpoint import load_checkpoint, make_checkpoint, save_checkpoint
 from maniskill_tomato.learning.policy import load_policy
 from maniskill_tomato.learning.presets import get_preset
-from maniskill_tomato.tasks import TASK_IDS
+from maniskill_tomato.tasks import THESIS_IDS
 
 ROOT = Path(__file__).resolve().parent.parent
-GUIDED, SPARSE = TASK_IDS
+GUIDED, SPARSE = THESIS_IDS
 SHORT = (
     "--total-timesteps",
     "100",
@@ -76,7 +76,28 @@ def test_help_is_quick_and_loads_neither_torch_nor_the_simulator() -> None:
     assert all(word in result.stdout for word in ("train", "eval", "demo", "export"))
 
 
-@pytest.mark.parametrize("env_id", TASK_IDS)
+@pytest.mark.parametrize(
+    "options",
+    [
+        ("--hindsight-targets", "2", "--n-step", "3", "--aux-visibility-weight", "0.1"),
+        ("--success-threshold-start", "0.3", "--normalize-observations", "running"),
+        ("--preset", "fast-td3", "--num-envs", "1", "--updates-per-step", "0.2", "--batch-size", "16"),
+    ],
+    ids=["hindsight", "threshold", "fast-td3"],
+)
+def test_options_of_the_learner_are_flags(tmp_path: Path, options: tuple[str, ...]) -> None:
+    main(["train", THESIS_IDS[1], "--out", str(tmp_path / "run"), *SHORT, *options])
+    config = json.loads((tmp_path / "run" / "config.json").read_text())
+    for flag, value in zip(options[::2], options[1::2], strict=True):
+        if flag != "--preset":
+            assert str(config["config"][flag.removeprefix("--").replace("-", "_")]) == value
+    assert config["env_options"] == {}
+    main(["train", "--resume", str(tmp_path / "run"), "--total-timesteps", "120"])
+    policy = load_policy(tmp_path / "run" / "policy.pt")
+    assert policy.counters["steps"] == 120 and policy.counters["updates"] > 0
+
+
+@pytest.mark.parametrize("env_id", THESIS_IDS)
 def test_training_a_hundred_steps_writes_a_run(
     tmp_path: Path, env_id: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -190,6 +211,22 @@ def test_evaluation_writes_metrics_that_follow_from_its_trajectories(
     assert again["per_episode"] == metrics["per_episode"]
 
 
+def test_a_run_on_another_plant_leaves_policies_that_say_so(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    plant = ("--plant", "three_tomatoes", "--plant-seed", "4", "--plant-pose", "0.8", "0.1", "0.5")
+    main(["train", GUIDED, "--out", str(tmp_path), *plant, *SHORT])
+    options = {"plant": {"preset": "three_tomatoes", "seed": 4}, "plant_pose": [0.8, 0.1, 0.5]}
+    (newest, *_) = sorted((tmp_path / "checkpoints").iterdir(), reverse=True)
+    for path in (tmp_path / "policy.pt", newest):
+        assert load_policy(path).env_options == options
+    capsys.readouterr()
+    short = ("--episodes", "1", "--no-video", "--no-baseline", "--out", str(tmp_path / "eval"))
+    main(["eval", GUIDED, "--policy", str(tmp_path / "policy.pt"), *short])
+    assert f"policy  TD3, trained on {GUIDED} with plant={{" in capsys.readouterr().out
+    assert json.loads((tmp_path / "eval/metrics.json").read_text())["policy"]["trained_with"] == options
+
+
 def test_the_demo_names_its_report_and_its_policy(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     for _ in range(2):  # A second demo replaces the first.
         main(["demo", "--out", str(tmp_path), "--minutes", "0.05", "--episodes", "2", "--no-video"])
@@ -244,7 +281,7 @@ def test_a_policy_that_is_missing_damaged_or_of_another_task_is_an_error(
     assert "random_actions" not in json.loads((tmp_path / "out/metrics.json").read_text())
 
 
-@pytest.mark.parametrize("env_id", TASK_IDS)
+@pytest.mark.parametrize("env_id", THESIS_IDS)
 def test_the_shipped_policy_solves_its_task(tmp_path: Path, env_id: str) -> None:
     main(["eval", env_id, "--episodes", "50", "--out", str(tmp_path), "--no-video", "--no-baseline"])
     metrics = json.loads((tmp_path / "metrics.json").read_text())

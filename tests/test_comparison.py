@@ -12,8 +12,10 @@ from typing import Any
 import numpy as np
 import pytest
 import scipy.stats
+import torch
 from torch.utils.tensorboard import SummaryWriter
 
+from maniskill_tomato.cli import main
 from maniskill_tomato.errors import InvalidInputError
 from maniskill_tomato.evaluation.comparison import (
     Group,
@@ -27,11 +29,15 @@ from maniskill_tomato.evaluation.comparison import (
     training_curve,
 )
 from maniskill_tomato.evaluation.comparison_report import make_rows, markdown_table, write_comparison
+from maniskill_tomato.evaluation.evaluate import evaluate_run
+from maniskill_tomato.learning.agent import make_agent
+from maniskill_tomato.learning.checkpoint import make_checkpoint, save_checkpoint
+from maniskill_tomato.learning.envs import make_env
 from maniskill_tomato.learning.presets import get_preset
-from maniskill_tomato.tasks import TASK_IDS
+from maniskill_tomato.tasks import THESIS_IDS
 
 ROOT = Path(__file__).resolve().parent.parent
-GUIDED, SPARSE = TASK_IDS
+GUIDED, SPARSE = THESIS_IDS
 TD3 = get_preset("td3").to_dict()
 HEADER = "episode,end_step,steps,success\n"
 
@@ -293,7 +299,39 @@ def test_the_script_compares_and_refuses_with_one_line(tmp_path: Path) -> None:
     assert "holds no run" in refused.stderr and "Traceback" not in refused.stderr
 
 
-def test_ppo_trains_evaluates_and_can_be_compared(tmp_path: Path) -> None:
+def test_runs_without_an_evaluation_get_one_on_the_plants_of_their_training(tmp_path: Path) -> None:
+    options: dict[str, Any] = {"plant": {"preset": "three_tomatoes", "seed": 4}}
+    new = make_run(tmp_path / "runs" / "new", success=None)
+    config = json.loads((new / "config.json").read_text())
+    (new / "config.json").write_text(json.dumps({**config, "env_options": options}))
+    checkpoint = make_checkpoint(
+        make_agent(get_preset("td3"), 9, 6), GUIDED, (-torch.ones(6), torch.ones(6)), {}, env_options=options
+    )
+    save_checkpoint(new / "policy.pt", checkpoint)
+    kept = make_run(tmp_path / "runs" / "old", success=0.25)
+    arguments = ("--evaluate", "2", "--eval-seed", "7", "--out", str(tmp_path / "out"))
+    done = run_script("scripts/compare_runs.py", str(tmp_path / "runs"), *arguments)
+    assert done.returncode == 0, done.stderr
+    metrics = json.loads((new / "eval" / "metrics.json").read_text())
+    assert (metrics["episodes"], metrics["per_episode"]["seed"]) == (2, [7, 8])
+    assert metrics["policy"]["trained_with"] == options
+    with np.load(new / "eval" / "trajectories.npz") as data:
+        heights = set(np.round(data["target"][:, 2], 3))
+    env = make_env(GUIDED, **options)
+    observations = [env.reset(seed=seed)[0] for seed in (7, 8)]
+    env.close()
+    assert heights == {round(float(o[0, 8]), 3) for o in observations}
+    rates = {
+        r["path"]: r["success_rate"]
+        for r in json.loads((tmp_path / "out/comparison.json").read_text())["runs"]
+    }
+    assert rates[str(kept)] == 0.25 and rates[str(new)] == metrics["success_rate"]
+    (kept / "eval" / "metrics.json").unlink()
+    with pytest.raises(InvalidInputError, match="holds no policy to evaluate"):
+        evaluate_run(load_run(kept), 2, 7)
+
+
+def test_ppo_trains_evaluates_and_can_be_compared(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     arguments = (
         "--no-progress",
         "--episodes",
@@ -313,5 +351,15 @@ def test_ppo_trains_evaluates_and_can_be_compared(tmp_path: Path) -> None:
     (group,) = group_runs([run])
     assert group.label == "PPO"
     assert training_curve(group, "success", wall_time=True) is not None
+    evaluated = tmp_path / "again"
+    exported = str(tmp_path / "seed-3" / "policy.onnx")
+    main(["eval", SPARSE, "--policy", exported, "--episodes", "2", "--out", str(evaluated), "--no-video"])
+    assert f"PPO, ONNX, trained on {SPARSE} with the task's own plant" in capsys.readouterr().out
+    metrics = json.loads((evaluated / "metrics.json").read_text())
+    # The same policy on the same seeds: its actions agree to 1e-5, and so do the views that they lead to.
+    assert metrics["per_episode"]["steps"] == run.metrics["per_episode"]["steps"]
+    largest = metrics["per_episode"]["max_visible_fraction"]
+    np.testing.assert_allclose(largest, run.metrics["per_episode"]["max_visible_fraction"], atol=0.02)
+    assert "Training" in (evaluated / "report.html").read_text()
     again = run_script("scripts/train_ppo.py", SPARSE, "--seeds", "3", "--out", str(tmp_path), *arguments)
     assert again.returncode == 2 and "already holds a run" in again.stderr

@@ -21,7 +21,7 @@ from maniskill_tomato.learning.gymnasium_env import (
     LearnableTask,
     make_gymnasium_env,
 )
-from maniskill_tomato.tasks import TASK_IDS
+from maniskill_tomato.tasks import THESIS_IDS
 
 ROOT = Path(__file__).resolve().parent.parent
 SCALE = (0.35, 0.35, 0.35, 0.6, 0.6, 0.6)
@@ -110,7 +110,7 @@ def test_wrong_options_are_refused() -> None:
         make_gymnasium_env("CartPole-v1")
 
 
-@pytest.mark.parametrize("env_id", TASK_IDS)
+@pytest.mark.parametrize("env_id", THESIS_IDS)
 def test_the_real_tasks_pass_an_outside_check_and_run_out_of_time_without_terminating(
     env_id: str,
 ) -> None:
@@ -190,7 +190,7 @@ def test_stable_baselines_bootstraps_an_episode_that_ran_out_of_time_and_no_othe
         (
             "cleanrl_style.py",
             *("--total-timesteps", "400", "--learning-starts", "256"),
-            *("--vectorization", "async", "--autoreset", "next-step", "--env-id", TASK_IDS[1]),
+            *("--vectorization", "async", "--autoreset", "next-step", "--env-id", THESIS_IDS[1]),
         ),
     ],
     ids=lambda arguments: arguments[0],

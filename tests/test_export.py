@@ -5,6 +5,7 @@ import json
 import subprocess
 import sys
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -14,23 +15,26 @@ import pytest
 import torch
 from numpy.typing import NDArray
 from onnx import helper
+from torch import nn
 
 import maniskill_tomato
 from maniskill_tomato.assets import asset_path
 from maniskill_tomato.cli import main
 from maniskill_tomato.errors import CheckpointError, InvalidInputError, PolicyError
-from maniskill_tomato.evaluation.exported import open_policy
+from maniskill_tomato.evaluation.exported import ExportedPolicy, open_policy, origin
 from maniskill_tomato.evaluation.rollout import run_episodes
 from maniskill_tomato.learning.agent import make_agent
 from maniskill_tomato.learning.checkpoint import make_checkpoint, save_checkpoint
 from maniskill_tomato.learning.envs import make_env
-from maniskill_tomato.learning.export import export_policy
+from maniskill_tomato.learning.export import DenseActor, export_actor, export_policy
+from maniskill_tomato.learning.networks import ObservationNormalizer
 from maniskill_tomato.learning.policy import load_policy
 from maniskill_tomato.learning.presets import PRESETS, TrainConfig, get_preset
+from maniskill_tomato.policy.description import PolicyDescription
 from maniskill_tomato.policy.onnx_policy import OnnxPolicy
-from maniskill_tomato.tasks import TASK_IDS
+from maniskill_tomato.tasks import THESIS_IDS
 
-GUIDED, SPARSE = TASK_IDS
+GUIDED, SPARSE = THESIS_IDS
 CENTRE = np.array([0.2, 0.0, 0.8, 0.0, np.pi / 2, 0.0, 0.7, 0.0, 0.8])
 """A usual observation: the camera looks along x, the target stands in front of it."""
 
@@ -83,7 +87,7 @@ def test_an_export_acts_as_the_policy_does_in_torch(tmp_path: Path, preset: str)
     assert 0.0 <= result.largest_difference <= 1e-5
 
 
-@pytest.mark.parametrize("env_id", TASK_IDS)
+@pytest.mark.parametrize("env_id", THESIS_IDS)
 def test_the_shipped_policies_act_alike_when_exported(tmp_path: Path, env_id: str) -> None:
     source = asset_path(f"policies/{env_id}.pt")
     policy = OnnxPolicy.load(export_policy(source, tmp_path).model, env_id)
@@ -98,7 +102,7 @@ def test_an_export_follows_a_calculation_by_hand(tmp_path: Path) -> None:
         total_timesteps=1,
         actor_hidden=(2,),
         action_scale=(0.1, 0.2, 0.3, 0.4, 0.5, 0.6),
-        normalize_observations=True,
+        normalize_observations="fixed",
     )
     agent = make_agent(config, 9, 6)
     with torch.no_grad():
@@ -119,6 +123,90 @@ def test_an_export_follows_a_calculation_by_hand(tmp_path: Path) -> None:
     (action,) = policy.act(observation[None])
     # tanh(2 * 0.5) * 0.1; dz saturates at 0.3 and dyaw at tanh(1) * 0.6 = 0.457, both above the bound.
     np.testing.assert_allclose(action, [0.1 * np.tanh(1.0), 0.0, 0.25, 0.0, 0.0, 0.25], rtol=0.0, atol=1e-6)
+
+
+def test_a_running_normaliser_is_exported_as_it_was_last(tmp_path: Path) -> None:
+    config = replace(PRESETS["td3"], normalize_observations="running")
+    agent = make_agent(config, 9, 6)
+    seen = torch.randn(500, 9, generator=torch.Generator().manual_seed(0)) * 0.2 + torch.tensor(
+        CENTRE.tolist()
+    )
+    agent.observe(seen)
+    with torch.no_grad():
+        agent.actor.output.weight.mul_(100.0)
+    bounds = (-torch.ones(6), torch.ones(6))
+    save_checkpoint(tmp_path / "p.pt", make_checkpoint(agent, GUIDED, bounds, {}, with_training_state=False))
+    model = export_policy(tmp_path / "p.pt", tmp_path / "out").model
+    content = json.loads(model.with_suffix(".json").read_text())["normalizer"]
+    assert content["kind"] == "running"
+    np.testing.assert_allclose(content["centre"], seen.double().mean(dim=0), rtol=1e-5)
+    np.testing.assert_allclose(content["half_range"], seen.double().std(dim=0, correction=0), rtol=1e-5)
+    wanted = agent.policy(seen).numpy() * np.array(config.action_scale)
+    assert np.abs(wanted).max() > 0.05
+    np.testing.assert_allclose(OnnxPolicy.load(model).act(seen.numpy()), wanted, rtol=0.0, atol=1e-5)
+
+
+def test_a_description_that_does_not_say_where_its_normaliser_comes_from_is_read(exported: Path) -> None:
+    text = exported.with_suffix(".json").read_text()
+    content = json.loads(text)
+    assert PolicyDescription.from_json(text).normalizer_kind == content["normalizer"].pop("kind") == "fixed"
+    assert PolicyDescription.from_json(json.dumps(content)).normalizer_kind == "unknown"
+
+
+def make_foreign_actor(act: Callable[[torch.Tensor], torch.Tensor], weights: list[Any]) -> DenseActor:
+    """A policy of another learner: tanh layers and a clipped output."""
+    layers = []
+    for weight, bias in weights:
+        layers.append(nn.Linear(weight.shape[1], weight.shape[0]))
+        layers[-1].weight.data = torch.tensor(weight, dtype=torch.float32)
+        layers[-1].bias.data = torch.tensor(bias, dtype=torch.float32)
+    return DenseActor(
+        act=act,
+        normalizer=ObservationNormalizer([0.5] * 9, [2.0] * 9),
+        normalizer_kind="fixed",
+        layers=layers,
+        activation="Tanh",
+        output="Clip",
+        action_scale=torch.full((6,), 0.4),
+        action_low=torch.full((6,), -0.3),
+        action_high=torch.ones(6),
+        env_id=SPARSE,
+        env_options={"plant": "full"},
+        package_version="9",
+        algorithm="PPO",
+        counters={"steps": 7},
+        config={"n_steps": 500},
+    )
+
+
+def test_policies_of_other_learners_can_be_exported(tmp_path: Path) -> None:
+    rng = np.random.default_rng(5)
+    weights = [
+        (rng.normal(size=(12, 9)), rng.normal(size=12)),
+        (rng.normal(size=(6, 12)), rng.normal(size=6)),
+    ]
+
+    def by_hand(observations: torch.Tensor) -> torch.Tensor:
+        x = (observations.numpy() - 0.5) / 2.0
+        x = np.tanh(x @ weights[0][0].T + weights[0][1])
+        x = np.clip(x @ weights[1][0].T + weights[1][1], -1.0, 1.0)
+        return torch.from_numpy(np.clip(0.4 * x, -0.3, 1.0))
+
+    result = export_actor(make_foreign_actor(by_hand, weights), tmp_path / "out" / "ppo.onnx")
+    policy = OnnxPolicy.load(result.model, SPARSE)
+    observations = rng.normal(size=(200, 9))
+    reference = by_hand(torch.from_numpy(observations)).numpy()
+    assert (np.unique(reference).size > 100) and {-0.3, 0.4} <= set(np.unique(reference))
+    np.testing.assert_allclose(policy.act(observations), reference, rtol=0.0, atol=1e-5)
+    assert policy.description.training == {
+        "algorithm": "PPO",
+        **{"seed": None, "steps": 7, "episodes": None, "updates": None},
+        "config_sha256": hashlib.sha256(b'{"n_steps": 500}').hexdigest(),
+    }
+    other = make_foreign_actor(lambda o: by_hand(o) + 1e-3, weights)
+    with pytest.raises(PolicyError, match="differ by 1"):
+        export_actor(other, tmp_path / "other.onnx")
+    assert not list(tmp_path.glob("other.*"))
 
 
 def test_a_batch_of_any_size_is_answered_row_by_row(exported: Path) -> None:
@@ -167,6 +255,34 @@ def test_the_description_says_what_the_numbers_mean(exported: Path) -> None:
     training = content["training"]
     assert (training["algorithm"], training["seed"], training["steps"]) == ("TD3", 3, 12)
     assert content["onnx"]["sha256"] == hashlib.sha256(exported.read_bytes()).hexdigest()
+
+
+def test_the_description_says_what_plant_the_training_had(tmp_path: Path) -> None:
+    agent = make_agent(get_preset("td3"), 9, 6)
+    bounds = (-torch.ones(6), torch.ones(6))
+    options = {"plant": {"preset": "full"}, "plant_pose": (0.8, 0.1, 0.5)}
+    lines = []
+    for given in (options, {}, None):
+        save_checkpoint(tmp_path / "p.pt", make_checkpoint(agent, GUIDED, bounds, {}, env_options=given))
+        model = export_policy(tmp_path / "p.pt", tmp_path).model
+        kept = None if given is None else json.loads(json.dumps(given))
+        content = json.loads(model.with_suffix(".json").read_text())
+        assert content["task"]["trained_with"] == kept
+        assert content["task"]["default_plant"]["preset"] == "one_tomato"
+        policy = open_policy(model)
+        assert isinstance(policy, ExportedPolicy) and policy.description.trained_with == kept
+        lines.append(origin(policy))
+        assert origin(load_policy(tmp_path / "p.pt")) == lines[-1].replace("TD3, ONNX", "TD3")
+    assert lines == [
+        f'TD3, ONNX, trained on {GUIDED} with plant={{"preset": "full"}}, plant_pose=[0.8, 0.1, 0.5]',
+        f"TD3, ONNX, trained on {GUIDED} with the task's own plant and options",
+        f"TD3, ONNX, trained on {GUIDED} with options that its file does not say",
+    ]
+
+
+def test_a_description_of_an_earlier_version_still_loads(exported: Path) -> None:
+    edit(exported, lambda content: content["task"].pop("trained_with"))
+    assert OnnxPolicy.load(exported).description.trained_with is None
 
 
 def test_the_configuration_hash_tells_configurations_apart(tmp_path: Path) -> None:
@@ -377,8 +493,8 @@ def test_the_command_exports_the_shipped_policies_or_a_given_one(
 ) -> None:
     main(["export", "--out", str(tmp_path / "shipped")])
     written = {path.name for path in (tmp_path / "shipped").iterdir()}
-    assert written == {f"{env_id}.{ending}" for env_id in TASK_IDS for ending in ("onnx", "json")}
-    for env_id in TASK_IDS:
+    assert written == {f"{env_id}.{ending}" for env_id in THESIS_IDS for ending in ("onnx", "json")}
+    for env_id in THESIS_IDS:
         assert OnnxPolicy.load(tmp_path / f"shipped/{env_id}.onnx").description.env_id == env_id
     make_policy(tmp_path / "policy.pt")
     main(["export", "--policy", str(tmp_path / "policy.pt"), "--out", str(tmp_path)])
@@ -403,7 +519,7 @@ def test_the_command_answers_bad_files_in_words(tmp_path: Path, capsys: pytest.C
     assert not (tmp_path / "out").exists()
 
 
-@pytest.mark.parametrize("env_id", TASK_IDS)
+@pytest.mark.parametrize("env_id", THESIS_IDS)
 def test_an_exported_policy_has_the_same_episodes_as_its_source(tmp_path: Path, env_id: str) -> None:
     source = asset_path(f"policies/{env_id}.pt")
     target = export_policy(source, tmp_path).model

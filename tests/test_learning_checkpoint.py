@@ -37,6 +37,17 @@ def test_a_policy_comes_back_as_it_was(tmp_path: Path, preset: str) -> None:
     assert policy.counters == {"steps": 12, "seed": 3}
 
 
+def test_a_policy_knows_the_options_of_its_task(tmp_path: Path) -> None:
+    options = {"plant": {"preset": "full", "seed": "train"}, "plant_pose": (0.8, 0.1, 0.5)}
+    agent = make_agent(get_preset("td3"), 9, 6)
+    for given, kept in ((options, {**options, "plant_pose": [0.8, 0.1, 0.5]}), ({}, {}), (None, None)):
+        save_checkpoint(tmp_path / "p.pt", make_checkpoint(agent, ENV_ID, BOUNDS, {}, env_options=given))
+        assert load_policy(tmp_path / "p.pt").env_options == kept
+    saved(tmp_path / "p.pt", env_options="full")
+    with pytest.raises(CheckpointError, match="env_options is 'full'"):
+        load_policy(tmp_path / "p.pt")
+
+
 def test_a_training_checkpoint_holds_critics_targets_and_optimisers(tmp_path: Path) -> None:
     agent, _ = saved(tmp_path / "p.pt")
     data = load_checkpoint(tmp_path / "p.pt")
@@ -199,11 +210,17 @@ def test_the_thesis_presets_are_tables_5_1_and_5_2() -> None:
         assert config.actor_hidden == config.critic_hidden == (100, 100)
         assert config.action_scale == (1.0,) * 6
         assert (config.twin_critics, config.policy_frequency, config.target_noise) == (False, 1, 0.0)
-        assert (config.reward, config.updates_per_step, config.normalize_observations) == ("task", 1.0, False)
+        assert (config.reward, config.updates_per_step, config.normalize_observations) == (
+            "task",
+            1.0,
+            "none",
+        )
 
 
 def test_an_unknown_preset_lists_the_known_ones() -> None:
-    with pytest.raises(InvalidInputError, match="'td3', 'thesis-guided', 'thesis-sparse'; got 'sac'"):
+    with pytest.raises(
+        InvalidInputError, match="'td3', 'fast-td3', 'thesis-guided', 'thesis-sparse'; got 'sac'"
+    ):
         get_preset("sac")
 
 

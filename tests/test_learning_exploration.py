@@ -1,15 +1,18 @@
 import math
+from dataclasses import replace
 from typing import Any
 
 import pytest
 import torch
 
+from maniskill_tomato.errors import InvalidInputError
 from maniskill_tomato.learning.exploration import (
     DecayingGaussian,
     EpsilonGreedy,
     LookAtGoals,
     decaying_schedule,
     draw_look_at_goals,
+    draw_noise_levels,
     epsilon_greedy_schedule,
     make_exploration,
 )
@@ -206,3 +209,44 @@ def test_goals_lie_on_the_robots_side_within_reach_and_look_at_the_target() -> N
     )
     assert allowed.float().mean() > 0.98  # Sixteen draws are not always enough.
     assert position[:, 1].std() > 0.1 and position[:, 2].std() > 0.1
+
+
+def test_noise_levels_are_uniform_each_environments_own_and_last_for_an_episode() -> None:
+    starts = torch.ones(20_000, dtype=torch.bool)
+    levels = draw_noise_levels(None, starts, 0.1, 0.5, generator())
+    assert levels.shape == (20_000, 1)
+    assert 0.1 <= levels.min() and levels.max() <= 0.5
+    counts = torch.histc(levels, bins=4, min=0.1, max=0.5)
+    assert (counts - 5000).abs().max() < 300  # Five standard deviations.
+    some = torch.arange(20_000) % 2 == 0
+    later = draw_noise_levels(levels, some, 0.1, 0.5, generator(1))
+    assert torch.equal(later[~some], levels[~some])
+    assert (later[some] != levels[some]).float().mean() > 0.99
+
+
+@pytest.mark.parametrize("kind", ["decaying-gaussian", "look-at-goals"])
+def test_every_environment_explores_with_its_own_noise(kind: Any) -> None:
+    """Over one long episode the spread of each environment's actions is its level, and it differs between them."""
+    config = replace(
+        get_preset("td3"),
+        exploration=kind,
+        exploration_noise=0.3,
+        exploration_noise_end=0.02,
+        exploration_noise_per_env=True,
+        exploration_goal_share=0.0,
+        exploration_steps=1,
+        learning_starts=0,
+    )
+    noise = make_exploration(config, generator())
+    policy, seen = torch.zeros(8, 6), SEEN[:1].expand(8, -1)
+    tried = [noise.explore(policy, seen, 10, torch.full((8,), step == 0)) for step in range(400)]
+    spread = torch.stack(tried).std(dim=(0, 2))
+    levels = noise._levels[:, 0]  # type: ignore[attr-defined]
+    torch.testing.assert_close(spread, levels, rtol=0.1, atol=0.0)
+    assert levels.std() > 0.03 and levels.min() >= 0.02 and levels.max() <= 0.3
+    assert noise.amount(10) == pytest.approx(0.16)
+
+
+def test_noise_levels_need_noise() -> None:
+    with pytest.raises(InvalidInputError, match="needs an exploration with noise"):
+        replace(get_preset("thesis-guided"), exploration_noise_per_env=True)

@@ -103,10 +103,18 @@ class Walk:
     def _info(self) -> dict[str, Any]:
         distance = (self._place[:, :3] - self._place[:, 6:]).norm(dim=-1)
         visible = torch.exp(-distance)
+        others = self._place[:, None, 6:] + torch.tensor([[0.3, 0.0, 0.0], [0.0, -0.2, 0.1]])
+        seen = torch.exp(-(self._place[:, None, :3] - others).norm(dim=-1))
         return {
             "visible_fraction": visible,
             "success": visible > 0.8,
+            "fail": torch.zeros(self.num_envs, dtype=torch.bool),
             "reward_penalty": torch.zeros(self.num_envs),
+            "other_visible_fraction": seen,
+            "other_success": seen > 0.8,
+            "other_reward": (seen > 0.8).float() + seen,
+            "other_exists": torch.tensor([True, False]).expand(self.num_envs, 2).clone(),
+            "other_position": others,
         }
 
 
@@ -196,13 +204,34 @@ def unbroken(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return run_dir
 
 
+EVERYTHING: dict[str, Any] = {
+    "n_step": 3,
+    "critic": "categorical",
+    "normalize_observations": "running",
+    "hindsight_targets": 2,
+    "aux_distance_weight": 0.1,
+    "aux_visibility_weight": 0.1,
+    "exploration_noise_per_env": True,
+}
+"""Every option that keeps a state of its own, but the rising threshold, which does not go with n_step."""
+
+
 @pytest.mark.parametrize(
-    ("preset", "num_envs"), [("td3", 1), ("td3", 3), ("thesis-guided", 1), ("thesis-sparse", 2)]
+    ("preset", "num_envs", "options"),
+    [
+        ("td3", 1, {}),
+        ("td3", 3, {}),
+        ("thesis-guided", 1, {}),
+        ("thesis-sparse", 2, {}),
+        ("td3", 2, EVERYTHING),
+        ("td3", 1, {"success_threshold_start": 0.3, "success_threshold_steps": 200}),
+        ("fast-td3", 3, {"updates_per_step": 0.5}),
+    ],
 )
 def test_a_run_that_crashed_twice_ends_as_the_unbroken_one(
-    tmp_path: Path, preset: str, num_envs: int
+    tmp_path: Path, preset: str, num_envs: int, options: dict[str, Any]
 ) -> None:
-    settings = config(preset, num_envs=num_envs, checkpoint_every=18)
+    settings = config(preset, num_envs=num_envs, checkpoint_every=18, **options)
     train(tmp_path / "a", settings)
     for steps, resume in ((23, False), (STEPS // num_envs - 5, True)):
         with pytest.raises(Crash):
@@ -325,8 +354,8 @@ def test_when_all_checkpoints_are_damaged_the_run_is_not_begun_again_by_itself(t
         ({"env_id": "Other-v0"}, "a run on Other-v0, not on Walk-v0"),
         ({"package_version": "0.0.1"}, "written by version 0.0.1"),
         ({"format": 99}, "format 99.*upgrade"),
-        ({"run": {"format": 99}}, "run state 1"),
-        ({"run": None}, "run state 1"),
+        ({"run": {"format": 99}}, "run state 2"),
+        ({"run": None}, "run state 2"),
         ({"counters": {"seed": 8}}, "a run with seed 8, not 3"),
         ({"critics": {}}, "does not fit this run"),
     ],

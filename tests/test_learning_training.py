@@ -97,7 +97,7 @@ def small_config(**changes: Any) -> TrainConfig:
         gamma=0.95,
         actor_hidden=(64, 64),
         critic_hidden=(64, 64),
-        normalize_observations=False,
+        normalize_observations="none",
         exploration_steps=1000,
         action_scale=(0.25, 0.25, 0.25, 0.35, 0.35, 0.35),
         updates_per_step=1.0,
@@ -129,6 +129,30 @@ def test_training_solves_the_toy_task_that_an_untrained_policy_does_not(tmp_path
         ReachTask(), small_config(total_timesteps=4000, exploration_steps=2000), tmp_path / "trained"
     )
     assert success_rate(load_policy(untrained.policy_path), 100) < 0.3
+    assert success_rate(load_policy(trained.policy_path), 100) > 0.7
+
+
+def test_fast_td3_in_small_solves_the_toy_task(tmp_path: Path) -> None:
+    """Several steps, running normalisation, categorical critics and a noise level for each environment together."""
+    config = replace(
+        get_preset("fast-td3"),
+        total_timesteps=5000,
+        num_envs=8,
+        n_step=2,
+        learning_starts=400,
+        batch_size=128,
+        buffer_size=20_000,
+        updates_per_step=0.25,
+        tau=0.02,
+        actor_learning_rate=1e-3,
+        critic_learning_rate=1e-3,
+        actor_hidden=(64, 64),
+        critic_hidden=(64, 64),
+        exploration_steps=2000,
+        action_scale=(0.25, 0.25, 0.25, 0.35, 0.35, 0.35),
+        step_cost=0.02,
+    )
+    trained = train(ReachTask(8), config, tmp_path / "run")
     assert success_rate(load_policy(trained.policy_path), 100) > 0.7
 
 
@@ -195,7 +219,7 @@ def test_the_replay_sees_the_end_of_an_episode_and_not_the_start_of_the_next(tmp
         env, "Reach-v0", small_config(total_timesteps=200), tmp_path / "run", show_progress=False
     )
     trainer.run()
-    stored = trainer._replay._storage
+    stored = trainer._state.replay._storage
     moved = stored.next_observations[:200, :6] - stored.observations[:200, :6]
     inside = stored.next_observations[:200, :6].abs() < 1.0
     torch.testing.assert_close(moved[inside], torch.cat(env.actions)[inside], rtol=0.0, atol=1e-6)
@@ -257,6 +281,25 @@ def test_a_folder_that_holds_a_run_is_not_overwritten(tmp_path: Path) -> None:
     train(ReachTask(), small_config(total_timesteps=10), tmp_path / "run")
     with pytest.raises(InvalidInputError, match="already holds a run"):
         train(ReachTask(), small_config(total_timesteps=10), tmp_path / "run")
+
+
+def test_an_environment_without_what_an_option_needs_is_refused_before_anything_is_written(
+    tmp_path: Path,
+) -> None:
+    with pytest.raises(InvalidInputError, match="needs an environment made with other_targets=1"):
+        train(ReachTask(), small_config(hindsight_targets=1), tmp_path / "run")
+    assert not list((tmp_path / "run").iterdir())
+
+
+def test_auxiliary_losses_are_logged(tmp_path: Path) -> None:
+    config = small_config(aux_distance_weight=0.1, aux_visibility_weight=0.1)
+    train(ReachTask(), config, tmp_path / "run")
+    accumulators = importlib.import_module("tensorboard.backend.event_processing.event_accumulator")
+    events = accumulators.EventAccumulator(str(tmp_path / "run/tensorboard"))
+    events.Reload()
+    for name in ("aux_distance_loss", "aux_visibility_loss"):
+        values = [event.value for event in events.Scalars(f"losses/{name}")]
+        assert len(values) > 1 and values[-1] < values[0]
 
 
 def test_tensorboard_gets_the_documented_metrics(tmp_path: Path) -> None:

@@ -18,6 +18,8 @@ from maniskill_tomato.errors import InvalidInputError
 from maniskill_tomato.evaluation.camera_frustum import frustum_faces, frustum_points
 from maniskill_tomato.evaluation.experiments import (
     EXPERIMENTS,
+    IDEAS,
+    PARTS_OF_TD3,
     SINGLE_CHANGES,
     Experiment,
     find_variant,
@@ -86,8 +88,42 @@ def test_the_exact_variant_is_the_preset_and_every_single_change_changes_one_fie
 
 @pytest.mark.parametrize("experiment", EXPERIMENTS.values(), ids=lambda e: e.name)
 def test_variant_names_are_unique(experiment: Experiment) -> None:
-    singles = [v for v in SINGLE_CHANGES if experiment.name in v.experiments]
-    assert len(variants_of(experiment)) == 1 + len(singles)
+    changes = [v for v in (*SINGLE_CHANGES, *IDEAS) if experiment.name in v.experiments]
+    assert len(variants_of(experiment)) == len(changes) + 2  # The exact settings and td3.
+
+
+@pytest.mark.parametrize("experiment", EXPERIMENTS.values(), ids=lambda e: e.name)
+def test_the_parts_lead_from_the_exact_settings_to_td3_and_back(experiment: Experiment) -> None:
+    exact, td3 = PRESETS[experiment.preset], PRESETS["td3"]
+    there = find_variant(experiment, "+".join(PARTS_OF_TD3)).config(experiment)
+    assert differing_fields(there, td3) == {"step_cost", "pre_tanh_penalty"}
+    back = find_variant(experiment, "td3-without-" + "+".join(PARTS_OF_TD3)).config(experiment)
+    assert differing_fields(back, exact) == {"step_cost"}
+    assert find_variant(experiment, "td3").config(experiment) == td3
+
+
+def test_changes_can_be_made_together_and_parts_of_td3_left_out() -> None:
+    both = find_variant(GUIDED, "small-actions+gamma-0.9").config(GUIDED)
+    assert differing_fields(both, PRESETS["thesis-guided"]) == {"action_scale", "gamma"}
+    assert (both.gamma, both.action_scale[0]) == (0.9, 0.35)
+    less = find_variant(GUIDED, "td3-without-gamma-0.9+15000-steps").config(GUIDED)
+    assert differing_fields(less, PRESETS["td3"]) == {"gamma", "total_episodes", "total_timesteps"}
+    assert (less.gamma, less.total_episodes, less.total_timesteps) == (0.99, 240, None)
+
+
+@pytest.mark.parametrize(
+    ("name", "problem"),
+    [
+        ("tau-0.005+tau-0.01", "tau-0.01 changes nothing, or what another part changes already"),
+        ("gamma-0.9+exact", "exact changes nothing"),
+        ("gamma-0.9+td3", "td3 changes nothing"),
+        ("gamma-0.9+nonsense", "variant of guided must be one of 'exact'"),
+        ("td3-without-double-episodes", "part of td3 must be one of 'look-at-goals'"),
+    ],
+)
+def test_variants_that_contradict_themselves_are_refused(name: str, problem: str) -> None:
+    with pytest.raises(InvalidInputError, match=problem):
+        find_variant(GUIDED, name)
 
 
 def test_the_experiments_have_the_numbers_of_the_thesis() -> None:

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from maniskill_tomato.errors import InvalidInputError
-from maniskill_tomato.learning.presets import PRESETS, TrainConfig
+from maniskill_tomato.learning.presets import PRESETS, TrainConfig, modernise
 
 RESAMPLES = 10_000
 CURVE_RESAMPLES = 1000
@@ -177,6 +177,7 @@ def load_run(path: Path) -> Run:
         raise InvalidInputError(
             f"{path / 'config.json'} does not describe a run ({error!r}); it must hold env_id, seed and config"
         ) from error
+    config.pop("wandb_project", None)  # Where a run logs does not make it another one.
     if content.get("env_options"):
         config["env_options"] = content["env_options"]
     metrics = None
@@ -331,7 +332,7 @@ def _label(config: dict[str, Any], others: Sequence[dict[str, Any]]) -> str:
 def _nearest_preset(options: dict[str, Any]) -> tuple[str, dict[str, Any]]:
     """The preset that shares most options, and the options that it does not share."""
     defaults = TrainConfig(total_timesteps=1).to_dict()
-    complete = {**defaults, "total_timesteps": None, **options}
+    complete = {**defaults, "total_timesteps": None, **modernise(options)}
     differences: dict[str, dict[str, Any]] = {}
     for name, preset in PRESETS.items():
         values = preset.to_dict()

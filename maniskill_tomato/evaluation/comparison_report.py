@@ -194,14 +194,22 @@ def _cells(row: ComparisonRow) -> tuple[str, ...]:
         row.task,
         row.label,
         ", ".join(str(seed) for seed in row.seeds),
-        _interval(row.success_rate, 100.0, "{:.1f}", " %"),
-        _interval(row.mean_steps, 1.0, "{:.2f}", ""),
+        interval_text(row.success_rate, 100.0, "{:.1f}", " %"),
+        interval_text(row.mean_steps, 1.0, "{:.2f}", ""),
         "not known" if row.training_steps is None else f"{row.training_steps:,.0f}",
         "not logged" if row.training_seconds is None else f"{row.training_seconds:.0f} s",
     )
 
 
-def _interval(interval: Interval | None, factor: float, form: str, unit: str) -> str:
+def interval_text(interval: Interval | None, factor: float, form: str, unit: str) -> str:
+    """An interquartile mean with its interval, as `97.5 [95.0, 99.0] %`.
+
+    Args:
+        interval: None for runs that were not evaluated.
+        factor: What the numbers are multiplied by.
+        form: Format of each number.
+        unit: What follows them.
+    """
     if interval is None:
         return "not evaluated"
     text = form.format(factor * interval.estimate)

@@ -11,8 +11,10 @@ import imageio.v2 as imageio
 import numpy as np
 
 from maniskill_tomato import rendering
+from maniskill_tomato.errors import InvalidInputError
 from maniskill_tomato.evaluation import plots
-from maniskill_tomato.evaluation.exported import ExportedPolicy, describe_policy
+from maniskill_tomato.evaluation.comparison import Run
+from maniskill_tomato.evaluation.exported import ExportedPolicy, describe_policy, open_policy
 from maniskill_tomato.evaluation.metrics import make_metrics, write_metrics
 from maniskill_tomato.evaluation.report import Picture, ReportInput, write_report
 from maniskill_tomato.evaluation.rollout import ActingPolicy, Episode, run_episodes
@@ -116,6 +118,39 @@ def evaluate(
     )
     write_report(report, content)
     return EvaluationResult(metrics=metrics, report=report, video=video, left_out=left_out)
+
+
+def evaluate_run(run: Run, episodes: int, seed: int) -> EvaluationResult:
+    """Evaluates the policy of a run on the task and plants of its training; the results go into its folder `eval`.
+
+    Args:
+        run: Its folder holds `policy.pt`, or `policy.onnx` if another learner trained it.
+        episodes: How many episodes.
+        seed: Seed of the first; the others follow.
+
+    Raises:
+        InvalidInputError: The folder holds neither.
+        CheckpointError: Its policy cannot be read.
+    """
+    policies = [path for name in ("policy.pt", "policy.onnx") if (path := run.path / name).is_file()]
+    if not policies:
+        raise InvalidInputError(
+            f"{run.path} holds no policy to evaluate (policy.pt or policy.onnx); finish the run with "
+            f"`maniskill-tomato train --resume {run.path}`, or compare without evaluating"
+        )
+    config = EvaluationConfig(
+        env_id=run.env_id,
+        episodes=episodes,
+        seed=seed,
+        out=run.path / "eval",
+        env_options=run.config.get("env_options", {}),
+        baseline=False,
+        video=False,
+        title=f"Evaluation of {run.path.name}",
+        training_run=run.path if (run.path / "history.npz").is_file() else None,
+    )
+    logger.info("evaluating %s", run.path)
+    return evaluate(config, open_policy(policies[0], env_id=run.env_id), policies[0])
 
 
 def write_trajectories(path: Path, episodes: Sequence[Episode]) -> None:

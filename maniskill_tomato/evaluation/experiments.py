@@ -1,4 +1,4 @@
-"""The thesis's two experiments (sections 5-1 and 5-2), and variants that change one setting of them."""
+"""The thesis's two experiments (sections 5-1 and 5-2), and variants between their settings and those of `td3`."""
 
 import dataclasses
 from dataclasses import dataclass, field
@@ -95,19 +95,21 @@ EXPERIMENTS: dict[ExperimentName, Experiment] = {
 
 @dataclass(frozen=True, kw_only=True)
 class Variant:
-    """The exact settings, or those with one thing changed."""
+    """Settings to train with: a preset's, or those with something changed."""
 
     name: str
     title: str
     """What differs, for tables."""
     changes: dict[str, Any]
-    """Fields of `TrainConfig` and their new values; none for the exact settings."""
+    """Fields of `TrainConfig` and their new values; none for a preset as it is."""
     experiments: tuple[ExperimentName, ...] = ("guided", "sparse")
     """Where it applies."""
+    preset: PresetName | None = None
+    """What `changes` are made to; None stands for the exact settings of the experiment."""
 
     def config(self, experiment: Experiment) -> TrainConfig:
         """The training configuration of this variant."""
-        return dataclasses.replace(PRESETS[experiment.preset], **self.changes)
+        return dataclasses.replace(PRESETS[self.preset or experiment.preset], **self.changes)
 
 
 SMALL_ACTIONS = (0.35, 0.35, 0.35, 0.6, 0.6, 0.6)
@@ -134,7 +136,7 @@ SINGLE_CHANGES: tuple[Variant, ...] = (
     Variant(
         name="normalised",
         title="observations scaled to about [-1, 1]",
-        changes={"normalize_observations": True},
+        changes={"normalize_observations": "fixed"},
     ),
     Variant(
         name="buffer-100k",
@@ -189,22 +191,120 @@ SINGLE_CHANGES: tuple[Variant, ...] = (
         experiments=("sparse",),
     ),
 )
-"""One change each."""
+"""One field each."""
+
+
+def _of_td3(*fields: str) -> dict[str, Any]:
+    """Fields of the preset `td3` with their values."""
+    return {name: getattr(PRESETS["td3"], name) for name in fields}
+
+
+IDEAS: tuple[Variant, ...] = (
+    Variant(
+        name="look-at-goals",
+        title="exploration that looks at the target (`td3`'s)",
+        changes=_of_td3(
+            "exploration",
+            "exploration_steps",
+            "exploration_noise",
+            "exploration_noise_end",
+            "exploration_goal_share",
+        ),
+    ),
+    Variant(
+        name="15000-steps",
+        title="15,000 steps of training, not 240 / 500 episodes",
+        changes=_of_td3("total_episodes", "total_timesteps"),
+    ),
+    Variant(
+        name="twin-critics",
+        title="TD3's twin critics, delay and target noise",
+        changes=_of_td3("twin_critics", "policy_frequency", "target_noise"),
+    ),
+    Variant(
+        name="fewer-updates",
+        title="one update per two steps, the first after 1500",
+        changes=_of_td3("learning_starts", "updates_per_step"),
+    ),
+    Variant(
+        name="wide-networks",
+        title="128 units a layer, the action into the critic's first",
+        changes=_of_td3("actor_hidden", "critic_hidden", "critic_action_layer"),
+    ),
+)
+"""What else tells `td3` from the exact settings; one idea each, of several fields."""
+
+TD3 = Variant(name="td3", title="the preset `td3`", changes={}, preset="td3")
+
+PARTS_OF_TD3 = (
+    "look-at-goals",
+    "15000-steps",
+    "small-actions",
+    "potential-reward",
+    "gamma-0.9",
+    "tau-0.01",
+    "normalised",
+    "small-start",
+    "pre-tanh-penalty",
+    "actor-lr-1e-3",
+    "batch-256",
+    "buffer-100k",
+    "twin-critics",
+    "fewer-updates",
+    "wide-networks",
+)
+"""The changes that together lead from the exact settings to `td3`; they leave two weights to it, the cost of a step
+and that of the outputs before tanh."""
+
+TOGETHER = "+"
+WITHOUT = "td3-without-"
 
 
 def variants_of(experiment: Experiment) -> dict[str, Variant]:
-    """All variants of an experiment by name, the exact settings first."""
-    known = (EXACT, *SINGLE_CHANGES)
+    """The exact settings, every single change of them, and `td3`, by name."""
+    known = (EXACT, *SINGLE_CHANGES, *IDEAS, TD3)
     return {v.name: v for v in known if experiment.name in v.experiments}
 
 
 def find_variant(experiment: Experiment, name: str) -> Variant:
     """The variant called `name`.
 
+    Beside those of `variants_of`, `A+B` is the exact settings with the changes A and B, and `td3-without-A+B` the
+    preset `td3` with what A and B change put back to the exact settings.
+
     Raises:
-        InvalidInputError: The experiment has none of this name; the message lists them.
+        InvalidInputError: The experiment has none of this name, the message lists them; or two changes of one name
+            contradict each other.
     """
     variants = variants_of(experiment)
-    if name not in variants:
+    if name.startswith(WITHOUT):
+        return _td3_without(experiment, name)
+    if name in variants:
+        return variants[name]
+    if TOGETHER not in name:
         raise InvalidInputError.choice(f"variant of {experiment.name}", name, variants)
-    return variants[name]
+    parts = [find_variant(experiment, part) for part in name.split(TOGETHER)]
+    changes: dict[str, Any] = {}
+    for part in parts:
+        if not part.changes or part.preset is not None or changes.keys() & part.changes.keys():
+            raise InvalidInputError(
+                f"{name} cannot be combined: {part.name} changes nothing, or what another part changes already"
+            )
+        changes |= part.changes
+    return Variant(name=name, title="; ".join(part.title for part in parts), changes=changes)
+
+
+def _td3_without(experiment: Experiment, name: str) -> Variant:
+    """The preset `td3` with some of its parts put back."""
+    parts: list[Variant] = []
+    for part in name.removeprefix(WITHOUT).split(TOGETHER):
+        if part not in PARTS_OF_TD3:
+            raise InvalidInputError.choice("part of td3", part, PARTS_OF_TD3)
+        parts.append(variants_of(experiment)[part])
+    exact = PRESETS[experiment.preset]
+    return Variant(
+        name=name,
+        title=f"`td3` without: {'; '.join(part.title for part in parts)}",
+        changes={field: getattr(exact, field) for part in parts for field in part.changes},
+        preset="td3",
+    )

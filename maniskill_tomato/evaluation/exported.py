@@ -1,5 +1,6 @@
 """Exported policies in the evaluation, beside those of the trainer."""
 
+import json
 from pathlib import Path
 from typing import Any
 
@@ -51,6 +52,7 @@ def describe_policy(policy: Policy | ExportedPolicy) -> dict[str, Any]:
         return {
             "kind": policy.algorithm,
             "trained_on": policy.env_id,
+            "trained_with": policy.env_options,
             "training_steps": counters.get("steps"),
             "training_episodes": counters.get("episodes"),
             "training_seconds": round(float(counters.get("seconds", 0.0)), 1),
@@ -62,8 +64,22 @@ def describe_policy(policy: Policy | ExportedPolicy) -> dict[str, Any]:
     return {
         "kind": f"{training.get('algorithm')}, ONNX",
         "trained_on": description.env_id,
+        "trained_with": description.trained_with,
         "training_steps": training.get("steps"),
         "training_episodes": training.get("episodes"),
         "training_seed": training.get("seed"),
         "package_version": description.package_version,
     }
+
+
+def origin(policy: Policy | ExportedPolicy) -> str:
+    """One line that says by what, on which task and with which of its options a policy was trained."""
+    facts = describe_policy(policy)
+    options = facts["trained_with"]
+    if options is None:
+        trained_with = "with options that its file does not say"
+    elif not options:
+        trained_with = "with the task's own plant and options"
+    else:
+        trained_with = f"with {', '.join(f'{name}={json.dumps(value)}' for name, value in options.items())}"
+    return f"{facts['kind']}, trained on {facts['trained_on']} {trained_with}"

@@ -284,9 +284,9 @@ def _mark_thesis(axes: Axes, experiment: Experiment, unit: str) -> None:
     """Where the thesis's own training or exploration ended."""
     thesis = experiment.thesis
     if unit == "step" and thesis.total_steps is not None:
-        _mark(axes, thesis.total_steps, "thesis: last step")
+        _mark(axes, thesis.total_steps, "thesis:\nlast step")
     if thesis.exploration_ends is not None:
-        _mark(axes, thesis.exploration_ends[0 if unit == "episode" else 1], "thesis: exploration over")
+        _mark(axes, thesis.exploration_ends[0 if unit == "episode" else 1], "thesis:\nexploration over")
 
 
 def _mark(axes: Axes, x: float, text: str) -> None:
@@ -295,9 +295,10 @@ def _mark(axes: Axes, x: float, text: str) -> None:
         text,
         (x, 1.0),
         xycoords=("data", "axes fraction"),
-        xytext=(-3, -9),
+        xytext=(-3, -2),
         textcoords="offset points",
         ha="right",
+        va="top",
         fontsize=7.5,
         color=MUTED,
     )

@@ -2,6 +2,7 @@
 
 import contextlib
 import io
+import json
 import os
 import pickle
 import zipfile
@@ -31,7 +32,15 @@ REQUIRED_KEYS = (
     "counters",
 )
 
-TRAINING_PARTS = ("critics", "target_actor", "target_critics", "actor_optimizer", "critic_optimizer")
+TRAINING_PARTS = (
+    "critics",
+    "target_actor",
+    "target_critics",
+    "actor_optimizer",
+    "critic_optimizer",
+    "statistics",
+    "heads",
+)
 """Parts of an agent that only its further training needs."""
 
 
@@ -42,6 +51,7 @@ def make_checkpoint(
     counters: dict[str, int | float],
     with_training_state: bool = True,
     run: dict[str, Any] | None = None,
+    env_options: dict[str, Any] | None = None,
 ) -> dict[str, Any]:
     """What a checkpoint file holds: tensors, numbers and strings only, so that it loads without running code.
 
@@ -53,6 +63,8 @@ def make_checkpoint(
         with_training_state: Also keep critics, target networks and optimisers; a policy to be used needs none
             of them.
         run: What else a run needs to go on exactly, kept under `run`; see `Trainer`.
+        env_options: The options that the task was made with, as JSON can hold them; none were given if empty,
+            None if that is not known.
     """
     low, high = action_bounds
     scale = torch.tensor(agent.config.action_scale)
@@ -79,6 +91,8 @@ def make_checkpoint(
         "actor": agent.actor.state_dict(),
         "counters": counters,
     }
+    if env_options is not None:
+        data["env_options"] = json.loads(json.dumps(env_options))
     if with_training_state:
         for name in TRAINING_PARTS:
             data[name] = getattr(agent, name).state_dict()

@@ -42,7 +42,7 @@ class Exploration(Protocol):
         ...
 
     def amount(self, step: int) -> float:
-        """The schedule's value at `step`, for the logs."""
+        """The schedule's value at `step`, or the mean noise level of the environments, for the logs."""
         ...
 
 
@@ -88,24 +88,67 @@ class EpsilonGreedy:
         return torch.where(explores, random_actions, policy_actions).clamp_(-1.0, 1.0)
 
 
+def draw_noise_levels(
+    levels: Tensor | None,
+    episode_starts: Tensor,
+    low: float,
+    high: float,
+    generator: torch.Generator | None = None,
+) -> Tensor:
+    """Noise levels of every environment, drawn anew where an episode starts, uniformly between `low` and `high`.
+
+    Some environments then explore boldly and others refine, at any time of the training (FastTD3, Seo et al., 2025).
+
+    Args:
+        levels: Those so far, or None. Shape (N, 1).
+        episode_starts: True where an episode starts. Shape (N,).
+        low: Smallest level.
+        high: Largest level.
+        generator: Source of the draws.
+
+    Returns:
+        Shape (N, 1).
+    """
+    uniform = torch.rand(len(episode_starts), 1, generator=generator, device=episode_starts.device)
+    drawn = low + (high - low) * uniform
+    if levels is None or len(levels) != len(drawn):
+        return drawn
+    return torch.where(episode_starts[:, None], drawn, levels)
+
+
 class DecayingGaussian:
     """The policy's action plus max(epsilon, 0) N(0, 0.1), where 0.1 is read as the standard deviation (sparse
-    task)."""
+    task); or with noise of each environment's own level."""
 
     def __init__(
-        self, exploration_steps: int, noise: float, generator: torch.Generator | None = None
+        self,
+        exploration_steps: int,
+        noise: float,
+        generator: torch.Generator | None = None,
+        noise_end: float = 0.0,
+        noise_per_env: bool = False,
     ) -> None:
         self._exploration_steps = exploration_steps
         self._noise = noise
+        self._noise_end = noise_end
+        self._noise_per_env = noise_per_env
         self._generator = generator
+        self._levels: Tensor | None = None
 
     def amount(self, step: int) -> float:
+        if self._noise_per_env:
+            return 0.5 * (self._noise + self._noise_end)
         return decaying_schedule(step, self._exploration_steps)
 
     def explore(
         self, policy_actions: Tensor, observations: Tensor, step: int, episode_starts: Tensor
     ) -> Tensor:
         noise = torch.randn(policy_actions.shape, generator=self._generator, device=policy_actions.device)
+        if self._noise_per_env:
+            self._levels = draw_noise_levels(
+                self._levels, episode_starts, self._noise_end, self._noise, self._generator
+            )
+            return (policy_actions + self._levels * noise).clamp_(-1.0, 1.0)
         return (policy_actions + self.amount(step) * self._noise * noise).clamp_(-1.0, 1.0)
 
 
@@ -117,7 +160,7 @@ class LookAtGoals:
     So an episode is, with a probability that falls linearly from 1 to `goal_share`, led through goals:
     positions around the target on the robot's side, at the distances of `GOAL_DISTANCE`, with the tool axis
     towards the target. Only the observation is used for it. Gaussian noise, falling linearly from `noise` to
-    `noise_end`, is added to both kinds.
+    `noise_end` or of each environment's own level between the two, is added to both kinds.
     """
 
     def __init__(
@@ -130,10 +173,13 @@ class LookAtGoals:
         warmup_steps: int,
         generator: torch.Generator | None = None,
         device: torch.device | str = "cpu",
+        noise_per_env: bool = False,
     ) -> None:
         self._exploration_steps = exploration_steps
         self._noise = noise
         self._noise_end = noise_end
+        self._noise_per_env = noise_per_env
+        self._levels: Tensor | None = None
         self._goal_share = goal_share
         self._warmup_steps = warmup_steps
         self._scale = torch.tensor(action_scale, device=device)
@@ -142,6 +188,8 @@ class LookAtGoals:
         self._goals = torch.zeros(0, 6, device=device)
 
     def amount(self, step: int) -> float:
+        if self._noise_per_env:
+            return 0.5 * (self._noise + self._noise_end)
         remaining = decaying_schedule(step, self._exploration_steps)
         return self._noise_end + remaining * (self._noise - self._noise_end)
 
@@ -168,7 +216,12 @@ class LookAtGoals:
         towards = ((self._goals - observations[:, :6]) / self._scale).clamp_(-1.0, 1.0)
         base = torch.where(self._led[:, None], towards, policy_actions)
         noise = torch.randn(base.shape, generator=self._generator, device=device)
-        return (base + self.amount(step) * noise).clamp_(-1.0, 1.0)
+        amount: float | Tensor = self.amount(step)
+        if self._noise_per_env:
+            self._levels = amount = draw_noise_levels(
+                self._levels, episode_starts, self._noise_end, self._noise, self._generator
+            )
+        return (base + amount * noise).clamp_(-1.0, 1.0)
 
 
 def draw_look_at_goals(targets: Tensor, generator: torch.Generator | None = None) -> Tensor:
@@ -213,7 +266,13 @@ def make_exploration(
     if config.exploration == "epsilon-greedy":
         return EpsilonGreedy(config.exploration_steps, config.action_scale, generator, device)
     if config.exploration == "decaying-gaussian":
-        return DecayingGaussian(config.exploration_steps, config.exploration_noise, generator)
+        return DecayingGaussian(
+            config.exploration_steps,
+            config.exploration_noise,
+            generator,
+            config.exploration_noise_end,
+            config.exploration_noise_per_env,
+        )
     return LookAtGoals(
         config.exploration_steps,
         config.exploration_noise,
@@ -223,4 +282,5 @@ def make_exploration(
         config.learning_starts,
         generator,
         device,
+        config.exploration_noise_per_env,
     )

@@ -59,12 +59,16 @@ class Actor(nn.Module):
             nn.init.uniform_(self.output.weight, -ACTOR_SMALL_OUTPUT_BOUND, ACTOR_SMALL_OUTPUT_BOUND)
         nn.init.zeros_(self.output.bias)
 
-    def pre_activation(self, observations: Tensor) -> Tensor:
-        """The output before tanh. Shape (B, action_dim)."""
+    def features(self, observations: Tensor) -> Tensor:
+        """The last hidden layer. Shape (B, width)."""
         x = observations
         for layer in self.hidden:
             x = torch.relu(layer(x))
-        out: Tensor = self.output(x)
+        return x
+
+    def pre_activation(self, observations: Tensor) -> Tensor:
+        """The output before tanh. Shape (B, action_dim)."""
+        out: Tensor = self.output(self.features(observations))
         return out
 
     def forward(self, observations: Tensor) -> Tensor:
@@ -86,6 +90,7 @@ class Critic(nn.Module):
         action_dim: int,
         hidden: Sequence[int] = (100, 100),
         action_layer: int = 1,
+        outputs: int = 1,
     ) -> None:
         super().__init__()
         self.action_layer = action_layer
@@ -96,24 +101,28 @@ class Critic(nn.Module):
             initialise_hidden_(layers[-1])
             fan_in = width
         self.hidden = nn.ModuleList(layers)
-        self.output = nn.Linear(fan_in, 1)
+        self.output = nn.Linear(fan_in, outputs)
         nn.init.uniform_(self.output.weight, -CRITIC_OUTPUT_BOUND, CRITIC_OUTPUT_BOUND)
         nn.init.zeros_(self.output.bias)
 
-    def forward(self, observations: Tensor, actions: Tensor) -> Tensor:
-        """Values of shape (B,) for observations (B, observation_dim) and actions in [-1, 1], (B,
-        action_dim)."""
+    def features(self, observations: Tensor, actions: Tensor) -> Tensor:
+        """The last hidden layer. Shape (B, width)."""
         x = observations
         for index, layer in enumerate(self.hidden):
             if index == self.action_layer:
                 x = torch.cat((x, actions), dim=-1)
             x = torch.relu(layer(x))
-        values: Tensor = self.output(x)
+        return x
+
+    def forward(self, observations: Tensor, actions: Tensor) -> Tensor:
+        """Values of shape (B,) for observations (B, observation_dim) and actions in [-1, 1], (B,
+        action_dim)."""
+        values: Tensor = self.output(self.features(observations, actions))
         return values.squeeze(-1)
 
 
 class ObservationNormalizer(nn.Module):
-    """A fixed affine map `(observation - centre) / half_range`; the identity by default."""
+    """An affine map `(observation - centre) / half_range`."""
 
     centre: Tensor
     half_range: Tensor

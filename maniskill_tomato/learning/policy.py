@@ -33,6 +33,9 @@ class Policy:
     """The version that wrote it."""
     counters: dict[str, Any]
     """Steps, episodes, updates, seconds and seed of its training."""
+    env_options: dict[str, Any] | None = None
+    """Options of the task that it was trained with, such as its plant; empty if the task was as it is, None if the
+    file is of a version that did not keep them."""
 
     @property
     def observation_dim(self) -> int:
@@ -121,4 +124,13 @@ def load_policy(path: Path | str, device: torch.device | str = "cpu", env_id: st
         env_id=data["env_id"],
         package_version=data["package_version"],
         counters=data["counters"],
+        env_options=_options(path, data.get("env_options")),
     )
+
+
+def _options(path: Path | str, options: Any) -> dict[str, Any] | None:
+    if options is not None and not isinstance(options, dict):
+        raise CheckpointError(
+            f"{path} does not fit itself: env_options is {options!r}; train the policy again"
+        )
+    return options

@@ -1,4 +1,4 @@
-"""What a run shows while it learns: a progress bar and TensorBoard's event files."""
+"""What a run shows while it learns: a progress bar, TensorBoard's event files, optionally Weights & Biases."""
 
 import logging
 import os
@@ -15,6 +15,7 @@ from tqdm import tqdm
 
 from maniskill_tomato.learning.history import EpisodeRecord, TrainingHistory
 from maniskill_tomato.learning.presets import TrainConfig
+from maniskill_tomato.learning.wandb_log import WandbWriter
 
 logger = logging.getLogger(__name__)
 
@@ -39,7 +40,8 @@ class Progress:
 
 
 class TrainingLog:
-    """Writes CleanRL's metric names to TensorBoard and draws the bar; a context manager."""
+    """Writes CleanRL's metric names to TensorBoard, and to Weights & Biases if the configuration asks for it, and draws
+    the bar; a context manager."""
 
     def __init__(
         self,
@@ -61,7 +63,12 @@ class TrainingLog:
             report: Called about twice a second.
             state: What `state_dict` gave when the run was saved; the event files are cut back to that moment.
             done: Steps and episodes at that moment.
+
+        Raises:
+            InvalidInputError: Weights & Biases is asked for and cannot be used.
         """
+        project = config.wandb_project
+        self._wandb = None if project is None else WandbWriter(project, run_dir)
         self._folder = run_dir / "tensorboard"
         if state is not None:
             _cut_back(self._folder, state["event_files"])
@@ -96,6 +103,13 @@ class TrainingLog:
             self._writer.close()
         except OSError as failure:
             logger.warning("the TensorBoard files could not be finished: %s", failure)
+        if self._wandb is not None:
+            self._wandb.close(failed=error is not None)
+
+    def _add(self, name: str, value: float, step: int) -> None:
+        self._writer.add_scalar(name, value, step)
+        if self._wandb is not None:
+            self._wandb.add_scalar(name, value, step)
 
     def tell(self, step: int, history: TrainingHistory) -> None:
         """Reports where the run is to whom wants to know."""
@@ -146,16 +160,16 @@ class TrainingLog:
                 ("max_visible_fraction", record.max_visible_fraction),
                 ("success", float(record.success)),
             ):
-                self._writer.add_scalar(f"charts/{name}", value, record.end_step)
+                self._add(f"charts/{name}", value, record.end_step)
         for name, value in losses.items():
             self._losses.setdefault(name, []).append(value)
         if step - self._last_loss_step >= LOSS_EVERY:
             self._last_loss_step = step
             for name, values in self._losses.items():
-                self._writer.add_scalar(f"losses/{name}", sum(values) / len(values), step)
+                self._add(f"losses/{name}", sum(values) / len(values), step)
             self._losses.clear()
-            self._writer.add_scalar("charts/exploration", exploration, step)
-            self._writer.add_scalar("charts/SPS", step / max(now - self._start, 1e-9), step)
+            self._add("charts/exploration", exploration, step)
+            self._add("charts/SPS", step / max(now - self._start, 1e-9), step)
         self._bar.update(len(finished) if self._by_episodes else step - self._last_step)
         self._last_step = step
         if now - self._last_refresh >= REFRESH_SECONDS:

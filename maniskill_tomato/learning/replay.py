@@ -18,17 +18,41 @@ class Batch(NamedTuple):
     rewards: Tensor
     """Shape (B,)."""
     next_observations: Tensor
-    """What was seen after the action, before any reset. Shape (B, observation_dim)."""
+    """What was seen after the action, or after the last of n, before any reset. Shape (B, observation_dim)."""
     terminations: Tensor
     """1.0 where the episode ended for good, 0.0 where it went on or only ran out of time. Shape (B,)."""
+    discounts: Tensor | None = None
+    """gamma^k of a return over k steps; None where every return is over one. Shape (B,)."""
+    visible_fractions: Tensor | None = None
+    """V_f after the action (the first of n); None where nobody needs it. Shape (B,)."""
 
 
 class ReplayBuffer:
     """The newest `capacity` transitions; older ones are overwritten."""
 
     def __init__(
-        self, capacity: int, observation_dim: int, action_dim: int, device: torch.device | str = "cpu"
+        self,
+        capacity: int,
+        observation_dim: int,
+        action_dim: int,
+        device: torch.device | str = "cpu",
+        *,
+        discounts: bool = False,
+        visible_fractions: bool = False,
     ) -> None:
+        """Allocates an empty buffer.
+
+        Args:
+            capacity: How many transitions it holds.
+            observation_dim: Number of observed values.
+            action_dim: Number of actions.
+            device: Where they are kept.
+            discounts: Whether `Batch.discounts` is kept.
+            visible_fractions: Whether `Batch.visible_fractions` is kept.
+
+        Raises:
+            InvalidInputError: The capacity is not positive.
+        """
         if capacity < 1:
             raise InvalidInputError(f"the replay capacity must be 1 or more, got {capacity}")
         self.capacity = capacity
@@ -38,6 +62,8 @@ class ReplayBuffer:
             torch.zeros(capacity, device=device),
             torch.zeros(capacity, observation_dim, device=device),
             torch.zeros(capacity, device=device),
+            torch.zeros(capacity, device=device) if discounts else None,
+            torch.zeros(capacity, device=device) if visible_fractions else None,
         )
         self._next = 0
         self._size = 0
@@ -50,7 +76,7 @@ class ReplayBuffer:
         """Stores one transition per row, the first row first.
 
         Raises:
-            InvalidInputError: There are more rows than the buffer can hold.
+            InvalidInputError: There are more rows than the buffer can hold, or a column that it keeps is missing.
         """
         count = len(transitions.rewards)
         if count > self.capacity:
@@ -63,7 +89,10 @@ class ReplayBuffer:
             rows: slice | Tensor = slice(self._next, end)
         else:
             rows = torch.arange(self._next, end, device=self._storage.rewards.device) % self.capacity
-        for stored, new in zip(self._storage, transitions, strict=True):
+        for name, stored in self._columns().items():
+            new = getattr(transitions, name)
+            if new is None:
+                raise InvalidInputError(f"this replay buffer keeps {name}, and the transitions have none")
             stored[rows] = new.to(stored.dtype)
         self._next = end % self.capacity
         self._size = min(self._size + count, self.capacity)
@@ -79,11 +108,11 @@ class ReplayBuffer:
         rows = torch.randint(
             self._size, (batch_size,), generator=generator, device=self._storage.rewards.device
         )
-        return Batch(*(stored[rows] for stored in self._storage))
+        return Batch(*(None if stored is None else stored[rows] for stored in self._storage))  # type: ignore[arg-type]
 
     def state_dict(self) -> dict[str, Any]:
         """The transitions held and where the next one goes, for `load_state_dict`."""
-        held = {name: stored[: self._size].cpu().clone() for name, stored in self._storage._asdict().items()}
+        held = {name: stored[: self._size].cpu().clone() for name, stored in self._columns().items()}
         return {**held, "next": self._next, "capacity": self.capacity}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
@@ -97,10 +126,14 @@ class ReplayBuffer:
             raise InvalidInputError(
                 f"the replay state is of a buffer of {state['capacity']} transitions, this one holds {self.capacity}"
             )
-        for name, stored in self._storage._asdict().items():
+        for name, stored in self._columns().items():
             if state[name].shape != (size, *stored.shape[1:]):
                 raise InvalidInputError(
                     f"replay {name} must have shape {(size, *stored.shape[1:])}, got {tuple(state[name].shape)}"
                 )
             stored[:size] = state[name].to(stored.device)
         self._next, self._size = int(state["next"]), size
+
+    def _columns(self) -> dict[str, Tensor]:
+        """The tensors that are kept, by their names in `Batch`."""
+        return {name: stored for name, stored in self._storage._asdict().items() if stored is not None}

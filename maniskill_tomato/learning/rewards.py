@@ -1,6 +1,42 @@
 """The reward that the learner may use instead of the task's own."""
 
+from collections.abc import Mapping
+
 from torch import Tensor
+
+from maniskill_tomato.learning.presets import TrainConfig
+
+
+def learned_reward(
+    config: TrainConfig,
+    rewards: Tensor,
+    terminations: Tensor,
+    previous_visible_fraction: Tensor,
+    info: Mapping[str, Tensor],
+) -> Tensor:
+    """The reward that goes into the replay buffer: the task's, or `potential_reward` where it is configured.
+
+    Args:
+        config: Which of them.
+        rewards: The task's. Shape (B,).
+        terminations: Whether the episode ended for good. Shape (B,), bool.
+        previous_visible_fraction: V_f before the action. Shape (B,).
+        info: `visible_fraction`, `success` and `reward_penalty` after it, each of shape (B,).
+
+    Returns:
+        Shape (B,).
+    """
+    if config.reward == "task":
+        return rewards
+    return potential_reward(
+        info["visible_fraction"],
+        previous_visible_fraction,
+        info["success"],
+        terminations,
+        info["reward_penalty"],
+        gamma=config.gamma,
+        step_cost=config.step_cost,
+    )
 
 
 def potential_reward(

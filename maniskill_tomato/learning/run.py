@@ -4,7 +4,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from maniskill_tomato.learning.envs import check_env_id, make_learner_env
+from maniskill_tomato.learning.envs import LearnerEnv, check_env_id, make_learner_env
 from maniskill_tomato.learning.presets import TrainConfig
 from maniskill_tomato.learning.progress import Progress
 from maniskill_tomato.learning.run_folder import check_run_dir, clear_run
@@ -46,7 +46,7 @@ def train(
         clear_run(run_dir)
     if not resume:
         check_run_dir(run_dir)
-    env = make_learner_env(env_id, config.num_envs, **env_options)
+    env = make_training_env(env_id, config, env_options)
     try:
         trainer = Trainer(
             env,
@@ -62,3 +62,13 @@ def train(
         return trainer.run()
     finally:
         env.close()
+
+
+def make_training_env(env_id: str, config: TrainConfig, env_options: dict[str, Any]) -> LearnerEnv:
+    """The environments that a configuration trains in: its number of them, judging what its hindsight needs.
+
+    Raises:
+        InvalidInputError: The id or an option cannot be used.
+    """
+    judged = {"other_targets": config.hindsight_targets} if config.hindsight_targets else {}
+    return make_learner_env(env_id, config.num_envs, **{**judged, **env_options})

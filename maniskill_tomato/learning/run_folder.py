@@ -5,6 +5,7 @@ import fcntl
 import json
 import logging
 import os
+import shutil
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -12,17 +13,17 @@ from typing import Any
 import maniskill_tomato
 from maniskill_tomato.errors import CheckpointError, InvalidInputError
 from maniskill_tomato.learning.checkpoint import load_checkpoint, write_atomically
-from maniskill_tomato.learning.presets import MAY_CHANGE
+from maniskill_tomato.learning.presets import MAY_CHANGE, TrainConfig
 
 logger = logging.getLogger(__name__)
 
-RUN_STATE_FORMAT = 1
+RUN_STATE_FORMAT = 2
 """Version of the layout of a checkpoint's `run` entry."""
 
 LOG_NAME = "train.log"
 """What a run in a process of its own says."""
 
-_FILES = ("config.json", "episodes.csv", "history.npz", "policy.pt")
+_FILES = ("config.json", "episodes.csv", "history.npz", "policy.pt", "wandb.json")
 _PATTERNS = (
     "checkpoints/step_*.pt",
     "checkpoints/damaged_step_*.pt",
@@ -67,6 +68,7 @@ def remove_results(run_dir: Path) -> None:
     for pattern in _PATTERNS:
         for path in run_dir.glob(pattern):
             path.unlink()
+    shutil.rmtree(run_dir / "wandb", ignore_errors=True)
 
 
 @contextlib.contextmanager
@@ -185,7 +187,8 @@ def _check_origin(path: Path, data: dict[str, Any], env_id: str, seed: int, conf
         raise CheckpointError(
             f"{path} was written by a run with seed {data['counters'].get('seed')}, not {seed}"
         )
-    stored = {k: v for k, v in data["config"].items() if k not in MAY_CHANGE}
+    begun = TrainConfig.from_dict(data["config"]).to_dict()
+    stored = {k: v for k, v in begun.items() if k not in MAY_CHANGE}
     present = {k: v for k, v in config.items() if k not in MAY_CHANGE}
     changed = sorted(k for k in stored.keys() | present.keys() if stored.get(k) != present.get(k))
     if changed:

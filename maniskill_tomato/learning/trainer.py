@@ -14,30 +14,17 @@ import torch
 from torch import Tensor
 
 from maniskill_tomato.errors import CheckpointError, InvalidInputError, TrainingDivergedError
-from maniskill_tomato.learning.agent import make_agent, update
-from maniskill_tomato.learning.checkpoint import TRAINING_PARTS, make_checkpoint, save_checkpoint
-from maniskill_tomato.learning.env_state import (
-    env_state,
-    seed_action_spaces,
-    set_env_state,
-    set_tensor_attributes,
-    tensor_attributes,
-)
+from maniskill_tomato.learning.agent import update
+from maniskill_tomato.learning.checkpoint import make_checkpoint, save_checkpoint
+from maniskill_tomato.learning.env_state import seed_action_spaces
 from maniskill_tomato.learning.envs import LearnerEnv
-from maniskill_tomato.learning.exploration import make_exploration
-from maniskill_tomato.learning.history import TrainingHistory
 from maniskill_tomato.learning.interrupt import StopRequest, stop_on_signals
 from maniskill_tomato.learning.presets import TrainConfig
 from maniskill_tomato.learning.progress import Progress, TrainingLog
-from maniskill_tomato.learning.random_state import (
-    global_random_state,
-    seed_global_random_state,
-    set_global_random_state,
-)
-from maniskill_tomato.learning.replay import Batch, ReplayBuffer
-from maniskill_tomato.learning.rewards import potential_reward
+from maniskill_tomato.learning.random_state import seed_global_random_state
+from maniskill_tomato.learning.replay import Batch
+from maniskill_tomato.learning.rewards import learned_reward
 from maniskill_tomato.learning.run_folder import (
-    RUN_STATE_FORMAT,
     check_run_dir,
     checkpoint_path,
     checkpoints,
@@ -46,6 +33,9 @@ from maniskill_tomato.learning.run_folder import (
     remove_results,
     write_config,
 )
+from maniskill_tomato.learning.threshold import label_successes, success_threshold
+from maniskill_tomato.learning.training_state import TrainingState
+from maniskill_tomato.learning.wandb_log import import_wandb
 
 logger = logging.getLogger(__name__)
 
@@ -101,8 +91,8 @@ class Trainer:
             report: Called about twice a second with where the run is.
 
         Raises:
-            InvalidInputError: `run_dir` already holds a run and `resume` is off, or holds none and it is on, or
-                `config` does not fit `env`.
+            InvalidInputError: `run_dir` already holds a run and `resume` is off, or holds none and it is on,
+                `config` does not fit `env`, or it asks for Weights & Biases and that is not installed.
         """
         observation_space, action_space = env.single_observation_space, env.single_action_space
         if not isinstance(observation_space, gym.spaces.Box) or not isinstance(action_space, gym.spaces.Box):
@@ -112,6 +102,8 @@ class Trainer:
             raise InvalidInputError(
                 f"action_scale must have {action_dim} values, one per action, got {len(config.action_scale)}"
             )
+        if config.wandb_project is not None:
+            import_wandb(config.wandb_project)
         if not resume:
             check_run_dir(run_dir)
         elif not (run_dir / "config.json").is_file():
@@ -127,10 +119,6 @@ class Trainer:
         self._report = report
         self._dims = observation_space.shape[0], action_dim
         self._action_bounds = torch.as_tensor(action_space.low), torch.as_tensor(action_space.high)
-        self._step = 0
-        self._updates = 0
-        self._updates_owed = 0.0
-        self._episodes = 0
         self._checkpoint_step = 0
         self._start = self._checkpoint_time = time.perf_counter()
 
@@ -141,6 +129,7 @@ class Trainer:
         once. However it ends, `resume` goes on from its newest checkpoint.
 
         Raises:
+            InvalidInputError: The environment does not tell what an option needs; nothing was written.
             TrainingDivergedError: A loss, reward, action or weight is not finite; the last good checkpoint stays.
             CheckpointError: The disk does not take a file, another process trains in the folder, or there is
                 nothing to go on from. What was saved before stays.
@@ -161,14 +150,21 @@ class Trainer:
         seed_global_random_state(self._seed)
         seed_action_spaces(self._env, self._seed)
         saved = self._saved_run()
-        write_config(self._run_dir, self._env_id, self._seed, self._env_options, self._config.to_dict())
         observations, info = self._env.reset(seed=self._seed)
-        self._prepare(observations, info["visible_fraction"])
+        self._state = state = TrainingState(
+            self._env, self._config, self._dims, self._seed, observations, info
+        )
+        write_config(self._run_dir, self._env_id, self._seed, self._env_options, self._config.to_dict())
+        self._scale = torch.tensor(self._config.action_scale, device=observations.device)
         self._start = self._checkpoint_time = time.perf_counter()
         if saved is not None:
-            self._restore(saved)
+            state.restore(saved)
+            self._checkpoint_step = state.step
+            self._start -= saved["counters"]["seconds"]
+            state.history.save(self._run_dir)
+            logger.info("%s goes on from step %d", self._run_dir, state.step)
         log_state = None if saved is None else saved["run"]["log"]
-        done = (self._step, self._episodes)
+        done = (state.step, state.episodes)
         with (
             stop_on_signals() as stop,
             TrainingLog(
@@ -179,99 +175,70 @@ class Trainer:
             reason = self._loop(stop)
             seconds = time.perf_counter() - self._start
             policy_path = self._save()
-            log.tell(self._step, self._history)
-        logger.info("training ended (%s) after %d steps; policy in %s", reason, self._step, policy_path)
+            log.tell(state.step, state.history)
+        logger.info("training ended (%s) after %d steps; policy in %s", reason, state.step, policy_path)
         return TrainResult(
             run_dir=self._run_dir,
             policy_path=policy_path,
-            steps=self._step,
-            episodes=self._episodes,
-            updates=self._updates,
+            steps=state.step,
+            episodes=state.episodes,
+            updates=state.updates,
             seconds=seconds,
             stop_reason=reason,
         )
 
-    def _prepare(self, observations: Tensor, visible_fraction: Tensor) -> None:
-        device = observations.device
-        config = self._config
-        self._agent = make_agent(config, *self._dims, device)
-        self._replay = ReplayBuffer(config.buffer_size, *self._dims, device)
-        self._generator = torch.Generator(device=device).manual_seed(self._seed)
-        self._exploration = make_exploration(config, self._generator, device)
-        self._scale = torch.tensor(config.action_scale, device=device)
-        self._history = TrainingHistory(self._env.num_envs)
-        self._observations = observations
-        self._visible_fraction = visible_fraction
-        self._episode_starts = torch.ones(self._env.num_envs, dtype=torch.bool, device=device)
-
     def _loop(self, stop: StopRequest) -> str:
         """Steps until the end; returns why it ended."""
+        state = self._state
         while (reason := stop.reason or self._end_reason()) is None:
-            observations = self._observations
-            actions = self._exploration.explore(
-                self._agent.policy(observations), observations, self._step, self._episode_starts
+            observations = state.observations
+            state.agent.observe(observations)
+            actions = state.exploration.explore(
+                state.agent.policy(observations), observations, state.step, state.episode_starts
             )
             self._check_finite(action=actions)
             next_observations, rewards, terminations, truncations, info = self._env.step(
                 actions * self._scale
             )
             dones = terminations | truncations
-            self._step += self._env.num_envs
+            state.step += self._env.num_envs
             # At the end of an episode `next_observations` is already the start of the next one.
             step_info = info.get("final_info", info)
             reached = info["final_observation"] if "final_observation" in info else next_observations
-            learned = self._learned_reward(rewards, terminations, self._visible_fraction, step_info)
+            learned = learned_reward(self._config, rewards, terminations, state.visible_fraction, step_info)
             self._check_finite(reward=learned, observation=reached)
-            self._replay.add(Batch(observations, actions, learned, reached, terminations.float()))
+            batch = Batch(observations, actions, learned, reached, terminations.float())
+            state.experience.add(batch, dones, step_info, info)
             losses = self._learn()
             if losses:
-                self._history.add_loss(losses["qf1_loss"])
-            finished = self._history.add_step(
-                self._step,
+                state.history.add_loss(losses["qf1_loss"])
+            finished = state.history.add_step(
+                state.step,
                 rewards.tolist(),
                 step_info["visible_fraction"].tolist(),
                 step_info["success"].tolist(),
                 dones.tolist(),
             )
-            self._episodes += len(finished)
-            self._log.step(self._step, losses, self._exploration.amount(self._step), finished, self._history)
-            self._observations, self._episode_starts = next_observations, dones
-            self._visible_fraction = info["visible_fraction"]
+            state.episodes += len(finished)
+            amount = state.exploration.amount(state.step)
+            self._log.step(state.step, losses, amount, finished, state.history)
+            state.observations, state.episode_starts = next_observations, dones
+            state.visible_fraction = info["visible_fraction"]
             if self._checkpoint_is_due():
                 self._save_periodic()
         return reason
 
     def _checkpoint_is_due(self) -> bool:
-        if self._step - self._checkpoint_step >= self._config.checkpoint_every:
+        if self._state.step - self._checkpoint_step >= self._config.checkpoint_every:
             return True
         longest = self._config.checkpoint_seconds
         return longest is not None and time.perf_counter() - self._checkpoint_time >= longest
 
-    def _learned_reward(
-        self,
-        rewards: Tensor,
-        terminations: Tensor,
-        previous_visible_fraction: Tensor,
-        info: dict[str, Tensor],
-    ) -> Tensor:
-        """The reward that goes into the replay buffer. Shape (num_envs,)."""
-        if self._config.reward == "task":
-            return rewards
-        return potential_reward(
-            info["visible_fraction"],
-            previous_visible_fraction,
-            info["success"],
-            terminations,
-            info["reward_penalty"],
-            gamma=self._config.gamma,
-            step_cost=self._config.step_cost,
-        )
-
     def _end_reason(self) -> str | None:
         config = self._config
-        if config.total_timesteps is not None and self._step >= config.total_timesteps:
+        if config.total_timesteps is not None and self._state.step >= config.total_timesteps:
             return "finished"
-        if config.total_episodes is not None and self._episodes >= config.total_episodes:
+        if config.total_episodes is not None and self._state.episodes >= config.total_episodes:
             return "finished"
         if config.max_minutes is not None and time.perf_counter() - self._start >= 60.0 * config.max_minutes:
             return "time budget"
@@ -279,17 +246,22 @@ class Trainer:
 
     def _learn(self) -> dict[str, float]:
         """The updates owed for this step; their logs averaged, empty before learning starts."""
-        config = self._config
-        if self._step < config.learning_starts or len(self._replay) < config.batch_size:
+        config, state = self._config, self._state
+        if state.step < config.learning_starts or len(state.replay) < config.batch_size:
             return {}
-        self._updates_owed += config.updates_per_step * self._env.num_envs
+        state.updates_owed += config.updates_per_step * self._env.num_envs
         sums: dict[str, float] = {}
         counts: dict[str, int] = {}
-        while self._updates_owed >= 1.0:
-            self._updates_owed -= 1.0
-            batch = self._replay.sample(config.batch_size, self._generator)
-            logs = update(self._agent, batch, self._updates, self._generator)
-            self._updates += 1
+        while state.updates_owed >= 1.0:
+            state.updates_owed -= 1.0
+            batch = state.replay.sample(config.batch_size, state.generator)
+            if config.success_threshold_start is not None:
+                threshold = success_threshold(
+                    config.success_threshold_start, state.step, config.success_threshold_steps
+                )
+                batch = label_successes(batch, threshold, config.gamma)
+            logs = update(state.agent, batch, state.updates, state.generator)
+            state.updates += 1
             for name, value in logs.items():
                 sums[name] = sums.get(name, 0.0) + float(value)
                 counts[name] = counts.get(name, 0) + 1
@@ -305,15 +277,15 @@ class Trainer:
 
     def _diverged(self, listed: str) -> TrainingDivergedError:
         return TrainingDivergedError(
-            f"training diverged at step {self._step}: {listed}. Lower the learning rates or check the "
+            f"training diverged at step {self._state.step}: {listed}. Lower the learning rates or check the "
             f"rewards; the checkpoints in {self._run_dir / 'checkpoints'} are from before"
         )
 
     def _counters(self) -> dict[str, int | float]:
         return {
-            "steps": self._step,
-            "episodes": self._episodes,
-            "updates": self._updates,
+            "steps": self._state.step,
+            "episodes": self._state.episodes,
+            "updates": self._state.updates,
             "seconds": time.perf_counter() - self._start,
             "seed": self._seed,
         }
@@ -334,63 +306,24 @@ class Trainer:
             )
         return saved
 
-    def _run_state(self) -> dict[str, Any]:
-        """What a run needs beside its networks to go on exactly: data only, on the CPU."""
-        return {
-            "format": RUN_STATE_FORMAT,
-            "torch_version": str(torch.__version__),
-            "updates_owed": self._updates_owed,
-            "replay": self._replay.state_dict(),
-            "exploration": tensor_attributes(self._exploration),
-            "history": self._history.state_dict(),
-            "log": self._log.state_dict(),
-            "observations": self._observations.cpu(),
-            "visible_fraction": self._visible_fraction.cpu(),
-            "episode_starts": self._episode_starts.cpu(),
-            "generator": self._generator.get_state().cpu(),
-            "env": env_state(self._env),
-            "random": global_random_state(),
-        }
-
-    def _restore(self, saved: dict[str, Any]) -> None:
-        """Puts everything back to the moment of the checkpoint `saved`."""
-        state, counters, device = saved["run"], saved["counters"], self._observations.device
-        try:
-            for name in ("actor", "normalizer", *TRAINING_PARTS):
-                getattr(self._agent, name).load_state_dict(saved[name])
-            self._replay.load_state_dict(state["replay"])
-            set_tensor_attributes(self._exploration, state["exploration"], device)
-            self._history.load_state_dict(state["history"])
-            self._observations = state["observations"].to(device)
-            self._visible_fraction = state["visible_fraction"].to(device)
-            self._episode_starts = state["episode_starts"].to(device)
-            self._step = self._checkpoint_step = counters["steps"]
-            self._episodes, self._updates = counters["episodes"], counters["updates"]
-            self._updates_owed = state["updates_owed"]
-            set_env_state(self._env, state["env"])
-            self._generator.set_state(state["generator"])
-            set_global_random_state(state["random"])
-        except (KeyError, TypeError, ValueError, RuntimeError, AttributeError) as error:
-            raise CheckpointError(
-                f"the checkpoint of step {counters['steps']} in {self._run_dir} does not fit this run: {error!r}; "
-                "train again with --overwrite"
-            ) from error
-        self._start -= counters["seconds"]
-        self._history.save(self._run_dir)
-        logger.info("%s goes on from step %d", self._run_dir, self._step)
-
     def _save_periodic(self) -> None:
         """Writes a checkpoint of the present step, drops the oldest, writes the history."""
-        weights = (*self._agent.actor.parameters(), *self._agent.critics.parameters())
+        state = self._state
+        weights = (*state.agent.actor.parameters(), *state.agent.critics.parameters())
         self._check_finite(weights=torch.cat([w.detach().flatten() for w in weights]))
         data = make_checkpoint(
-            self._agent, self._env_id, self._action_bounds, self._counters(), run=self._run_state()
+            state.agent,
+            self._env_id,
+            self._action_bounds,
+            self._counters(),
+            run=state.run_state(self._log.state_dict()),
+            env_options=self._env_options,
         )
-        save_checkpoint(checkpoint_path(self._run_dir, self._step), data)
+        save_checkpoint(checkpoint_path(self._run_dir, state.step), data)
         for old in checkpoints(self._run_dir)[: -self._config.checkpoints_kept]:
             old.unlink()
-        self._history.save(self._run_dir)
-        self._checkpoint_step, self._checkpoint_time = self._step, time.perf_counter()
+        state.history.save(self._run_dir)
+        self._checkpoint_step, self._checkpoint_time = state.step, time.perf_counter()
 
     def _save(self) -> Path:
         """The last checkpoint, and beside it the policy alone."""
@@ -398,7 +331,12 @@ class Trainer:
         path = self._run_dir / "policy.pt"
         counters = self._counters()
         data = make_checkpoint(
-            self._agent, self._env_id, self._action_bounds, counters, with_training_state=False
+            self._state.agent,
+            self._env_id,
+            self._action_bounds,
+            counters,
+            with_training_state=False,
+            env_options=self._env_options,
         )
         save_checkpoint(path, data)
         return path

@@ -50,19 +50,25 @@ class PolicyDescription:
     """The target counts as fully visible when V_f is above this; None if the exporting version does not know the
     task."""
     default_plant: dict[str, Any] | None
-    """The task's own plant and where it stands, or None; a run may have used another."""
+    """The task's own plant and where it stands, or None; `trained_with` says whether another was used."""
     observation: tuple[Component, ...]
     """The input, in order; world frame."""
     normalizer_centre: tuple[float, ...]
     """What the normaliser, which is part of the graph, maps to 0."""
     normalizer_half_range: tuple[float, ...]
     """What it maps to 1, as a distance from the centre."""
+    normalizer_kind: str
+    """Where both come from: `none` (the identity), `fixed` ranges, or the `running` mean and standard deviation of
+    the training's observations; `unknown` in files that do not say."""
     action: tuple[ActionComponent, ...]
     """The output, in order: increments of the end-effector pose."""
     training: dict[str, Any]
     """Algorithm, seed, steps and episodes of its training, and the SHA-256 of its configuration."""
     onnx_sha256: str
     """SHA-256 of the ONNX file that belongs to this description."""
+    trained_with: dict[str, Any] | None = None
+    """Options of the task in the training, such as `plant`, `plant_pose`; empty if it was as it is, None if not
+    known."""
 
     def to_json(self) -> str:
         """The file's text."""
@@ -73,6 +79,7 @@ class PolicyDescription:
                 "id": self.env_id,
                 "success_threshold": self.success_threshold,
                 "default_plant": self.default_plant,
+                "trained_with": self.trained_with,
             },
             "observation": {
                 "input": INPUT_NAME,
@@ -84,6 +91,7 @@ class PolicyDescription:
             "normalizer": {
                 "formula": "(observation - centre) / half_range",
                 "part_of_the_graph": True,
+                "kind": self.normalizer_kind,
                 "centre": list(self.normalizer_centre),
                 "half_range": list(self.normalizer_half_range),
             },
@@ -121,6 +129,7 @@ class PolicyDescription:
             )
         try:
             plant = content["task"]["default_plant"]
+            trained_with = content["task"].get("trained_with")  # Older descriptions lack it.
             description = cls(
                 package_version=_text(content["package_version"]),
                 env_id=_text(content["task"]["id"]),
@@ -129,12 +138,14 @@ class PolicyDescription:
                 observation=tuple(Component(**_component(c)) for c in content["observation"]["components"]),
                 normalizer_centre=tuple(_number(v) for v in content["normalizer"]["centre"]),
                 normalizer_half_range=tuple(_number(v) for v in content["normalizer"]["half_range"]),
+                normalizer_kind=_text(content["normalizer"].get("kind", "unknown")),
                 action=tuple(
                     ActionComponent(scale=_number(c["scale"]), **_component(c))
                     for c in content["action"]["components"]
                 ),
                 training=dict(content["training"]),
                 onnx_sha256=_text(content["onnx"]["sha256"]),
+                trained_with=None if trained_with is None else dict(trained_with),
             )
         except KeyError as error:
             raise PolicyError(f"it lacks the entry {error}") from error

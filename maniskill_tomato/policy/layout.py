@@ -21,3 +21,6 @@ ACTION_NAMES = ("dx", "dy", "dz", "droll", "dpitch", "dyaw")
 
 ACTION_UNITS = ("m", "m", "m", "rad", "rad", "rad")
 """The unit of each action value."""
+
+TARGET_POSITION = slice(6, 9)
+"""Where the target's position is in the observation."""

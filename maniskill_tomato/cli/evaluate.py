@@ -1,0 +1,77 @@
+"""`maniskill-tomato eval`: how good a policy is."""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from maniskill_tomato.cli.options import EnvId, PlantOptions, shipped_policy
+
+
+@dataclass(frozen=True, kw_only=True)
+class Eval:
+    """Evaluate a policy: metrics.json, plots, a film and report.html."""
+
+    env_id: EnvId
+    """Id of the task."""
+    policy: str | None = None
+    """File of the policy (.pt, or .onnx from `export`), or `random`; by default the one that ships with the
+    package."""
+    episodes: int = 100
+    """How many episodes."""
+    seed: int = 1000
+    """Seed of the first episode; the others follow."""
+    out: Path = Path("runs/eval")
+    """Folder of the results."""
+    baseline: bool = True
+    """Also run random actions, to compare."""
+    video: bool = True
+    """Film the first episodes where this machine can render."""
+    allow_other_task: bool = False
+    """Accept a policy that was trained on another task."""
+    plants: PlantOptions = PlantOptions()
+    """Another plant."""
+
+    def run(self) -> None:
+        """Evaluates and says where the report is."""
+        from maniskill_tomato.evaluation.evaluate import EvaluationConfig, evaluate
+        from maniskill_tomato.evaluation.exported import open_policy, origin
+        from maniskill_tomato.evaluation.rollout import ActingPolicy
+        from maniskill_tomato.learning.envs import check_env_id
+        from maniskill_tomato.learning.policy import RandomPolicy
+
+        check_env_id(self.env_id)
+        path: Path | None = None
+        policy: ActingPolicy = RandomPolicy(self.seed)
+        if self.policy != "random":
+            path = Path(self.policy) if self.policy else shipped_policy(self.env_id)
+            opened = open_policy(path, env_id=None if self.allow_other_task else self.env_id)
+            print(f"policy  {origin(opened)}")
+            policy = opened
+        run_dir = path.parent if path is not None and (path.parent / "history.npz").is_file() else None
+        config = EvaluationConfig(
+            env_id=self.env_id,
+            episodes=self.episodes,
+            seed=self.seed,
+            out=self.out,
+            env_options=self.plants.env_options(),
+            baseline=self.baseline,
+            video=self.video,
+            title="Where to look: evaluation",
+            training_run=run_dir,
+        )
+        result = evaluate(config, policy, path)
+        print(summary(result.metrics))
+        if result.left_out:
+            print(result.left_out)
+        print(f"metrics {self.out / 'metrics.json'}")
+        print(f"report  {result.report}")
+
+
+def summary(metrics: dict[str, Any]) -> str:
+    """One line with the figures that matter."""
+    low, high = metrics["success_rate_interval_95"]
+    return (
+        f"success {metrics['success_rate']:.0%} of {metrics['episodes']} episodes "
+        f"(95 % interval {low:.0%} to {high:.0%}), "
+        f"{metrics['mean_steps']:.1f} steps, largest V_f {metrics['mean_max_visible_fraction']:.2f} on average"
+    )
