@@ -1,1 +1,1 @@
-"""Learning how good views are: a network that says, for every candidate viewpoint round the target, how much of it will be seen."""
+"""Learning how much of the target will be seen from every candidate viewpoint, by what the simulator knows."""

@@ -1,6 +1,5 @@
 """Data for the view-quality network: what was known after each look, and what every candidate view really shows."""
 
-import math
 from dataclasses import dataclass
 from typing import Any
 
@@ -13,8 +12,8 @@ from maniskill_tomato.planners.base import Planner
 from maniskill_tomato.planners.moves import Goals
 from maniskill_tomato.planners.next_best_view import NextBestView, NextBestViewConfig
 from maniskill_tomato.planners.quality_features import quality_features
-from maniskill_tomato.planners.view_quality import ViewQuality, ViewQualityConfig
 from maniskill_tomato.planners.quality_network import ViewQualityNetwork
+from maniskill_tomato.planners.view_quality import ViewQuality, ViewQualityConfig
 from maniskill_tomato.robot.look_at import look_at_pose
 from maniskill_tomato.visibility.situation import Situation
 
