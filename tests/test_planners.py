@@ -411,7 +411,8 @@ def test_the_oracles_way_keeps_to_reachable_stops_and_bends_where_it_must() -> N
     class BehindTheWall:
         def visible_fraction(self, T_world_camera: Tensor, env_index: int) -> Tensor:
             place = T_world_camera[:, :3, 3]
-            return ((place - torch.tensor([0.3, 0.3, 1.0])).norm(dim=1) < 0.06).float()
+            near: Tensor = (place - torch.tensor([0.3, 0.3, 1.0])).norm(dim=1) < 0.06
+            return near.float()
 
     def allowed(positions: Tensor, target: Tensor) -> Tensor:
         free: Tensor = (positions[:, 1] - 0.15).abs() > 0.04
