@@ -10,14 +10,20 @@ share this module.
 """
 
 from dataclasses import dataclass
-from typing import Final
+from functools import lru_cache
+from typing import Any, Final
 
+import numpy as np
 import torch
+import warp as wp
 from torch import Tensor
 
 from maniskill_tomato.errors import InvalidInputError
+from maniskill_tomato.robot import look_at_kernels
+from maniskill_tomato.robot.d435 import T_flange_camera_color_optical
 from maniskill_tomato.robot.iiwa14 import NUM_JOINTS
 from maniskill_tomato.robot.inverse_kinematics import InverseKinematics, Reach
+from maniskill_tomato.robot.kinematics import RecordedLaunch
 from maniskill_tomato.robot.look_at import (
     CAMERA_ROLLS,
     camera_to_flange,
@@ -98,6 +104,7 @@ class LookAtMover:
         self._rolls = torch.tensor(CAMERA_ROLLS, dtype=torch.float64, device=device)
         # Upright first, then 30 degrees to either side, 60, ...; between the two sides the joints decide.
         self._rank = (self._rolls.abs() * (180.0 / torch.pi / 30.0)).round()
+        self._kept_launch = lru_cache(maxsize=16)(lambda batch: _UprightLaunch(batch, device))
         self._shares = torch.tensor(MOVE_SHARES, dtype=torch.float64, device=device)
 
     def move(self, qpos: Tensor, position: Tensor, target: Tensor, action: Tensor) -> LookAtMove:
@@ -114,10 +121,14 @@ class LookAtMover:
         """
         _check_rows(qpos=(qpos, NUM_JOINTS), position=(position, 3), target=(target, 3), action=(action, 3))
         qpos, position, target = qpos.double(), position.double(), target.double()
-        goal = moved_position(position, target, action.double())
+        T_world_camera, T_world_flange = self._kept_launch(len(qpos)).run(position, target, action)
+        solution = self._inverse_kinematics.solve(T_world_flange, qpos, neighbour=False)
+        near = (solution.qpos - qpos).abs().amax(-1) <= LARGEST_JOINT_STEP
+        fits = (solution.reach == int(Reach.REACHABLE)) & near & keeps_clear(T_world_flange)
+        if bool(fits.all()):
+            return LookAtMove(solution.qpos, solution.reach, T_world_camera)
+        goal = T_world_camera[:, :3, 3]
         upright = self.look_from(qpos, goal, target, rolls=1)
-        if int(upright.reach.max()) == Reach.REACHABLE:
-            return upright
         rows = (upright.reach != Reach.REACHABLE).nonzero()[:, 0]
         shares = self._shares[:, None, None]
         goals = torch.lerp(position[rows], goal[rows], shares)
@@ -178,6 +189,30 @@ class LookAtMover:
         taken = torch.where(found[:, None], solved[every, best], qpos.double())
         T = torch.where(found[:, None, None], T_world_camera[every, best], T_world_camera[:, 0])
         return LookAtMove(taken, reach, T)
+
+
+class _UprightLaunch:
+    """The kernel of full moves with the picture upright for one batch size, with its tensors."""
+
+    def __init__(self, batch: int, device: torch.device) -> None:
+        def zeros(*shape: int) -> Tensor:
+            return torch.zeros(batch, *shape, dtype=torch.float64, device=device)
+
+        self._inputs = [zeros(3) for _ in range(3)]
+        self._poses = [zeros(4, 4) for _ in range(2)]
+        vectors: list[Any] = [wp.from_torch(tensor, dtype=wp.vec3d) for tensor in self._inputs]
+        poses: list[Any] = [wp.from_torch(tensor, dtype=wp.mat44d) for tensor in self._poses]
+        mount: Any = wp.mat44d(*np.linalg.inv(T_flange_camera_color_optical).ravel())
+        # The launch keeps addresses: what they point to must stay alive with it.
+        self._arguments = [*vectors, wp.float64(MAX_MOVE), wp.float64(MIN_DISTANCE), mount, *poses]
+        self._launch = RecordedLaunch(look_at_kernels.upright_move, batch, device, self._arguments)
+
+    def run(self, *inputs: Tensor) -> tuple[Tensor, Tensor]:
+        """Poses of the optical frame and the flange after a move from positions, targets and actions."""
+        for own, given in zip(self._inputs, inputs, strict=True):
+            own.copy_(given)
+        self._launch()
+        return self._poses[0].clone(), self._poses[1].clone()
 
 
 def _check_rows(**tensors: tuple[Tensor, int]) -> None:
