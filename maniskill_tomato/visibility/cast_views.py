@@ -46,7 +46,7 @@ class CastViews:
         self._link_poses = self._links_away.clone()
         self._targets = torch.zeros(at_once, dtype=torch.int32, device=self._device)
         self._results = torch.zeros((kernels.RESULTS, at_once), device=self._device)
-        self._recorded: tuple[Any, int] | None = None
+        self._recorded_scene: Any = None
         self._commands: list[tuple[Any, bool]] = []
 
     def visible_fraction(
@@ -89,7 +89,7 @@ class CastViews:
         if not 0 <= target_fruit < fruits:
             raise InvalidInputError(f"target_fruit must be from 0 to {fruits - 1}, got {target_fruit}")
 
-        if self._recorded is None or self._recorded[0] is not self._caster.scene:
+        if self._recorded_scene is not self._caster.scene:
             self._record()
         self._look_at(env_index)
         self._targets.fill_(target_fruit)
@@ -172,4 +172,7 @@ class CastViews:
         ]
         # A recorded launch keeps addresses, not arrays: what they point to must stay alive with it.
         self._launched_with = [inputs for _, _, inputs in calls]
-        self._recorded = (shared, n)
+        self._recorded_scene = shared
+        if self._device.type == "cuda":
+            # What was made just now was made in Warp's stream, and the casts run in torch's.
+            wp.synchronize_device(self._warp_device)

@@ -227,6 +227,9 @@ class ViewRayCaster:
         # A recorded launch keeps addresses, not arrays: what they point to must stay alive with it.
         self._launched_with = [inputs for _, _, inputs in calls]
         self._launches = [command.launch for command in commands]
+        if self._device.type == "cuda":
+            # What was made just now was made in Warp's stream, and the casts run in torch's.
+            wp.synchronize_device(self._warp_device)
 
 
 def sample_view(
