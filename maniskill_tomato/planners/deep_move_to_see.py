@@ -52,7 +52,7 @@ class MoveToSeeData:
 class RegressionConfig:
     """How the network is trained."""
 
-    epochs: int = 30
+    epochs: int = 15
     """Passes over the data; theirs: 50."""
     batch_size: int = 64
     """As theirs."""
