@@ -25,7 +25,7 @@ from maniskill_tomato.benchmark_command import Benchmark
 from maniskill_tomato.errors import InvalidInputError, SeedsFailedError, TomatoError
 from maniskill_tomato.learning.config_file import RunFile, parse_seeds, read_run_config, read_run_file
 from maniskill_tomato.learning.presets import MAY_CHANGE, PRESETS, PresetName, TrainConfig
-from maniskill_tomato.tasks import TASK_IDS
+from maniskill_tomato.tasks import TASK_IDS, THESIS_IDS
 
 # PyTorch and ManiSkill take seconds to import, so that every command imports what it needs when it runs.
 
@@ -260,7 +260,7 @@ class Export:
         """Exports and says where the files are."""
         from maniskill_tomato.learning.export import export_policy
 
-        for path in [self.policy] if self.policy else [shipped_policy(env_id) for env_id in TASK_IDS]:
+        for path in [self.policy] if self.policy else [shipped_policy(env_id) for env_id in THESIS_IDS]:
             result = export_policy(path, self.out)
             print(f"model       {result.model}")
             print(f"description {result.description}")

@@ -21,12 +21,13 @@ MAX_GENERAL_STEPS = 20
 MAX_ROW_STEPS = 120
 """Moves of a whole row."""
 
-TASK_IDS = (
-    "TomatoViewpointGuided-v1",
-    "TomatoViewpointSparse-v1",
-    "TomatoViewpoint-v1",
-    "TomatoViewpointRow-v1",
-)
+THESIS_IDS = ("TomatoViewpointGuided-v1", "TomatoViewpointSparse-v1")
+"""The thesis's tasks: nine observed numbers, six increments."""
+
+GENERAL_IDS = ("TomatoViewpoint-v1", "TomatoViewpointRow-v1")
+"""The tasks on plants never seen before."""
+
+TASK_IDS = (*THESIS_IDS, *GENERAL_IDS)
 
 
 def _register(env_id: str, entry_point: str, max_episode_steps: int) -> None:

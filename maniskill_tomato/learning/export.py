@@ -32,7 +32,7 @@ from maniskill_tomato.policy.description import (
 )
 from maniskill_tomato.policy.layout import ACTION_NAMES, ACTION_UNITS, OBSERVATION_NAMES, OBSERVATION_UNITS
 from maniskill_tomato.policy.onnx_policy import OnnxPolicy, description_path
-from maniskill_tomato.tasks import TASK_IDS
+from maniskill_tomato.tasks import THESIS_IDS
 from maniskill_tomato.tasks.config import ViewpointTaskConfig, guided_task, sparse_task
 
 OPSET = 17
@@ -45,7 +45,7 @@ TOLERANCE = 1e-5
 """Largest difference from PyTorch that an export may have, in [m] and [rad]."""
 
 _TASKS: dict[str, Callable[[], ViewpointTaskConfig]] = dict(
-    zip(TASK_IDS, (guided_task, sparse_task), strict=True)
+    zip(THESIS_IDS, (guided_task, sparse_task), strict=True)
 )
 
 
