@@ -19,10 +19,10 @@ from maniskill_tomato.learning.agent import make_agent
 from maniskill_tomato.learning.checkpoint import load_checkpoint, make_checkpoint, save_checkpoint
 from maniskill_tomato.learning.policy import load_policy
 from maniskill_tomato.learning.presets import get_preset
-from maniskill_tomato.tasks import TASK_IDS
+from maniskill_tomato.tasks import THESIS_IDS
 
 ROOT = Path(__file__).resolve().parent.parent
-GUIDED, SPARSE = TASK_IDS
+GUIDED, SPARSE = THESIS_IDS
 SHORT = (
     "--total-timesteps",
     "100",
@@ -76,7 +76,7 @@ def test_help_is_quick_and_loads_neither_torch_nor_the_simulator() -> None:
     assert all(word in result.stdout for word in ("train", "eval", "demo", "export"))
 
 
-@pytest.mark.parametrize("env_id", TASK_IDS)
+@pytest.mark.parametrize("env_id", THESIS_IDS)
 def test_training_a_hundred_steps_writes_a_run(
     tmp_path: Path, env_id: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -244,7 +244,7 @@ def test_a_policy_that_is_missing_damaged_or_of_another_task_is_an_error(
     assert "random_actions" not in json.loads((tmp_path / "out/metrics.json").read_text())
 
 
-@pytest.mark.parametrize("env_id", TASK_IDS)
+@pytest.mark.parametrize("env_id", THESIS_IDS)
 def test_the_shipped_policy_solves_its_task(tmp_path: Path, env_id: str) -> None:
     main(["eval", env_id, "--episodes", "50", "--out", str(tmp_path), "--no-video", "--no-baseline"])
     metrics = json.loads((tmp_path / "metrics.json").read_text())

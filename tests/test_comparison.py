@@ -28,10 +28,10 @@ from maniskill_tomato.evaluation.comparison import (
 )
 from maniskill_tomato.evaluation.comparison_report import make_rows, markdown_table, write_comparison
 from maniskill_tomato.learning.presets import get_preset
-from maniskill_tomato.tasks import TASK_IDS
+from maniskill_tomato.tasks import THESIS_IDS
 
 ROOT = Path(__file__).resolve().parent.parent
-GUIDED, SPARSE = TASK_IDS
+GUIDED, SPARSE = THESIS_IDS
 TD3 = get_preset("td3").to_dict()
 HEADER = "episode,end_step,steps,success\n"
 

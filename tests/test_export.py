@@ -28,9 +28,9 @@ from maniskill_tomato.learning.export import export_policy
 from maniskill_tomato.learning.policy import load_policy
 from maniskill_tomato.learning.presets import PRESETS, TrainConfig, get_preset
 from maniskill_tomato.policy.onnx_policy import OnnxPolicy
-from maniskill_tomato.tasks import TASK_IDS
+from maniskill_tomato.tasks import THESIS_IDS
 
-GUIDED, SPARSE = TASK_IDS
+GUIDED, SPARSE = THESIS_IDS
 CENTRE = np.array([0.2, 0.0, 0.8, 0.0, np.pi / 2, 0.0, 0.7, 0.0, 0.8])
 """A usual observation: the camera looks along x, the target stands in front of it."""
 
@@ -83,7 +83,7 @@ def test_an_export_acts_as_the_policy_does_in_torch(tmp_path: Path, preset: str)
     assert 0.0 <= result.largest_difference <= 1e-5
 
 
-@pytest.mark.parametrize("env_id", TASK_IDS)
+@pytest.mark.parametrize("env_id", THESIS_IDS)
 def test_the_shipped_policies_act_alike_when_exported(tmp_path: Path, env_id: str) -> None:
     source = asset_path(f"policies/{env_id}.pt")
     policy = OnnxPolicy.load(export_policy(source, tmp_path).model, env_id)
@@ -377,8 +377,8 @@ def test_the_command_exports_the_shipped_policies_or_a_given_one(
 ) -> None:
     main(["export", "--out", str(tmp_path / "shipped")])
     written = {path.name for path in (tmp_path / "shipped").iterdir()}
-    assert written == {f"{env_id}.{ending}" for env_id in TASK_IDS for ending in ("onnx", "json")}
-    for env_id in TASK_IDS:
+    assert written == {f"{env_id}.{ending}" for env_id in THESIS_IDS for ending in ("onnx", "json")}
+    for env_id in THESIS_IDS:
         assert OnnxPolicy.load(tmp_path / f"shipped/{env_id}.onnx").description.env_id == env_id
     make_policy(tmp_path / "policy.pt")
     main(["export", "--policy", str(tmp_path / "policy.pt"), "--out", str(tmp_path)])
@@ -403,7 +403,7 @@ def test_the_command_answers_bad_files_in_words(tmp_path: Path, capsys: pytest.C
     assert not (tmp_path / "out").exists()
 
 
-@pytest.mark.parametrize("env_id", TASK_IDS)
+@pytest.mark.parametrize("env_id", THESIS_IDS)
 def test_an_exported_policy_has_the_same_episodes_as_its_source(tmp_path: Path, env_id: str) -> None:
     source = asset_path(f"policies/{env_id}.pt")
     target = export_policy(source, tmp_path).model
