@@ -34,7 +34,9 @@ def main(argv: list[str] | None = None) -> None:
     args = tyro.cli(Args, args=argv, description=__doc__, config=(tyro.conf.OmitArgPrefixes,))
     start = time.perf_counter()
     try:
-        path = train_view_quality(args.out, args.config, args.jobs, report=lambda line: print(line, flush=True))
+        path = train_view_quality(
+            args.out, args.config, args.jobs, report=lambda line: print(line, flush=True)
+        )
     except TomatoError as error:
         print(f"error: {error}", file=sys.stderr)
         raise SystemExit(2) from None

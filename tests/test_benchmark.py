@@ -11,6 +11,8 @@ import pytest
 import torch
 from torch import Tensor
 
+from maniskill_tomato.cli import parse
+from maniskill_tomato.cli.benchmark import Benchmark
 from maniskill_tomato.errors import InvalidInputError
 from maniskill_tomato.evaluation import benchmark
 from maniskill_tomato.evaluation.benchmark import BenchmarkConfig, run_benchmark
@@ -349,3 +351,33 @@ def test_the_results_are_written(tmp_path: Path) -> None:
     for name in ("progress.png", "thresholds.png", "sweeps.png"):
         assert f"({name})" in text
         assert (tmp_path / name).stat().st_size > 5000
+
+
+# ----------------------------------------------------------------- command
+
+
+def test_the_command_line_names_policies_list_and_sweeps(tmp_path: Path) -> None:
+    command = parse(
+        ["benchmark", "--policies", "nbv,oracle", "--episodes", "7", "--seed", "3", "--out", str(tmp_path)]
+        + ["--sweeps", "depth,pose", "--episode-list", "validation", "--jobs", "2"]
+    )
+    assert isinstance(command, Benchmark)
+    assert (command.policies, command.episodes, command.seed, command.jobs) == ("nbv,oracle", 7, 3, 2)
+    assert (command.sweeps, command.episode_list, command.out) == ("depth,pose", "validation", tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"episodes": 0}, "--episodes must be"),
+        ({"seed": 195, "episodes": 20}, "at most 200"),
+        ({"sweeps": "weather"}, "the sweep"),
+        ({"sweep_policies": "oracle"}, "--sweep-policies"),
+        ({"policies": "unheard_of"}, "no policy"),
+    ],
+)
+def test_the_command_refuses_what_it_cannot_run(tmp_path: Path, change: dict[str, Any], message: str) -> None:
+    options: dict[str, Any] = {"policies": "nbv", "episodes": 2, "out": tmp_path / "b"}
+    with pytest.raises(InvalidInputError, match=message):
+        Benchmark(episode_list="validation", **{**options, **change}).run()
+    assert not (tmp_path / "b").exists()

@@ -26,7 +26,7 @@ from maniskill_tomato.planners.deep_move_to_see import (
     save_move_network,
     train_move_network,
 )
-from maniskill_tomato.planners.gradient_view import GradientView, expected_visible_share, map_density
+from maniskill_tomato.planners.gradient_view import GradientView, expected_visible_share
 from maniskill_tomato.planners.greedy_truth import GreedyTruth, greedy_directions
 from maniskill_tomato.planners.move_to_see import MoveToSee, MoveToSeeOnMemory, camera_array, size_gradient
 from maniskill_tomato.planners.next_best_view import NextBestDirection, NextBestView, NextBestViewConfig
@@ -291,7 +291,7 @@ def test_the_differentiable_map_agrees_with_the_memorys_prediction(world: FreeWo
     candidates = situation.lattice.positions(situation.target_position)[:, 1::4]
     expected = situation.memory.predict(candidates)[0, :, 0]
     count = candidates.shape[1]
-    density = map_density(situation.memory).expand(count, -1, -1, -1)
+    density = situation.memory.density.expand(count, -1, -1, -1)
     found = expected_visible_share(density, candidates[0], situation.target_position.expand(count, 3))
     # One walks from voxel to voxel, the other interpolates between their centres along 9 other rays.
     assert float(torch.corrcoef(torch.stack([found, expected]))[0, 1]) > 0.9
@@ -301,7 +301,7 @@ def test_the_differentiable_map_agrees_with_the_memorys_prediction(world: FreeWo
 def test_the_maps_gradient_agrees_with_finite_differences(world: FreeWorld) -> None:
     world.reset(seed=3)
     world.step(torch.tensor([[1.0, 0.0, 0.0]]))
-    density = map_density(world.situation.memory).double()
+    density = world.situation.memory.density.double()
     target = world.situation.target_position.double()
     place = (world.situation.camera_position.double() + 0.01).requires_grad_()
     (gradient,) = torch.autograd.grad(expected_visible_share(density, place, target).sum(), place)
@@ -319,7 +319,7 @@ def test_a_gradient_step_raises_the_expected_share(world: FreeWorld) -> None:
     for seed in range(6):
         world.reset(seed=seed)
         situation = world.situation
-        density = map_density(situation.memory)
+        density = situation.memory.density
         planner = GradientView(reachable=anywhere)
         planner.begin(situation, torch.tensor([0]))
         action = planner.act(situation)
@@ -411,7 +411,8 @@ def test_the_oracles_way_keeps_to_reachable_stops_and_bends_where_it_must() -> N
     class BehindTheWall:
         def visible_fraction(self, T_world_camera: Tensor, env_index: int) -> Tensor:
             place = T_world_camera[:, :3, 3]
-            return ((place - torch.tensor([0.3, 0.3, 1.0])).norm(dim=1) < 0.06).float()
+            near: Tensor = (place - torch.tensor([0.3, 0.3, 1.0])).norm(dim=1) < 0.06
+            return near.float()
 
     def allowed(positions: Tensor, target: Tensor) -> Tensor:
         free: Tensor = (positions[:, 1] - 0.15).abs() > 0.04
@@ -535,7 +536,7 @@ def test_a_file_that_is_no_network_is_refused(tmp_path: Any) -> None:
 # -------------------------------------------------------------- registry
 
 
-@pytest.mark.parametrize("name", [n for n in PLANNERS if n != "deep_3dmts"])
+@pytest.mark.parametrize("name", PLANNERS)
 def test_every_planner_is_made_by_name_and_gives_moves(world: FreeWorld, name: str) -> None:
     world.reset(seed=4)
     planner = make_planner(name, ground_truth=world)

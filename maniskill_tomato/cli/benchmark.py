@@ -5,11 +5,13 @@ import os
 from collections import Counter
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 from maniskill_tomato.errors import InvalidInputError
 
 # PyTorch and ManiSkill take seconds to import; the command imports what it needs when it runs.
+
+EpisodeList = Literal["held_out", "validation"]
 
 DEFAULT_POLICIES = "random_viewpoint,fixed_sweep,3dmts,gradient_nbv,nbv_direction,nbv,greedy_truth,oracle"
 
@@ -21,7 +23,9 @@ class Benchmark:
     policies: str = DEFAULT_POLICIES
     """Names of planners, files of trained policies, or LABEL=FILE, with commas between them."""
     episodes: int = 500
-    """How many episodes of the held-out list."""
+    """How many episodes of the list."""
+    episode_list: EpisodeList = "held_out"
+    """Which fixed list: held_out to report, validation to choose."""
     seed: int = 0
     """The first of them."""
     out: Path = Path("runs/benchmark")
@@ -57,18 +61,21 @@ class Benchmark:
         from maniskill_tomato.tasks.general_config import GeneralTaskConfig
 
         specs = parse_policies(self.policies)
-        main = main_condition()
+        main = main_condition(self.episode_list)
         listed = len(load_episodes(main.name))
-        for name, count in (("--episodes", self.episodes), ("--sweep-episodes", self.sweep_episodes)):
-            if not 1 <= count or self.seed + count > listed:
-                raise InvalidInputError(
-                    f"{name} must be 1 or more, and --seed plus {name} at most {listed}, the number of held-out "
-                    f"episodes; got {self.seed} and {count}"
-                )
         axes = (
             list(SWEEPS) if self.sweeps == "all" else [a.strip() for a in self.sweeps.split(",") if a.strip()]
         )
-        swept = [condition for axis in axes for condition in sweep_conditions(axis)]
+        swept = [condition for axis in axes for condition in sweep_conditions(axis, main.name)]
+        wanted_counts = {"--episodes": self.episodes} | (
+            {"--sweep-episodes": self.sweep_episodes} if swept else {}
+        )
+        for name, count in wanted_counts.items():
+            if count < 1 or self.seed + count > listed:
+                raise InvalidInputError(
+                    f"{name} must be 1 or more, and --seed plus {name} at most {listed}, the number of episodes in "
+                    f"the list {main.name}; got {self.seed} and {count}"
+                )
         chosen = [label.strip() for label in self.sweep_policies.split(",") if label.strip()]
         labels = [spec.label for spec in specs]
         for label in chosen:

@@ -29,32 +29,12 @@ def main_condition(episode_list: str = MAIN) -> Condition:
     return Condition(name=episode_list, env_options={"episodes": episode_list}, episode_list=episode_list)
 
 
-def _leaf_density(value: float) -> dict[str, Any]:
-    return {"plant": {"seed": MAIN, "pool": None, "leaf_density": [value, value]}}
-
-
-def _start(low: float, high: float) -> dict[str, Any]:
-    return {"plant": {"seed": MAIN, "pool": None}, "start_visibility": [low, high]}
-
-
-def _noise(**values: float) -> dict[str, Any]:
-    return {"episodes": MAIN, "sensor_noise": values}
-
-
-SWEEPS: dict[str, dict[float, dict[str, Any]]] = {
-    "leaf_density": {value: _leaf_density(value) for value in (0.5, 0.75, 1.0, 1.25, 1.5, 2.0)},
-    "start_visibility": {
-        0.05: _start(0.0, 0.05),
-        0.1: _start(0.05, 0.1),
-        0.2: _start(0.1, 0.2),
-        0.3: _start(0.2, 0.3),
-        0.5: _start(0.3, 0.5),
-    },
-    "segmentation": {
-        value: _noise(false_target=0.2 * value, missed_target=value) for value in (0.0, 0.1, 0.2, 0.4)
-    },
-    "depth": {value: _noise(depth_noise=value, dropout=0.1 * value) for value in (0.0, 1.0, 2.0, 4.0)},
-    "pose": {value: _noise(target_position=value) for value in (0.0, 0.01, 0.02, 0.04)},
+SWEEPS: dict[str, tuple[float, ...]] = {
+    "leaf_density": (0.5, 0.75, 1.0, 1.25, 1.5, 2.0),
+    "start_visibility": (0.05, 0.1, 0.2, 0.3, 0.5),
+    "segmentation": (0.0, 0.1, 0.2, 0.4),
+    "depth": (0.0, 1.0, 2.0, 4.0),
+    "pose": (0.0, 0.01, 0.02, 0.04),
 }
 """The values of each sweep with what they change.
 
@@ -66,8 +46,12 @@ SWEEPS: dict[str, dict[float, dict[str, Any]]] = {
 """
 
 
-def sweep_conditions(axis: str) -> list[Condition]:
+def sweep_conditions(axis: str, split: str = MAIN) -> list[Condition]:
     """The conditions of one sweep.
+
+    Args:
+        axis: One of `SWEEPS`.
+        split: Name of the fixed list, and of the split of seeds for new plants.
 
     Raises:
         InvalidInputError: There is no such sweep.
@@ -75,11 +59,32 @@ def sweep_conditions(axis: str) -> list[Condition]:
     if axis not in SWEEPS:
         raise InvalidInputError.choice("the sweep", axis, SWEEPS)
     conditions = []
-    for value, options in SWEEPS[axis].items():
-        listed = options.get("episodes")
+    lowest = 0.0
+    for value in SWEEPS[axis]:
+        options = _options(axis, lowest, value, split)
+        lowest = value
         conditions.append(
             Condition(
-                name=f"{axis}_{value:g}", axis=axis, value=value, env_options=options, episode_list=listed
+                name=f"{axis}_{value:g}_{split}",
+                axis=axis,
+                value=value,
+                env_options=options,
+                episode_list=options.get("episodes"),
             )
         )
     return conditions
+
+
+def _options(axis: str, lowest: float, value: float, split: str) -> dict[str, Any]:
+    """Options for `gymnasium.make` at one value of a sweep, the value before it being `lowest`."""
+    new_plants: dict[str, Any] = {"seed": split, "pool": None}
+    if axis == "leaf_density":
+        return {"plant": {**new_plants, "leaf_density": [value, value]}}
+    if axis == "start_visibility":
+        return {"plant": new_plants, "start_visibility": [lowest, value]}
+    noise = {
+        "segmentation": {"missed_target": value, "false_target": 0.2 * value},
+        "depth": {"depth_noise": value, "dropout": 0.1 * value},
+        "pose": {"target_position": value},
+    }
+    return {"episodes": split, "sensor_noise": noise[axis]}

@@ -8,11 +8,10 @@ from typing import Any
 import gymnasium as gym
 
 from maniskill_tomato.errors import InvalidInputError
-from maniskill_tomato.evaluation.exported import open_policy
+from maniskill_tomato.evaluation.viewpoint_policy import open_viewpoint_policy
 from maniskill_tomato.planners.base import Planner
 from maniskill_tomato.planners.deep_move_to_see import DeepMoveToSee, load_move_network
 from maniskill_tomato.planners.env_truth import EnvironmentTruth
-from maniskill_tomato.planners.learned import LearnedPolicy
 from maniskill_tomato.planners.registry import PLANNERS, make_planner
 
 
@@ -72,7 +71,7 @@ class PolicySpec:
             return DeepMoveToSee(load_move_network(self.path, device))
         if self.path is not None:
             spec: Any = env.unwrapped.spec
-            return LearnedPolicy(open_policy(self.path, env_id=None if spec is None else spec.id))
+            return open_viewpoint_policy(self.path, None if spec is None else spec.id)
         assert self.planner is not None
         truth = EnvironmentTruth(env, contact_free)
         return make_planner(

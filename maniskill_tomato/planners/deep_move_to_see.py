@@ -52,14 +52,14 @@ class MoveToSeeData:
 class RegressionConfig:
     """How the network is trained."""
 
-    epochs: int = 30
+    epochs: int = 15
     """Passes over the data; theirs: 50."""
     batch_size: int = 64
     """As theirs."""
     learning_rate: float = 1e-3
     """Of Adam; theirs fine-tune by SGD with momentum at 1e-5."""
     validation_share: float = 0.1
-    """Share of the data, its last part, on which the loss is told."""
+    """Share of the data, its last part, by whose loss the epoch is chosen."""
     seed: int = 0
 
     def __post_init__(self) -> None:
@@ -122,7 +122,7 @@ def train_move_network(
     config: RegressionConfig | None = None,
     report: Callable[[int, float, float], None] = lambda epoch, loss, validation: None,
 ) -> MoveNetwork:
-    """Fits the network to the moves by their squared error.
+    """Fits the network to the moves by their squared error, and keeps the epoch with the lowest validation loss.
 
     Args:
         data: From `scripts/train_deep_move_to_see.py`, in the order of the episodes.
@@ -143,6 +143,7 @@ def train_move_network(
         network = MoveNetwork()
     optimizer = torch.optim.Adam(network.parameters(), lr=config.learning_rate)
     last = count - held_back
+    best, weights = float("inf"), network.state_dict()
     for epoch in range(config.epochs):
         losses = []
         for rows in torch.split(torch.randperm(last, generator=generator), config.batch_size):
@@ -153,7 +154,11 @@ def train_move_network(
             losses.append(float(loss.detach()))
         with torch.no_grad():
             validation = float(_loss(network, data, torch.arange(last, count)))
+        if validation < best:
+            best = validation
+            weights = {name: value.clone() for name, value in network.state_dict().items()}
         report(epoch, sum(losses) / len(losses), validation)
+    network.load_state_dict(weights)
     return network.eval().requires_grad_(False)
 
 

@@ -31,7 +31,7 @@ from maniskill_tomato.planners.moves import move_towards
 from maniskill_tomato.planners.reach import CameraReach
 from maniskill_tomato.robot.look_at import look_frame
 from maniskill_tomato.robot.look_at_move import MAX_MOVE, MIN_DISTANCE
-from maniskill_tomato.visibility.occlusion_memory import CELL_SIZE, GRID_CELLS, TARGET_RADIUS, OcclusionMemory
+from maniskill_tomato.visibility.occlusion_memory import CELL_SIZE, GRID_CELLS, TARGET_RADIUS
 from maniskill_tomato.visibility.situation import Situation
 
 LEARNING_RATE = 0.03
@@ -45,13 +45,6 @@ SPACING = 0.01
 
 SHORTENED = (1.0, 0.75, 0.5, 0.25)
 """Shares of a move that are tried where the arm cannot take the whole."""
-
-
-def map_density(memory: OcclusionMemory) -> Tensor:
-    """Expected hits per metre in every voxel, as `OcclusionMemory.predict` takes them. Shape (B, 32, 32, 32)."""
-    weight, assumed = float(memory.foliage.weight), float(memory.foliage.density)
-    density: Tensor = (memory.hits + weight * assumed) / (memory.passed_length + weight)
-    return density / CELL_SIZE
 
 
 def expected_visible_share(density: Tensor, position: Tensor, target: Tensor) -> Tensor:
@@ -109,7 +102,7 @@ class GradientView(Planner):
     def act(self, situation: Situation) -> Tensor:
         """Up the gradient, as far as the arm reaches."""
         position, target = situation.camera_position, situation.target_position
-        density = map_density(situation.memory)
+        density = situation.memory.density
         climbed = position
         for _ in range(STEPS):
             climbed = climbed + self._step(density, climbed, target)

@@ -22,8 +22,8 @@ class LearnedPolicy(Planner):
     name = "learned"
 
     def __init__(self, policy: ObservationPolicy) -> None:
-        self._policy = policy
+        self.policy = policy
 
     def act(self, situation: Situation) -> Tensor:
         """The policy's move."""
-        return self._policy.act(situation.observation)
+        return self.policy.act(situation.observation)

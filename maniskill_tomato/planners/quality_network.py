@@ -33,7 +33,9 @@ class _Block(nn.Module):
 class ViewQualityNetwork(nn.Module):
     """A small convolutional network over the directions from the target; distances are channels."""
 
-    def __init__(self, map_channels: int, scalars: int, distances: int, width: int = 48, blocks: int = 3) -> None:
+    def __init__(
+        self, map_channels: int, scalars: int, distances: int, width: int = 48, blocks: int = 3
+    ) -> None:
         """Builds the layers.
 
         Args:

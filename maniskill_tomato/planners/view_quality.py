@@ -16,7 +16,7 @@ import torch
 from torch import Tensor
 
 from maniskill_tomato.errors import CheckpointError, InvalidInputError
-from maniskill_tomato.learning.checkpoint import write_atomically
+from maniskill_tomato.learning.checkpoint import read_tensors, write_atomically
 from maniskill_tomato.planners.base import Planner
 from maniskill_tomato.planners.moves import move_towards, moves_needed
 from maniskill_tomato.planners.quality_features import MAP_CHANNELS, SCALARS, quality_features
@@ -45,9 +45,22 @@ class ViewQuality(Planner):
 
     name = "view_quality"
 
-    def __init__(self, network: ViewQualityNetwork, config: ViewQualityConfig | None = None) -> None:
+    def __init__(
+        self,
+        network: ViewQualityNetwork,
+        config: ViewQualityConfig | None = None,
+        facts: dict[str, Any] | None = None,
+    ) -> None:
+        """Keeps the network.
+
+        Args:
+            network: Judges the candidates.
+            config: How the policy weighs.
+            facts: Numbers and strings about its training.
+        """
         self.network = network.eval().requires_grad_(False)
         self.config = config or ViewQualityConfig()
+        self.facts = facts or {}
         self._refused = torch.zeros(0, 0, dtype=torch.bool)
         self._chosen = torch.zeros(0, dtype=torch.int64)
         self._before = torch.zeros(0, 3)
@@ -83,14 +96,14 @@ class ViewQuality(Planner):
         return move_towards(position, target, candidates[rows, self._chosen])
 
 
-def save_view_quality(path: Path, policy: ViewQuality, **facts: Any) -> None:
-    """Writes the network and the settings; `facts` (numbers and strings) are kept beside them."""
+def save_view_quality(path: Path, policy: ViewQuality) -> None:
+    """Writes the network, the settings and the facts."""
     data = {
         "format": FORMAT,
         "sizes": policy.network.sizes,
         "weights": policy.network.state_dict(),
         "config": asdict(policy.config),
-        "facts": facts,
+        "facts": policy.facts,
     }
     buffer = io.BytesIO()
     torch.save(data, buffer)
@@ -103,20 +116,23 @@ def load_view_quality(path: Path, device: str | torch.device = "cpu") -> ViewQua
     Raises:
         CheckpointError: The file is missing, damaged, or of something else.
     """
+    data = read_tensors(path, device)
+    if not is_view_quality(data):
+        raise CheckpointError(f"{path} holds no view-quality policy; scripts/train_view_quality.py makes one")
     try:
-        data = torch.load(path, map_location=device, weights_only=True)
-        if data["format"] != FORMAT:
-            raise CheckpointError(f"{path} is of format {data['format']!r}, not {FORMAT!r}; train it again")
         network = ViewQualityNetwork(**data["sizes"])
         network.load_state_dict(data["weights"])
-        config = ViewQualityConfig(**data["config"])
-    except FileNotFoundError as error:
-        raise CheckpointError(f"there is no file {path}; give the file of a view-quality policy") from error
-    except (KeyError, TypeError, ValueError, RuntimeError, EOFError, OSError) as error:
-        raise CheckpointError(f"{path} holds no view-quality policy: {error}; train it again") from error
+        config, facts = ViewQualityConfig(**data["config"]), dict(data["facts"])
+    except (KeyError, TypeError, ValueError, RuntimeError) as error:
+        raise CheckpointError(f"{path} does not fit itself: {error}; train the policy again") from error
     if not all(bool(p.isfinite().all()) for p in network.parameters()):
         raise CheckpointError(f"{path} holds weights that are not finite; train it again")
-    return ViewQuality(network.to(device), config)
+    return ViewQuality(network.to(device), config, facts)
+
+
+def is_view_quality(data: object) -> bool:
+    """Whether the content of a file is of `save_view_quality`."""
+    return isinstance(data, dict) and data.get("format") == FORMAT
 
 
 def new_network(width: int = 32, blocks: int = 3) -> ViewQualityNetwork:

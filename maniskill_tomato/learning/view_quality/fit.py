@@ -140,7 +140,9 @@ def fit(
     return network.eval().requires_grad_(False)
 
 
-def judge(network: ViewQualityNetwork, data: QualityData, threshold: float, most: int = 600) -> dict[str, float]:
+def judge(
+    network: ViewQualityNetwork, data: QualityData, threshold: float, most: int = 600
+) -> dict[str, float]:
     """Cross entropy and squared error over up to `most` looks, evenly spread."""
     rows = torch.linspace(0, len(data.scalars) - 1, min(most, len(data.scalars))).long()
     network.eval()

@@ -13,8 +13,9 @@ from typing import Any
 
 import torch
 
+import maniskill_tomato
 from maniskill_tomato.errors import CheckpointError, InvalidInputError
-from maniskill_tomato.learning.checkpoint import write_atomically
+from maniskill_tomato.learning.checkpoint import read_tensors, write_atomically
 from maniskill_tomato.learning.envs import make_env
 from maniskill_tomato.learning.view_quality.collect import QualityData, collect_episodes
 from maniskill_tomato.learning.view_quality.fit import FitConfig, fit
@@ -53,7 +54,9 @@ class QualityTrainConfig:
         if not self.rounds or min(self.rounds) < 1:
             raise InvalidInputError(f"rounds must list one or more numbers above 0, got {self.rounds}")
         if not 0 <= self.seed < 100 or max(self.rounds) * len(self.rounds) > VALIDATION_SEED // 100:
-            raise InvalidInputError("seed must be from 0 to 99 and the rounds hold less than 9 million episodes")
+            raise InvalidInputError(
+                "seed must be from 0 to 99 and the rounds hold less than 9 million episodes"
+            )
 
 
 def train_view_quality(
@@ -91,7 +94,9 @@ def train_view_quality(
     options = env_options or {}
     count = -(-config.validation_episodes // config.block)
     validation_plan = [
-        _Block(out / f"validation-{b}.pt", VALIDATION_SEED + b * config.block, config.block, "validation", None)
+        _Block(
+            out / f"validation-{b}.pt", VALIDATION_SEED + b * config.block, config.block, "validation", None
+        )
         for b in range(count)
     ]
     network: ViewQualityNetwork | None = None
@@ -127,15 +132,16 @@ def train_view_quality(
             ),
             network,
         )
-        save_view_quality(
-            policy_path,
-            ViewQuality(network),
-            env_id=ENV_ID,
-            looks=len(data.scalars),
-            episodes=len(data.reachable),
-            seconds=round(time.perf_counter() - start, 1),
-            seed=config.seed,
-        )
+        facts = {
+            "env_id": ENV_ID,
+            "env_options": json.dumps(env_options or {}),
+            "package_version": maniskill_tomato.__version__,
+            "looks": len(data.scalars),
+            "episodes": len(data.reachable),
+            "seconds": round(time.perf_counter() - start, 1),
+            "seed": config.seed,
+        }
+        save_view_quality(policy_path, ViewQuality(network, facts=facts))
     path = out / "policy.pt"
     write_atomically(path, (out / f"round-{len(config.rounds) - 1}.pt").read_bytes())
     return path
@@ -157,7 +163,9 @@ def _run_blocks(
     missing = [block for block in blocks if not block.path.is_file()]
     # ManiSkill and Warp start once in each process, which must not be a fork of one that has them.
     with ProcessPoolExecutor(jobs, mp_context=multiprocessing.get_context("spawn")) as pool:
-        futures: dict[Future[int], _Block] = {pool.submit(_run_block, block, options): block for block in missing}
+        futures: dict[Future[int], _Block] = {
+            pool.submit(_run_block, block, options): block for block in missing
+        }
         for done, future in enumerate(as_completed(futures), start=1):
             report(f"{futures[future].path.name}: {future.result()} looks ({done} of {len(missing)} blocks)")
 
@@ -181,7 +189,7 @@ def _load(blocks: list[_Block]) -> QualityData:
     parts = []
     for block in blocks:
         try:
-            parts.append(QualityData(**torch.load(block.path, weights_only=True)))
-        except (TypeError, RuntimeError, EOFError, OSError) as error:
-            raise CheckpointError(f"{block.path} cannot be read: {error}; delete it and go on") from error
+            parts.append(QualityData(**read_tensors(block.path)))
+        except TypeError as error:
+            raise CheckpointError(f"{block.path} holds no looks: {error}; delete it and go on") from error
     return QualityData.join(parts)
