@@ -20,6 +20,7 @@ from maniskill_tomato.tasks.general_rewards import view_gain_reward
 from maniskill_tomato.tasks.ground_truth import GroundTruth
 from maniskill_tomato.tasks.hard_starts import HardStarts, Start
 from maniskill_tomato.tasks.plant_choice import PlantChoice
+from maniskill_tomato.tasks.sensor_noise import SensorErrors, SensorNoise
 from maniskill_tomato.tasks.tomato_env import TomatoEnv
 from maniskill_tomato.visibility.cast_views import CastViews
 from maniskill_tomato.visibility.caster import Visibility
@@ -56,6 +57,8 @@ class TomatoViewpointGeneralEnv(TomatoEnv):
     - `layout`: an `ObservationLayout`, or the parts' names, says what the observation holds.
     - `start_visibility`: range of V_f of the first view.
     - `contact_penalty`: what a move with plant contact costs.
+    - `sensor_noise`: a `SensorNoise` or a mapping of its fields, what camera and segmenter get wrong. A saved state
+      keeps no errors: taken back, the views are measured anew.
 
     `reset(options=...)` takes `episode` (index in the list), `target` (index of a ripe fruit in `Plant.fruits`) and
     `camera_position` (x, y, z [m], world frame).
@@ -77,11 +80,13 @@ class TomatoViewpointGeneralEnv(TomatoEnv):
         layout: ObservationLayout | Sequence[str] | None = None,
         start_visibility: Sequence[float] | None = None,
         contact_penalty: float | None = None,
+        sensor_noise: SensorNoise | Mapping[str, float] | None = None,
         plant: PlantChoice | Mapping[str, object] | str | None = None,
         plant_pose_noise: Sequence[float] | None = None,
         control_mode: str | None = "pd_look_at",
         **kwargs: Any,
     ) -> None:
+        self._sensor_noise = SensorNoise.parse(sensor_noise)
         task = task or GeneralTaskConfig()
         if start_visibility is not None:
             low, high = options.check_range("start_visibility", start_visibility)
@@ -122,6 +127,7 @@ class TomatoViewpointGeneralEnv(TomatoEnv):
             self._cast_views, self._plant_clearance, lambda: self.planting, lambda: self._target
         )
         """What only the simulator knows; for planners that need the truth."""
+        self._errors = SensorErrors(self._sensor_noise, n, device)
         self.soft_starts = 0
         """Episodes so far that no drawn start made as hard as asked for."""
         self._views = torch.zeros(n, MAX_VIEWS, 7, device=device)
@@ -185,6 +191,8 @@ class TomatoViewpointGeneralEnv(TomatoEnv):
         near = torch.tensor([START_RPY], dtype=torch.float64, device=self.device).expand(len(starts), 3)
         viewpoint = camera_to_viewpoint(poses, near).float()
         self._set_arm(env_idx, viewpoint, torch.stack([start.qpos for start in starts]))
+        for i, rng in zip(indices, rngs, strict=True):
+            self._errors.begin(i, rng)
         self._begin(env_idx)
 
     def _start(
@@ -222,7 +230,7 @@ class TomatoViewpointGeneralEnv(TomatoEnv):
 
     def _look_anew(self, env_idx: Tensor) -> None:
         """Forgets what was seen in some environments and takes a first look at their targets."""
-        self._observer.begin(env_idx, self._target_position_w[env_idx])
+        self._observer.begin(env_idx, self._known_target_position()[env_idx])
         self._view_count[env_idx] = 0
         self._views[env_idx] = 0.0
         mask = torch.zeros(self.num_envs, dtype=torch.bool, device=self.device)
@@ -243,11 +251,16 @@ class TomatoViewpointGeneralEnv(TomatoEnv):
         T_w_camera = T_w_links[:, -1] @ self._T_ee_camera
         T_w_plant = self.planting.T_world_plant
         self._seen: Visibility = self._caster.cast(T_w_camera, self._target, T_w_plant, T_w_links)
-        rays = self._ray_caster.cast(T_w_camera, self._target, self._target_position_w, T_w_plant, T_w_links)
+        known = self._known_target_position()
+        rays = self._ray_caster.cast(T_w_camera, self._target, known, T_w_plant, T_w_links)
         self._camera_position = T_w_camera[:, :3, 3]
+        measured = self._errors.visible_fraction(self._seen.visible_fraction)
         self._observation = self._observer.observe(
-            self._viewpoint, T_w_camera, rays, self._seen.visible_fraction, self._moves_left(), mask
+            self._viewpoint, T_w_camera, self._errors.rays(rays), measured, self._moves_left(), mask
         )
+
+    def _known_target_position(self) -> Tensor:
+        return self._errors.known_target(self._target_position_w)
 
     def _moves_left(self) -> Tensor:
         return (self.task.max_moves - self._moves).clamp_min(0)
@@ -328,7 +341,7 @@ class TomatoViewpointGeneralEnv(TomatoEnv):
 
     def _replay(self, indices: Tensor) -> None:
         """Looks again from where some environments looked, so that their memory is what it was."""
-        self._observer.begin(indices, self._target_position_w[indices])
+        self._observer.begin(indices, self._known_target_position()[indices])
         chosen = torch.zeros(self.num_envs, dtype=torch.bool, device=self.device)
         chosen[indices] = True
         count = self._view_count.clamp_max(MAX_VIEWS)

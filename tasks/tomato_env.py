@@ -219,6 +219,10 @@ class TomatoEnv(BaseEnv):  # type: ignore[misc]
         self._target_id = self.planting.fruit_segmentation_id[rows, self._target]
         self._target_position_w = self.planting.fruit_position_w(self._target)
 
+    def _known_target_position(self) -> Tensor:
+        """Where the robot believes its targets to be, in the world frame, in [m]. Shape (num_envs, 3)."""
+        return self._target_position_w
+
     def _checked_target(self, env_index: int, target: object) -> int:
         ripe = self.planting.ripe_fruits[env_index]
         if isinstance(target, bool) or not isinstance(target, int) or target not in ripe:
@@ -247,7 +251,7 @@ class TomatoEnv(BaseEnv):  # type: ignore[misc]
         if isinstance(controller, ViewpointController):
             controller.viewpoint, controller.reach = self._viewpoint, self._reach
             if isinstance(controller, LookAtController):
-                controller.target_position = self._target_position_w
+                controller.target_position = self._known_target_position()
             controller.set_action(batch)
             if self.motion == "kinematic":
                 self._put_joints(controller.target_qpos)

@@ -1,21 +1,24 @@
-"""The command `maniskill-tomato`: train, evaluate, demonstrate, export.
+"""The command `maniskill-tomato`: train, evaluate, compare, demonstrate, export.
 
 Examples:
     maniskill-tomato train TomatoViewpointGuided-v1
     maniskill-tomato train TomatoViewpointSparse-v1 --preset thesis-sparse --seeds 0..4 --jobs 2
     maniskill-tomato train --resume runs/guided
     maniskill-tomato eval TomatoViewpointGuided-v1 --policy runs/demo/training/policy.pt --episodes 100
+    maniskill-tomato benchmark --policies nbv,oracle,runs/general/policy.pt --episodes 500
     maniskill-tomato demo
     maniskill-tomato export --policy runs/demo/training/policy.pt --out exported
 """
 
 import logging
+import os
 import sys
 from collections.abc import Sequence
 from typing import Annotated, Any
 
 import tyro
 
+from maniskill_tomato.cli.benchmark import Benchmark
 from maniskill_tomato.cli.demo import Demo
 from maniskill_tomato.cli.evaluate import Eval
 from maniskill_tomato.cli.export import Export
@@ -23,12 +26,12 @@ from maniskill_tomato.cli.options import PlantOptions, merge_options
 from maniskill_tomato.cli.train import Train, train_default
 from maniskill_tomato.errors import TomatoError
 
-__all__ = ["Demo", "Eval", "Export", "PlantOptions", "Train", "main", "merge_options", "parse"]
+__all__ = ["Benchmark", "Demo", "Eval", "Export", "PlantOptions", "Train", "main", "merge_options", "parse"]
 
 # PyTorch and ManiSkill take seconds to import, so that every command imports what it needs when it runs.
 
 
-def parse(argv: Sequence[str]) -> Train | Eval | Demo | Export:
+def parse(argv: Sequence[str]) -> Train | Eval | Benchmark | Demo | Export:
     """The command that the arguments describe.
 
     The options of `train` default to those of the run that it continues or of its `--config` file, and these to
@@ -41,13 +44,14 @@ def parse(argv: Sequence[str]) -> Train | Eval | Demo | Export:
     commands: Any = (
         Annotated[Train, tyro.conf.subcommand("train", default=default)]
         | Annotated[Eval, tyro.conf.subcommand("eval")]
+        | Annotated[Benchmark, tyro.conf.subcommand("benchmark")]
         | Annotated[Demo, tyro.conf.subcommand("demo")]
         | Annotated[Export, tyro.conf.subcommand("export")]
     )
-    command: Train | Eval | Demo | Export = tyro.cli(
+    command: Train | Eval | Benchmark | Demo | Export = tyro.cli(
         commands,
         prog="maniskill-tomato",
-        description="Active perception for tomato harvesting: train, evaluate, demonstrate, export.",
+        description="Active perception for tomato harvesting: train, evaluate, compare, demonstrate, export.",
         args=list(argv),
         config=(tyro.conf.OmitArgPrefixes,),
     )
@@ -66,3 +70,7 @@ def main(argv: Sequence[str] | None = None) -> None:
     except KeyboardInterrupt:
         print("stopped", file=sys.stderr)
         raise SystemExit(130) from None
+    except BrokenPipeError:
+        # Whoever read the output, such as `head`, has gone; what is still buffered must not fail at exit.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        raise SystemExit(141) from None

@@ -2,9 +2,15 @@
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 from maniskill_tomato.cli.options import EnvId, PlantOptions, shipped_policy
+from maniskill_tomato.tasks import GENERAL_IDS
+
+EpisodeList = Literal["validation", "held_out"]
+
+LISTED_ID = "TomatoViewpoint-v1"
+"""The task that has lists of episodes."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -14,8 +20,8 @@ class Eval:
     env_id: EnvId
     """Id of the task."""
     policy: str | None = None
-    """File of the policy (.pt, or .onnx from `export`), or `random`; by default the one that ships with the
-    package."""
+    """File of the policy (.pt, or .onnx from `export`), or `random`, or for the general tasks a planner's name; by
+    default the one that ships with the package."""
     episodes: int = 100
     """How many episodes."""
     seed: int = 1000
@@ -30,30 +36,47 @@ class Eval:
     """Accept a policy that was trained on another task."""
     plants: PlantOptions = PlantOptions()
     """Another plant."""
+    episode_list: EpisodeList | None = None
+    """Episodes of a fixed list, TomatoViewpoint-v1 only: seed i is its i-th; by default held_out, unless options of
+    the plants are given."""
 
     def run(self) -> None:
         """Evaluates and says where the report is."""
         from maniskill_tomato.evaluation.evaluate import EvaluationConfig, evaluate
         from maniskill_tomato.evaluation.exported import open_policy, origin
         from maniskill_tomato.evaluation.rollout import ActingPolicy
+        from maniskill_tomato.evaluation.viewpoint_policy import open_viewpoint_policy
         from maniskill_tomato.learning.envs import check_env_id
         from maniskill_tomato.learning.policy import RandomPolicy
+        from maniskill_tomato.planners.base import Planner
+        from maniskill_tomato.planners.registry import PLANNERS
 
         check_env_id(self.env_id)
         path: Path | None = None
-        policy: ActingPolicy = RandomPolicy(self.seed)
-        if self.policy != "random":
+        env_options = self.plants.env_options()
+        policy: ActingPolicy | Planner | str = RandomPolicy(self.seed)
+        if self.env_id in GENERAL_IDS:
+            if self.policy == "random":
+                policy = "random_step"
+            elif self.policy in PLANNERS:
+                policy = self.policy
+            else:
+                path = Path(self.policy) if self.policy else shipped_policy(self.env_id)
+                policy = open_viewpoint_policy(path, None if self.allow_other_task else self.env_id)
+        elif self.policy != "random":
             path = Path(self.policy) if self.policy else shipped_policy(self.env_id)
             opened = open_policy(path, env_id=None if self.allow_other_task else self.env_id)
             print(f"policy  {origin(opened)}")
             policy = opened
+        if self.episode_list is not None or (self.env_id == LISTED_ID and not env_options):
+            env_options["episodes"] = self.episode_list or "held_out"
         run_dir = path.parent if path is not None and (path.parent / "history.npz").is_file() else None
         config = EvaluationConfig(
             env_id=self.env_id,
             episodes=self.episodes,
             seed=self.seed,
             out=self.out,
-            env_options=self.plants.env_options(),
+            env_options=env_options,
             baseline=self.baseline,
             video=self.video,
             title="Where to look: evaluation",

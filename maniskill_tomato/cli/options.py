@@ -7,7 +7,7 @@ from typing import Annotated, Any
 import tyro
 
 from maniskill_tomato.errors import InvalidInputError
-from maniskill_tomato.tasks import TASK_IDS
+from maniskill_tomato.tasks import GENERAL_IDS, TASK_IDS
 
 EnvId = Annotated[
     str, tyro.conf.Positional, tyro.conf.arg(metavar="ENV_ID", help=f"One of {', '.join(TASK_IDS)}.")
@@ -65,8 +65,10 @@ def shipped_policy(env_id: str) -> Path:
     """
     from maniskill_tomato.assets import asset_path
 
+    # One policy serves both general tasks.
+    name = GENERAL_IDS[0] if env_id in GENERAL_IDS else env_id
     try:
-        return asset_path(f"policies/{env_id}.pt")
+        return asset_path(f"policies/{name}.pt")
     except FileNotFoundError as error:
         raise InvalidInputError(
             f"no policy for {env_id} ships with this version; train one with `maniskill-tomato train {env_id}` and "

@@ -18,9 +18,15 @@ from maniskill_tomato.evaluation.exported import ExportedPolicy, describe_policy
 from maniskill_tomato.evaluation.metrics import make_metrics, write_metrics
 from maniskill_tomato.evaluation.report import Picture, ReportInput, write_report
 from maniskill_tomato.evaluation.rollout import ActingPolicy, Episode, run_episodes
+from maniskill_tomato.evaluation.viewpoint_policy import acting_policy
 from maniskill_tomato.learning.envs import make_env
 from maniskill_tomato.learning.history import load_history
 from maniskill_tomato.learning.policy import Policy, RandomPolicy
+from maniskill_tomato.planners.base import Planner
+from maniskill_tomato.planners.baselines import RandomStep
+from maniskill_tomato.planners.learned import LearnedPolicy
+from maniskill_tomato.planners.view_quality import ViewQuality
+from maniskill_tomato.tasks import GENERAL_IDS
 
 logger = logging.getLogger(__name__)
 
@@ -67,13 +73,13 @@ class EvaluationResult:
 
 
 def evaluate(
-    config: EvaluationConfig, policy: ActingPolicy, policy_path: Path | None = None
+    config: EvaluationConfig, policy: ActingPolicy | Planner | str, policy_path: Path | None = None
 ) -> EvaluationResult:
     """Evaluates `policy` and writes metrics.json, trajectories.npz, plots, pictures, a film and report.html.
 
     Args:
         config: What to evaluate and where to write.
-        policy: Chooses the actions, without exploration.
+        policy: Chooses the actions, without exploration; a string names a planner for the general tasks.
         policy_path: Its file, for the record.
 
     Returns:
@@ -170,16 +176,20 @@ def write_trajectories(path: Path, episodes: Sequence[Episode]) -> None:
     )
 
 
-def _run(config: EvaluationConfig, policy: ActingPolicy) -> tuple[list[Episode], list[Episode] | None, float]:
+def _run(
+    config: EvaluationConfig, policy: ActingPolicy | Planner | str
+) -> tuple[list[Episode], list[Episode] | None, float]:
     """The policy's episodes, the baseline's if wanted, and the task's threshold of V_f."""
     env = make_env(config.env_id, **config.env_options)
     try:
         threshold = float(cast(Any, env.unwrapped).task.full_visibility)
-        episodes = run_episodes(env, policy, config.episodes, config.seed, config.show_progress)
+        acting = acting_policy(policy, env)
+        episodes = run_episodes(env, acting, config.episodes, config.seed, config.show_progress)
         baseline = None
         if config.baseline:
             logger.info("the same episodes with random actions, to compare")
-            random = RandomPolicy(config.seed)
+            general = config.env_id in GENERAL_IDS
+            random = acting_policy(RandomStep(config.seed) if general else RandomPolicy(config.seed), env)
             baseline = run_episodes(env, random, config.episodes, config.seed, config.show_progress)
     finally:
         env.close()
@@ -216,7 +226,7 @@ def _plot(
     return evaluation, [Picture(path=path, caption=caption)]
 
 
-def _film(config: EvaluationConfig, policy: ActingPolicy) -> tuple[Path, list[Picture]]:
+def _film(config: EvaluationConfig, policy: ActingPolicy | Planner | str) -> tuple[Path, list[Picture]]:
     """Films the first episodes; returns the film and the first and last view of the first one."""
     from maniskill_tomato.evaluation.video import film_episodes, make_film_options
 
@@ -226,7 +236,7 @@ def _film(config: EvaluationConfig, policy: ActingPolicy) -> tuple[Path, list[Pi
     env = make_env(config.env_id, **options)
     path = config.out / "video.mp4"
     try:
-        films = film_episodes(env, policy, [config.seed + i for i in range(count)], path)
+        films = film_episodes(env, acting_policy(policy, env), [config.seed + i for i in range(count)], path)
     finally:
         env.close()
     first = films[0]
@@ -245,8 +255,14 @@ def _film(config: EvaluationConfig, policy: ActingPolicy) -> tuple[Path, list[Pi
     return path, pictures
 
 
-def _describe(policy: ActingPolicy, path: Path | None) -> dict[str, Any]:
+def _describe(policy: ActingPolicy | Planner | str, path: Path | None) -> dict[str, Any]:
     """Where a policy comes from, for metrics.json."""
+    if isinstance(policy, str):
+        return {"path": None, "kind": policy}
+    if isinstance(policy, ViewQuality):
+        return {"path": None if path is None else str(path), "kind": policy.name, **policy.facts}
+    if isinstance(policy, LearnedPolicy):
+        policy = policy.policy
     if not isinstance(policy, Policy | ExportedPolicy):
         return {"path": None, "kind": type(policy).__name__}
     return {"path": None if path is None else str(path), **describe_policy(policy)}

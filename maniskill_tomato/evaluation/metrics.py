@@ -45,6 +45,7 @@ def summarise(episodes: Sequence[Episode]) -> dict[str, Any]:
     solved = [e for e in episodes if e.success]
     steps = np.array([e.steps for e in episodes])
     success = np.array([e.success for e in episodes])
+    touches = [e.plant_contact for e in episodes if e.plant_contact is not None]
     return {
         "episodes": count,
         "success_rate": len(solved) / count,
@@ -59,6 +60,7 @@ def summarise(episodes: Sequence[Episode]) -> dict[str, Any]:
         "mean_path_length_m": float(np.mean([e.path_length for e in episodes])),
         "unreachable_step_share": float(np.concatenate([e.reachability == 2 for e in episodes]).mean()),
         "forbidden_zone_step_share": float(np.concatenate([e.in_forbidden_zone for e in episodes]).mean()),
+        "plant_contact_step_share": float(np.concatenate(touches).mean()) if touches else None,
         "per_episode": {
             "seed": [e.seed for e in episodes],
             "success": [e.success for e in episodes],

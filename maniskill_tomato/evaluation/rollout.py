@@ -20,7 +20,7 @@ class ActingPolicy(Protocol):
     """Anything that turns observations into actions."""
 
     def act(self, observations: Tensor) -> Tensor:
-        """Actions of shape (B, 6) for observations of shape (B, 9), both in [m] and [rad]."""
+        """Actions for observations, a row per environment, both as the task has them."""
         ...
 
 
@@ -44,6 +44,8 @@ class Episode:
     """0 reached, 1 neighbour pose, 2 unreachable, for every step. Shape (T,)."""
     in_forbidden_zone: NDArray[np.bool_]
     """Whether each step ended in the forbidden zone. Shape (T,)."""
+    plant_contact: NDArray[np.bool_] | None = None
+    """Whether each step touched a plant; None where the task does not say. Shape (T,)."""
 
     @property
     def steps(self) -> int:
@@ -104,21 +106,42 @@ def _run_batch(env: gym.Env[Any, Any], policy: ActingPolicy, seeds: list[int]) -
     observations, info = env.reset(seed=seeds[0] if len(seeds) == 1 else seeds)  # type: ignore[arg-type]
     running = torch.ones(len(seeds), dtype=torch.bool, device=observations.device)
     success = torch.zeros_like(running)
-    views = [torch.cat((observations, info["visible_fraction"][:, None]), dim=-1)]
+    views = [_view(env, observations, info)]
     steps: list[Tensor] = []
     while bool(running.any()):
         observations, reward, terminated, truncated, info = env.step(policy.act(observations))
         success |= info["success"] & running
-        views.append(torch.cat((observations, info["visible_fraction"][:, None]), dim=-1))
-        outcome = (torch.as_tensor(reward), info["reachability"], info["in_forbidden_zone"], running)
+        views.append(_view(env, observations, info))
+        nowhere = torch.zeros_like(running)
+        outcome = (
+            torch.as_tensor(reward),
+            info["reachability"],
+            info.get("in_forbidden_zone", nowhere),
+            running,
+            info.get("plant_contact", nowhere),
+        )
         steps.append(torch.stack([value.float() for value in outcome], dim=-1))
         running = running & ~(terminated | truncated)
     seen = torch.stack(views).double().cpu().numpy()
     happened = torch.stack(steps).double().cpu().numpy()
-    return [_episode(seeds[i], bool(success[i]), seen[:, i], happened[:, i]) for i in range(len(seeds))]
+    contacts = "plant_contact" in info
+    return [
+        _episode(seeds[i], bool(success[i]), seen[:, i], happened[:, i], contacts) for i in range(len(seeds))
+    ]
 
 
-def _episode(seed: int, success: bool, seen: Float64, happened: Float64) -> Episode:
+def _view(env: gym.Env[Any, Any], observations: Tensor, info: dict[str, Tensor]) -> Tensor:
+    """Viewpoint, target and V_f of the present view. Shape (B, 10)."""
+    situation = getattr(env.unwrapped, "situation", None)
+    poses = (
+        observations[:, :9]
+        if situation is None
+        else torch.cat((situation.viewpoint, situation.target_position), dim=-1)
+    )
+    return torch.cat((poses, info["visible_fraction"][:, None]), dim=-1)
+
+
+def _episode(seed: int, success: bool, seen: Float64, happened: Float64, contacts: bool) -> Episode:
     """The part of one environment's record until its episode ended."""
     steps = int(happened[:, 3].sum())
     return Episode(
@@ -130,4 +153,5 @@ def _episode(seed: int, success: bool, seen: Float64, happened: Float64) -> Epis
         rewards=happened[:steps, 0],
         reachability=happened[:steps, 1].astype(np.int64),
         in_forbidden_zone=happened[:steps, 2].astype(np.bool_),
+        plant_contact=happened[:steps, 4].astype(np.bool_) if contacts else None,
     )

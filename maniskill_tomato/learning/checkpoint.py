@@ -148,11 +148,11 @@ def _sync_folder(folder: Path) -> None:
         os.close(descriptor)
 
 
-def load_checkpoint(path: Path | str, device: torch.device | str = "cpu") -> dict[str, Any]:
-    """The content of a checkpoint file (see `make_checkpoint`).
+def read_tensors(path: Path | str, device: torch.device | str = "cpu") -> Any:
+    """What `torch.save` wrote into a file: tensors, numbers, strings and containers of them, never code.
 
     Raises:
-        CheckpointError: The file is missing, damaged, not one of ours, or of a newer format.
+        CheckpointError: The file is missing or damaged.
     """
     path = Path(path)
     if not path.is_file():
@@ -181,6 +181,16 @@ def load_checkpoint(path: Path | str, device: torch.device | str = "cpu") -> dic
             f"{path} is not a readable checkpoint ({reason}); it may be truncated: "
             "use an earlier one from its run folder"
         ) from error
+    return data
+
+
+def load_checkpoint(path: Path | str, device: torch.device | str = "cpu") -> dict[str, Any]:
+    """The content of a checkpoint file (see `make_checkpoint`).
+
+    Raises:
+        CheckpointError: The file is missing, damaged, not one of ours, or of a newer format.
+    """
+    data = read_tensors(path, device)
     if not isinstance(data, dict) or any(key not in data for key in REQUIRED_KEYS):
         raise CheckpointError(
             f"{path} is not a checkpoint of this package, which would hold {', '.join(REQUIRED_KEYS)}"

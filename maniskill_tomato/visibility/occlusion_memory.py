@@ -109,6 +109,14 @@ class OcclusionMemory:
         return lengths / float(memory_kernels.PASS_UNIT)
 
     @property
+    def density(self) -> Tensor:
+        """What predictions rest on: expected hits per metre in each voxel. Shape (B, 32, 32, 32), float32."""
+        self.estimate()
+        # The sign tells known voxels from unknown ones.
+        per_edge = self._densities.abs().view(-1, GRID_CELLS, GRID_CELLS, GRID_CELLS)
+        return per_edge / CELL_SIZE
+
+    @property
     def target_position(self) -> Tensor:
         """The grids' centres, in the world frame, in [m]. Shape (B, 3)."""
         return self._centres

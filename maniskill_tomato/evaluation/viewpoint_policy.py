@@ -1,0 +1,72 @@
+"""Viewpoint policies in the evaluation: opened from files or by name, and asked as those of observations are."""
+
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+from torch import Tensor
+
+from maniskill_tomato.errors import CheckpointError
+from maniskill_tomato.evaluation.exported import open_policy
+from maniskill_tomato.evaluation.rollout import ActingPolicy
+from maniskill_tomato.learning.checkpoint import read_tensors
+from maniskill_tomato.planners.base import Planner
+from maniskill_tomato.planners.env_truth import EnvironmentTruth
+from maniskill_tomato.planners.learned import LearnedPolicy
+from maniskill_tomato.planners.registry import make_planner
+from maniskill_tomato.planners.view_quality import is_view_quality, load_view_quality
+from maniskill_tomato.tasks import GENERAL_IDS
+
+
+def open_viewpoint_policy(path: Path, env_id: str | None = None) -> Planner:
+    """Reads a policy for the general tasks: a view-quality policy, or one of observations (.pt or .onnx).
+
+    Args:
+        path: The file.
+        env_id: The task that it must fit; None accepts any. A view-quality policy fits all general tasks.
+
+    Raises:
+        CheckpointError: It is missing, damaged or made for another task.
+        PolicyError: The same of an exported one.
+    """
+    if path.suffix.lower() != ".onnx" and is_view_quality(read_tensors(path)):
+        if env_id is not None and env_id not in GENERAL_IDS:
+            raise CheckpointError(f"{path} is a policy for {', '.join(GENERAL_IDS)}, not for {env_id}")
+        return load_view_quality(path)
+    return LearnedPolicy(open_policy(path, env_id))
+
+
+class SituationPolicy:
+    """Looks at the situation of its environment where it is asked with observations."""
+
+    def __init__(self, policy: Planner, env: gym.Env[Any, Any]) -> None:
+        """Ties a policy to an environment.
+
+        Args:
+            policy: Decides.
+            env: A general viewpoint task.
+        """
+        self._policy = policy
+        self._world: Any = env.unwrapped
+
+    def act(self, observations: Tensor) -> Tensor:
+        """The policy's moves, whatever the observations are. Shape (B, 3)."""
+        situation = self._world.situation
+        fresh = (situation.memory.visits == 1).nonzero()[:, 0]
+        if len(fresh):
+            self._policy.begin(situation, fresh)
+        return self._policy.act(situation)
+
+
+def acting_policy(policy: ActingPolicy | Planner | str, env: gym.Env[Any, Any]) -> ActingPolicy:
+    """What `run_episodes` can ask in `env`; a string names a planner."""
+    if isinstance(policy, str):
+        truth = EnvironmentTruth(env)
+        policy = make_planner(
+            policy,
+            ground_truth=truth,
+            threshold=truth.threshold,
+            accept_way=truth.can_follow,
+            device=getattr(env.unwrapped, "device", "cpu"),
+        )
+    return SituationPolicy(policy, env) if isinstance(policy, Planner) else policy

@@ -1,0 +1,128 @@
+"""Data for the view-quality network: what was known after each look, and what every candidate view really shows."""
+
+from dataclasses import dataclass
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import torch
+from torch import Tensor
+
+from maniskill_tomato.planners.base import Planner
+from maniskill_tomato.planners.moves import Goals
+from maniskill_tomato.planners.next_best_view import NextBestView, NextBestViewConfig
+from maniskill_tomato.planners.quality_features import quality_features
+from maniskill_tomato.planners.quality_network import ViewQualityNetwork
+from maniskill_tomato.planners.view_quality import ViewQuality, ViewQualityConfig
+from maniskill_tomato.robot.look_at import look_at_pose
+from maniskill_tomato.visibility.situation import Situation
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class QualityData:
+    """N looks in M episodes."""
+
+    maps: Tensor
+    """Shape (N, 20, 13, 9), float16."""
+    scalars: Tensor
+    """Shape (N, 9)."""
+    episode: Tensor
+    """Row of each look in the tables below. Shape (N,), int64."""
+    visible_fraction: Tensor
+    """True V_f from every candidate. Shape (M, K), float16."""
+    reachable: Tensor
+    """Shape (M, K), bool."""
+
+    @classmethod
+    def join(cls, parts: list["QualityData"]) -> "QualityData":
+        """All of them, one after the other."""
+        offsets = np.cumsum([0, *(len(p.reachable) for p in parts[:-1])])
+        return cls(
+            maps=torch.cat([p.maps for p in parts]),
+            scalars=torch.cat([p.scalars for p in parts]),
+            episode=torch.cat([p.episode + int(o) for p, o in zip(parts, offsets, strict=True)]),
+            visible_fraction=torch.cat([p.visible_fraction for p in parts]),
+            reachable=torch.cat([p.reachable for p in parts]),
+        )
+
+
+class _Wanderer(Planner):
+    """The teacher's way through an episode: a planner of random settings that now and then goes somewhere else."""
+
+    name = "wanderer"
+
+    def __init__(self, rng: np.random.Generator, network: ViewQualityNetwork | None) -> None:
+        self._rng = rng
+        self._network = network
+
+    def begin(self, situation: Situation, env_idx: Tensor) -> None:
+        rng = self._rng
+        self._astray = rng.uniform(0.0, 0.5)
+        if self._network is None or rng.uniform() < 0.25:
+            config = NextBestViewConfig(move_cost=10.0 ** rng.uniform(-2.0, -0.7))
+            self._planner: Planner = NextBestView(situation.camera_position.device, config)
+        else:
+            patience = 10.0 ** rng.uniform(0.5, 1.2)
+            self._planner = ViewQuality(self._network, ViewQualityConfig(patience=patience))
+        self._planner.begin(situation, env_idx)
+        self._goals = Goals()
+        self._goals.begin(situation, env_idx)
+        self._on_goal = False
+
+    def act(self, situation: Situation) -> Tensor:
+        planned = self._planner.act(situation)
+        if self._on_goal and not bool(self._goals.ended(situation)[0]):
+            return self._goals.act(situation)
+        self._on_goal = bool(self._rng.uniform() < self._astray)
+        reachable = situation.reachable[0].nonzero()[:, 0]
+        if not self._on_goal or not len(reachable):
+            self._on_goal = False
+            return planned
+        k = reachable[int(self._rng.integers(len(reachable)))]
+        candidates = situation.lattice.positions(situation.target_position)
+        self._goals.set(candidates[:, k], torch.ones_like(situation.visible_fraction, dtype=torch.bool))
+        return self._goals.act(situation)
+
+
+def collect_episodes(
+    env: gym.Env[Any, Any], seeds: range, network: ViewQualityNetwork | None = None
+) -> QualityData:
+    """Runs episodes and keeps every look with the truth about all candidates.
+
+    Args:
+        env: A general viewpoint task with one environment.
+        seeds: Of the episodes.
+        network: Leads three quarters of the episodes; None leaves all to the planner on the occupancy map.
+    """
+    world: Any = env.unwrapped
+    maps: list[Tensor] = []
+    scalars: list[Tensor] = []
+    episode: list[int] = []
+    fractions: list[Tensor] = []
+    reachable: list[Tensor] = []
+    first = torch.zeros(1, dtype=torch.int64)
+    for seed in seeds:
+        env.reset(seed=seed)
+        situation: Situation = world.situation
+        target = situation.target_position[0]
+        poses = look_at_pose(situation.lattice.positions(situation.target_position)[0], target)
+        fractions.append(world.ground_truth.visible_fraction(poses).half())
+        reachable.append(situation.reachable[0].clone())
+        policy = _Wanderer(np.random.default_rng(seed), network)
+        policy.begin(situation, first)
+        done = False
+        while not done:
+            situation = world.situation
+            seen = quality_features(situation)
+            maps.append(seen[0][0].half())
+            scalars.append(seen[1][0])
+            episode.append(len(fractions) - 1)
+            _, _, terminated, truncated, _ = env.step(policy.act(situation))
+            done = bool(terminated) or bool(truncated)
+    return QualityData(
+        maps=torch.stack(maps),
+        scalars=torch.stack(scalars),
+        episode=torch.tensor(episode),
+        visible_fraction=torch.stack(fractions),
+        reachable=torch.stack(reachable),
+    )

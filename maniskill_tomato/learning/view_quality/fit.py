@@ -1,0 +1,152 @@
+"""Training of the view-quality network by what the candidates really showed."""
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+from torch.nn import functional
+
+from maniskill_tomato.errors import InvalidInputError, TrainingDivergedError
+from maniskill_tomato.learning.view_quality.collect import QualityData
+from maniskill_tomato.planners.quality_network import ViewQualityNetwork
+from maniskill_tomato.planners.view_quality import new_network
+
+
+@dataclass(frozen=True, kw_only=True)
+class FitConfig:
+    """How the network is trained."""
+
+    steps: int = 4000
+    """Batches."""
+    batch_size: int = 128
+    """Looks in each."""
+    learning_rate: float = 2e-3
+    """Of AdamW at the start; it falls to nothing along half a cosine."""
+    weight_decay: float = 1e-3
+    """Of AdamW."""
+    width: int = 32
+    """Channels of the network's maps."""
+    blocks: int = 3
+    """Its residual blocks."""
+    full_visibility: float = 0.8
+    """V_f above which a view is a full one."""
+    fraction_weight: float = 2.0
+    """Weight of the squared error of V_f beside the cross entropy of full views."""
+    mirror: bool = True
+    """Also learn from the mirror images of the looks, left and right exchanged."""
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        for name in ("steps", "batch_size", "width", "blocks"):
+            if getattr(self, name) < 1:
+                raise InvalidInputError(f"{name} must be 1 or more, got {getattr(self, name)}")
+        if not 0.0 < self.learning_rate < 1.0:
+            raise InvalidInputError(f"learning_rate must be in (0, 1), got {self.learning_rate}")
+        if not 0.0 < self.full_visibility < 1.0:
+            raise InvalidInputError(f"full_visibility must be in (0, 1), got {self.full_visibility}")
+
+
+def losses(
+    network: ViewQualityNetwork, data: QualityData, rows: Tensor, threshold: float, flip: Tensor | None = None
+) -> tuple[Tensor, Tensor]:
+    """Mean cross entropy of full views and mean squared error of V_f, over the candidates that the arm reaches.
+
+    Args:
+        network: Judged.
+        data: Looks and truth.
+        rows: Which looks. Shape (B,).
+        threshold: V_f above which a view is full.
+        flip: Which of them to mirror. Shape (B,), bool.
+    """
+    maps, scalars = data.maps[rows].float(), data.scalars[rows]
+    episode = data.episode[rows]
+    if flip is not None:
+        maps, scalars = mirrored(maps, scalars, flip)
+    logits, fraction = network(maps, scalars)
+    truth = data.visible_fraction[episode].float().view(fraction.shape)
+    reachable = data.reachable[episode].float().view(fraction.shape)
+    if flip is not None:
+        truth = torch.where(flip[:, None, None, None], truth.flip(1), truth)
+        reachable = torch.where(flip[:, None, None, None], reachable.flip(1), reachable)
+    full = (truth > threshold).float()
+    count = reachable.sum()
+    entropy = functional.binary_cross_entropy_with_logits(logits, full, weight=reachable, reduction="sum")
+    return entropy / count, ((fraction - truth).square() * reachable).sum() / count
+
+
+def mirrored(maps: Tensor, scalars: Tensor, flip: Tensor) -> tuple[Tensor, Tensor]:
+    """Features of the scene mirrored in the plane y = 0, where `flip` is set.
+
+    Azimuth runs from one side to the other and y changes its sign; the arm and the rows have that symmetry.
+    """
+    sign = scalars.new_ones(scalars.shape[1])
+    sign[[3, 6]] = -1.0
+    return (
+        torch.where(flip[:, None, None, None], maps.flip(2), maps),
+        torch.where(flip[:, None], scalars * sign, scalars),
+    )
+
+
+def fit(
+    data: QualityData,
+    config: FitConfig | None = None,
+    validation: QualityData | None = None,
+    report: Callable[[int, dict[str, float]], None] = lambda step, values: None,
+    network: ViewQualityNetwork | None = None,
+) -> ViewQualityNetwork:
+    """Trains a network, or goes on with one.
+
+    Args:
+        data: Looks and truth.
+        config: How to train.
+        validation: Looks in other episodes, judged now and then.
+        report: Told the step and the losses about every 200 steps.
+        network: To go on with; a fresh one if None.
+
+    Raises:
+        TrainingDivergedError: A loss is not finite.
+    """
+    config = config or FitConfig()
+    torch.manual_seed(config.seed)
+    generator = torch.Generator().manual_seed(config.seed)
+    network = network or new_network(config.width, config.blocks)
+    network.train().requires_grad_(True)
+    optimizer = torch.optim.AdamW(
+        network.parameters(), lr=config.learning_rate, weight_decay=config.weight_decay, fused=True
+    )
+    schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, config.steps)
+    start = time.perf_counter()
+    count = len(data.scalars)
+    for step in range(1, config.steps + 1):
+        rows = torch.randint(count, (config.batch_size,), generator=generator)
+        flip = torch.rand(config.batch_size, generator=generator) < 0.5 if config.mirror else None
+        entropy, error = losses(network, data, rows, config.full_visibility, flip)
+        loss = entropy + config.fraction_weight * error
+        if not bool(loss.isfinite()):
+            raise TrainingDivergedError(f"the loss of step {step} is not finite; lower learning_rate")
+        optimizer.zero_grad()
+        loss.backward()  # type: ignore[no-untyped-call]
+        optimizer.step()
+        schedule.step()
+        if step % 200 == 0 or step == config.steps:
+            values = {"cross_entropy": entropy.item(), "squared_error": error.item()}
+            if validation is not None:
+                judged = judge(network, validation, config.full_visibility)
+                values |= {f"validation_{name}": value for name, value in judged.items()}
+            values["seconds"] = time.perf_counter() - start
+            report(step, values)
+    return network.eval().requires_grad_(False)
+
+
+def judge(
+    network: ViewQualityNetwork, data: QualityData, threshold: float, most: int = 600
+) -> dict[str, float]:
+    """Cross entropy and squared error over up to `most` looks, evenly spread."""
+    rows = torch.linspace(0, len(data.scalars) - 1, min(most, len(data.scalars))).long()
+    network.eval()
+    with torch.no_grad():
+        entropy, error = losses(network, data, rows, threshold)
+    network.train()
+    return {"cross_entropy": entropy.item(), "squared_error": error.item()}

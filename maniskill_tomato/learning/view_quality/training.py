@@ -1,0 +1,195 @@
+"""From nothing to a view-quality policy: rounds of episodes and fits, kept in a folder and continued from there."""
+
+import io
+import json
+import logging
+import multiprocessing
+import time
+from collections.abc import Callable
+from concurrent.futures import Future, ProcessPoolExecutor, as_completed
+from dataclasses import asdict, dataclass, field, fields
+from pathlib import Path
+from typing import Any
+
+import torch
+
+import maniskill_tomato
+from maniskill_tomato.errors import CheckpointError, InvalidInputError
+from maniskill_tomato.learning.checkpoint import read_tensors, write_atomically
+from maniskill_tomato.learning.envs import make_env
+from maniskill_tomato.learning.view_quality.collect import QualityData, collect_episodes
+from maniskill_tomato.learning.view_quality.fit import FitConfig, fit
+from maniskill_tomato.planners.quality_network import ViewQualityNetwork
+from maniskill_tomato.planners.view_quality import ViewQuality, load_view_quality, save_view_quality
+
+logger = logging.getLogger(__name__)
+
+ENV_ID = "TomatoViewpoint-v1"
+
+VALIDATION_SEED = 900_000_000
+"""Seed of the first validation episode; training episodes stay below."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class QualityTrainConfig:
+    """A training."""
+
+    rounds: tuple[int, ...] = (3000, 3000)
+    """Episodes of each round. The first is led by the planner on the occupancy map, the later ones mostly by the
+    network of the round before."""
+    pool: int = 120
+    """Training plants that three quarters of the episodes draw from; the others grow a new one each."""
+    block: int = 100
+    """Episodes that a process runs and writes at a time; what a stopped training repeats."""
+    validation_episodes: int = 200
+    """Episodes on the validation plants, for the losses in the log."""
+    fit: FitConfig = field(default_factory=FitConfig)
+    """How each round's network is trained, the first from scratch, the others going on from the one before."""
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        for name in ("pool", "block", "validation_episodes"):
+            if getattr(self, name) < 1:
+                raise InvalidInputError(f"{name} must be 1 or more, got {getattr(self, name)}")
+        if not self.rounds or min(self.rounds) < 1:
+            raise InvalidInputError(f"rounds must list one or more numbers above 0, got {self.rounds}")
+        if not 0 <= self.seed < 100 or max(self.rounds) * len(self.rounds) > VALIDATION_SEED // 100:
+            raise InvalidInputError(
+                "seed must be from 0 to 99 and the rounds hold less than 9 million episodes"
+            )
+
+
+def train_view_quality(
+    out: Path,
+    config: QualityTrainConfig | None = None,
+    jobs: int = 1,
+    env_options: dict[str, Any] | None = None,
+    report: Callable[[str], None] = lambda line: None,
+) -> Path:
+    """Trains, or goes on with the training in a folder.
+
+    Args:
+        out: Folder of the data, the log and the networks.
+        config: How; the folder's own on a training that goes on.
+        jobs: Processes that run episodes.
+        env_options: Options of the task beside its plants' split.
+        report: Told one line after every block and every 200 batches.
+
+    Returns:
+        File of the last round's policy, `policy.pt`.
+
+    Raises:
+        InvalidInputError: The folder holds a training with another configuration.
+    """
+    config = config or QualityTrainConfig()
+    settings = {"config": asdict(config), "env_options": env_options or {}}
+    # As JSON tells it, with lists for tuples.
+    settings = json.loads(json.dumps(settings))
+    described = out / "config.json"
+    if described.is_file() and json.loads(described.read_text()) != settings:
+        raise InvalidInputError(f"{out} holds a training with other settings; choose another folder")
+    out.mkdir(parents=True, exist_ok=True)
+    write_atomically(described, json.dumps(settings, indent=2).encode())
+    start = time.perf_counter()
+    options = env_options or {}
+    count = -(-config.validation_episodes // config.block)
+    validation_plan = [
+        _Block(
+            out / f"validation-{b}.pt", VALIDATION_SEED + b * config.block, config.block, "validation", None
+        )
+        for b in range(count)
+    ]
+    network: ViewQualityNetwork | None = None
+    plan: list[_Block] = []
+    for number, episodes in enumerate(config.rounds):
+        policy_path = out / f"round-{number}.pt"
+        before = None if number == 0 else out / f"round-{number - 1}.pt"
+        first = (config.seed * len(config.rounds) + number) * max(config.rounds)
+        plan += [
+            _Block(
+                out / f"train-{number}-{b}.pt",
+                first + b * config.block,
+                config.block,
+                "train",
+                # A quarter of the blocks meets new plants only.
+                None if b % 4 == 3 else config.pool,
+                before,
+            )
+            for b in range(-(-episodes // config.block))
+        ]
+        if policy_path.is_file():
+            network = load_view_quality(policy_path).network
+            continue
+        _run_blocks([*validation_plan, *plan], options, jobs, report)
+        data, validation = _load(plan), _load(validation_plan)
+        report(f"round {number}: {len(data.scalars)} looks in {len(data.reachable)} episodes")
+        network = fit(
+            data,
+            config.fit,
+            validation,
+            lambda step, values: report(
+                f"batch {step}: " + ", ".join(f"{name} {value:.4g}" for name, value in values.items())
+            ),
+            network,
+        )
+        facts = {
+            "env_id": ENV_ID,
+            "env_options": json.dumps(env_options or {}),
+            "package_version": maniskill_tomato.__version__,
+            "looks": len(data.scalars),
+            "episodes": len(data.reachable),
+            "seconds": round(time.perf_counter() - start, 1),
+            "seed": config.seed,
+        }
+        save_view_quality(policy_path, ViewQuality(network, facts=facts))
+    path = out / "policy.pt"
+    write_atomically(path, (out / f"round-{len(config.rounds) - 1}.pt").read_bytes())
+    return path
+
+
+@dataclass(frozen=True)
+class _Block:
+    path: Path
+    first: int
+    episodes: int
+    split: str
+    pool: int | None
+    policy: Path | None = None
+
+
+def _run_blocks(
+    blocks: list[_Block], options: dict[str, Any], jobs: int, report: Callable[[str], None]
+) -> None:
+    missing = [block for block in blocks if not block.path.is_file()]
+    # ManiSkill and Warp start once in each process, which must not be a fork of one that has them.
+    with ProcessPoolExecutor(jobs, mp_context=multiprocessing.get_context("spawn")) as pool:
+        futures: dict[Future[int], _Block] = {
+            pool.submit(_run_block, block, options): block for block in missing
+        }
+        for done, future in enumerate(as_completed(futures), start=1):
+            report(f"{futures[future].path.name}: {future.result()} looks ({done} of {len(missing)} blocks)")
+
+
+def _run_block(block: _Block, options: dict[str, Any]) -> int:
+    torch.set_num_threads(1)
+    network = None if block.policy is None else load_view_quality(block.policy).network
+    plant = {"seed": block.split, "pool": block.pool, **dict(options.get("plant", {}))}
+    env = make_env(ENV_ID, **{**options, "plant": plant})
+    try:
+        data = collect_episodes(env, range(block.first, block.first + block.episodes), network)
+    finally:
+        env.close()
+    buffer = io.BytesIO()
+    torch.save({f.name: getattr(data, f.name) for f in fields(QualityData)}, buffer)
+    write_atomically(block.path, buffer.getvalue())
+    return len(data.scalars)
+
+
+def _load(blocks: list[_Block]) -> QualityData:
+    parts = []
+    for block in blocks:
+        try:
+            parts.append(QualityData(**read_tensors(block.path)))
+        except TypeError as error:
+            raise CheckpointError(f"{block.path} holds no looks: {error}; delete it and go on") from error
+    return QualityData.join(parts)

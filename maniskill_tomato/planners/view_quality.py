@@ -1,0 +1,140 @@
+"""A learned map of how good views are, and a search on it: the policy that looks where a full view is likely and near.
+
+The network has seen, for thousands of hidden tomatoes, what the memory knew after a few looks and how much of the
+target every candidate view would really have shown. At each step the policy moves towards the candidate with the
+largest P(full view) x `patience` - moves: with moves as the cost, `patience` is what it expects to need from here if
+a look fails, the rule that is best when looks succeed or fail independently and their number is not bounded.
+"""
+
+import io
+import math
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any, Final
+
+import torch
+from torch import Tensor
+
+from maniskill_tomato.errors import CheckpointError, InvalidInputError
+from maniskill_tomato.learning.checkpoint import read_tensors, write_atomically
+from maniskill_tomato.planners.base import Planner
+from maniskill_tomato.planners.moves import move_towards, moves_needed
+from maniskill_tomato.planners.quality_features import MAP_CHANNELS, SCALARS, quality_features
+from maniskill_tomato.planners.quality_network import ViewQualityNetwork
+from maniskill_tomato.robot.look_at_move import MAX_MOVE
+from maniskill_tomato.visibility.situation import Situation
+from maniskill_tomato.visibility.view_lattice import DISTANCES
+
+FORMAT: Final = "view-quality-1"
+
+
+@dataclass(frozen=True, kw_only=True)
+class ViewQualityConfig:
+    """How the policy weighs."""
+
+    patience: float = 8.0
+    """Moves that are worth a certain full view."""
+
+    def __post_init__(self) -> None:
+        if not 0.0 < self.patience < math.inf:
+            raise InvalidInputError(f"patience must be a positive number, got {self.patience}")
+
+
+class ViewQuality(Planner):
+    """Moves towards the view that the network thinks most of."""
+
+    name = "view_quality"
+
+    def __init__(
+        self,
+        network: ViewQualityNetwork,
+        config: ViewQualityConfig | None = None,
+        facts: dict[str, Any] | None = None,
+    ) -> None:
+        """Keeps the network.
+
+        Args:
+            network: Judges the candidates.
+            config: How the policy weighs.
+            facts: Numbers and strings about its training.
+        """
+        self.network = network.eval().requires_grad_(False)
+        self.config = config or ViewQualityConfig()
+        self.facts = facts or {}
+        self._refused = torch.zeros(0, 0, dtype=torch.bool)
+        self._chosen = torch.zeros(0, dtype=torch.int64)
+        self._before = torch.zeros(0, 3)
+
+    def begin(self, situation: Situation, env_idx: Tensor) -> None:
+        if self._refused.shape != situation.reachable.shape:
+            self._refused = torch.zeros_like(situation.reachable)
+            self._chosen = torch.zeros_like(situation.reachable[:, 0], dtype=torch.int64)
+            self._before = torch.full_like(situation.camera_position, math.nan)
+        self._refused[env_idx] = False
+        self._before[env_idx] = math.nan
+
+    def success_probability(self, situation: Situation) -> Tensor:
+        """P(full view) of every candidate. Shape (B, K)."""
+        with torch.no_grad():
+            logits, _ = self.network(*quality_features(situation))
+        probability: Tensor = logits.flatten(1).sigmoid()
+        return probability
+
+    def act(self, situation: Situation) -> Tensor:
+        """Towards the best view."""
+        position, target = situation.camera_position, situation.target_position
+        stuck = (position - self._before).norm(dim=-1) < 0.1 * MAX_MOVE
+        rows = torch.arange(len(position), device=position.device)
+        self._refused[rows[stuck], self._chosen[stuck]] = True
+        candidates = situation.lattice.positions(target)
+        way = (candidates - position[:, None]).norm(dim=-1)
+        worth = self.config.patience * self.success_probability(situation) - moves_needed(way)
+        # A view from here has been taken; a refused one was tried in vain.
+        allowed = situation.reachable & ~self._refused & (way > 0.25 * MAX_MOVE)
+        self._chosen = torch.where(allowed, worth, -math.inf).argmax(dim=1)
+        self._before = position.clone()
+        return move_towards(position, target, candidates[rows, self._chosen])
+
+
+def save_view_quality(path: Path, policy: ViewQuality) -> None:
+    """Writes the network, the settings and the facts."""
+    data = {
+        "format": FORMAT,
+        "sizes": policy.network.sizes,
+        "weights": policy.network.state_dict(),
+        "config": asdict(policy.config),
+        "facts": policy.facts,
+    }
+    buffer = io.BytesIO()
+    torch.save(data, buffer)
+    write_atomically(path, buffer.getvalue())
+
+
+def load_view_quality(path: Path, device: str | torch.device = "cpu") -> ViewQuality:
+    """Reads what `save_view_quality` wrote.
+
+    Raises:
+        CheckpointError: The file is missing, damaged, or of something else.
+    """
+    data = read_tensors(path, device)
+    if not is_view_quality(data):
+        raise CheckpointError(f"{path} holds no view-quality policy; scripts/train_view_quality.py makes one")
+    try:
+        network = ViewQualityNetwork(**data["sizes"])
+        network.load_state_dict(data["weights"])
+        config, facts = ViewQualityConfig(**data["config"]), dict(data["facts"])
+    except (KeyError, TypeError, ValueError, RuntimeError) as error:
+        raise CheckpointError(f"{path} does not fit itself: {error}; train the policy again") from error
+    if not all(bool(p.isfinite().all()) for p in network.parameters()):
+        raise CheckpointError(f"{path} holds weights that are not finite; train it again")
+    return ViewQuality(network.to(device), config, facts)
+
+
+def is_view_quality(data: object) -> bool:
+    """Whether the content of a file is of `save_view_quality`."""
+    return isinstance(data, dict) and data.get("format") == FORMAT
+
+
+def new_network(width: int = 32, blocks: int = 3) -> ViewQualityNetwork:
+    """A fresh network for the features of `quality_features`."""
+    return ViewQualityNetwork(MAP_CHANNELS, SCALARS, DISTANCES, width, blocks)

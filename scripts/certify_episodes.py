@@ -1,0 +1,137 @@
+"""Certifies the fixed lists of episodes: asks the oracle in how many moves each target can be seen.
+
+Without a list, one is drawn first as the task draws its episodes from a split. Only episodes that were not asked about
+are; the list is written after every block, so that a run that was stopped goes on where it was.
+
+Usage:
+    python scripts/certify_episodes.py --list held_out --count 1000 --jobs 2
+    python scripts/certify_episodes.py --list validation --count 200
+"""
+
+import logging
+import multiprocessing
+import os
+import sys
+import time
+from collections.abc import Iterator
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+import tyro
+
+from maniskill_tomato.assets import ASSETS_DIR
+from maniskill_tomato.errors import InvalidInputError, TomatoError
+from maniskill_tomato.learning.envs import make_env
+from maniskill_tomato.planners.env_truth import EnvironmentTruth
+from maniskill_tomato.planners.oracle import OracleSearch
+from maniskill_tomato.tasks.episode_draw import draw_episodes
+from maniskill_tomato.tasks.episode_list import EPISODE_LISTS, Episode, read_episodes, write_episodes
+
+logger = logging.getLogger("certify_episodes")
+
+BLOCK = 20
+"""Episodes that one process certifies at a time."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Args:
+    """Options."""
+
+    list: str
+    """validation or held_out."""
+    count: int
+    """How many episodes to draw where there is no list yet."""
+    out: Path | None = None
+    """File of the list; by default that of the package."""
+    jobs: int = 1
+    """Processes at a time."""
+    contact_free: bool = False
+    """Ask for a way that does not touch the plant."""
+    again: bool = False
+    """Also ask about episodes that are certified already."""
+
+
+def certify(episodes: list[Episode], contact_free: bool) -> list[Episode]:
+    """The episodes with the fewest moves that the oracle finds within the task's limit."""
+    env: Any = make_env("TomatoViewpoint-v1", episodes=episodes)
+    world = env.unwrapped
+    truth = EnvironmentTruth(env, contact_free)
+    search = OracleSearch(truth, truth.threshold, world.device, accept=truth.can_follow)
+    certified = []
+    for number, episode in enumerate(episodes):
+        env.reset(options={"episode": number})
+        situation = world.situation
+        solution = search.solve(
+            situation.camera_position[0], situation.target_position[0], 0, int(world.task.max_moves)
+        )
+        moves = None if solution is None else solution.moves
+        certified.append(replace(episode, oracle_moves=moves, certified=True))
+    env.close()
+    return certified
+
+
+def certify_all(episodes: list[Episode], args: Args) -> Iterator[list[Episode]]:
+    """The list after each further block is certified."""
+    known = list(episodes)
+    open_ones = [i for i, episode in enumerate(episodes) if args.again or not episode.certified]
+    blocks = [open_ones[i : i + BLOCK] for i in range(0, len(open_ones), BLOCK)]
+    context = multiprocessing.get_context("spawn")
+    with ProcessPoolExecutor(args.jobs, mp_context=context, initializer=_start_process) as pool:
+        work = [pool.submit(certify, [episodes[i] for i in block], args.contact_free) for block in blocks]
+        for block, future in zip(blocks, work, strict=True):
+            for i, episode in zip(block, future.result(), strict=True):
+                known[i] = episode
+            yield known
+
+
+def describe(episodes: list[Episode]) -> str:
+    """How many are solved, and in how many moves."""
+    moves = np.array([e.oracle_moves for e in episodes if e.oracle_moves is not None])
+    text = f"{len(episodes)} episodes, {len(moves)} solved by the oracle"
+    if not len(moves):
+        return text
+    shares = ", ".join(f"{k}: {np.mean(moves == k):.1%}" for k in sorted(set(moves.tolist())))
+    return f"{text}, mean moves {moves.mean():.3f} ({shares})"
+
+
+def _tell_drawn(count: int) -> None:
+    if count % 50 == 0:
+        logger.info("%d drawn", count)
+
+
+def _start_process() -> None:
+    os.environ["OMP_NUM_THREADS"] = "1"
+    torch.set_num_threads(1)
+
+
+def main(args: Args) -> None:
+    """Draws the list if there is none, and certifies it."""
+    if args.list not in EPISODE_LISTS:
+        raise InvalidInputError.choice("--list", args.list, EPISODE_LISTS)
+    if args.count < 1 or args.jobs < 1:
+        raise InvalidInputError(f"--count and --jobs must be 1 or more, got {args.count} and {args.jobs}")
+    out = args.out or ASSETS_DIR / "episodes" / f"{args.list}.json"
+    if out.is_file():
+        episodes = list(read_episodes(out))
+    else:
+        episodes = draw_episodes(args.list, args.count, on_episode=_tell_drawn)
+        write_episodes(out, episodes)
+    started = time.monotonic()
+    for known in certify_all(episodes, args):
+        write_episodes(out, known)
+        episodes = list(known)
+        done = sum(episode.certified for episode in known)
+        logger.info("%d of %d certified, %.0f s", done, len(known), time.monotonic() - started)
+    print(f"{out}: {describe(episodes)}")
+
+
+if __name__ == "__main__":
+    logging.basicConfig(level=logging.INFO, format="%(message)s")
+    try:
+        main(tyro.cli(Args, description=__doc__))
+    except TomatoError as error:
+        sys.exit(f"error: {error}")
