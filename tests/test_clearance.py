@@ -108,7 +108,7 @@ def test_clearance_follows_a_replaced_plant() -> None:
 def test_spheres_cover_their_link(name: str) -> None:
     vertices, faces = link_meshes()[name]
     mesh = trimesh.Trimesh(vertices, faces, process=False)
-    samples, _ = trimesh.sample.sample_surface(mesh, 4000, seed=0)
+    samples = trimesh.sample.sample_surface(mesh, 4000, seed=0)[0]
     points = np.concatenate([vertices, samples])
     spheres = np.array(LINK_SPHERES[name])
     outside = np.linalg.norm(points[:, None] - spheres[:, :3], axis=2) - spheres[:, 3]

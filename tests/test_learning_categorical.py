@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import replace
+from typing import Any
 
 import pytest
 import torch
@@ -148,7 +149,12 @@ def test_a_categorical_agent_finds_the_best_action_of_a_known_reward() -> None:
 
 
 def test_atoms_are_checked() -> None:
-    for changes in ({"value_atoms": 1}, {"value_range": (1.0, 1.0)}, {"value_range": (2.0, -2.0)}):
+    wrong: list[dict[str, Any]] = [
+        {"value_atoms": 1},
+        {"value_range": (1.0, 1.0)},
+        {"value_range": (2.0, -2.0)},
+    ]
+    for changes in wrong:
         with pytest.raises(InvalidInputError, match="2 or more value_atoms over a rising value_range"):
             TrainConfig(total_timesteps=1, **changes)
     with pytest.raises(

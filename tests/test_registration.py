@@ -19,7 +19,7 @@ EXPECTED_IDS = (
     "TomatoViewpointRow-v1",
 )
 
-HORIZONS = dict(zip(EXPECTED_IDS, (30, 30, 20, 120), strict=True))
+HORIZONS: dict[str, int] = dict(zip(EXPECTED_IDS, (30, 30, 20, 120), strict=True))
 
 
 def run_python(code: str, cwd: Path, *arguments: str) -> "subprocess.CompletedProcess[str]":
