@@ -34,7 +34,8 @@ from maniskill_tomato.errors import TomatoError
 from maniskill_tomato.evaluation.evaluate import write_trajectories
 from maniskill_tomato.evaluation.metrics import make_metrics, write_metrics
 from maniskill_tomato.evaluation.rollout import run_episodes
-from maniskill_tomato.learning.checkpoint import save_checkpoint, write_atomically
+from maniskill_tomato.files import write_atomically
+from maniskill_tomato.learning.checkpoint import save_checkpoint
 from maniskill_tomato.learning.envs import make_env
 from maniskill_tomato.learning.export import DenseActor, export_actor
 from maniskill_tomato.learning.gymnasium_env import Array, make_gymnasium_env, normalize_observation

@@ -19,7 +19,7 @@ from maniskill_tomato.errors import InvalidInputError, SeedsFailedError, TomatoE
 from maniskill_tomato.evaluation.metrics import make_metrics, write_metrics
 from maniskill_tomato.evaluation.reproduction import EVALUATION_SEED
 from maniskill_tomato.evaluation.rollout import run_episodes
-from maniskill_tomato.learning.checkpoint import write_atomically
+from maniskill_tomato.files import write_atomically
 from maniskill_tomato.learning.envs import make_env
 from maniskill_tomato.learning.history import TrainingCurves, load_history
 from maniskill_tomato.learning.policy import load_policy

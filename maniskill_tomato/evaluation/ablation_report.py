@@ -12,7 +12,7 @@ import maniskill_tomato
 from maniskill_tomato.evaluation.ablation import SOLVED, WINDOW, LearnerVariant
 from maniskill_tomato.evaluation.comparison import Interval, bootstrap_interval
 from maniskill_tomato.evaluation.comparison_report import interval_text
-from maniskill_tomato.learning.checkpoint import write_atomically
+from maniskill_tomato.files import write_atomically
 
 HEAD = (
     "task",

@@ -11,7 +11,7 @@ from maniskill_tomato.evaluation.benchmark_conditions import Condition
 from maniskill_tomato.evaluation.benchmark_metrics import compare_policies, summarise_policy
 from maniskill_tomato.evaluation.benchmark_plots import plot_progress, plot_sweeps, plot_thresholds
 from maniskill_tomato.evaluation.view_episode import ViewEpisode
-from maniskill_tomato.learning.checkpoint import write_atomically
+from maniskill_tomato.files import write_atomically
 
 HEAD = (
     "policy",

@@ -14,7 +14,7 @@ from typing import Any
 
 from maniskill_tomato.errors import InvalidInputError
 from maniskill_tomato.evaluation.view_episode import ViewEpisode
-from maniskill_tomato.learning.checkpoint import write_atomically
+from maniskill_tomato.files import write_atomically
 
 logger = logging.getLogger(__name__)
 

@@ -17,8 +17,8 @@ from maniskill_tomato.errors import InvalidInputError
 from maniskill_tomato.evaluation.experiments import Evaluation, Experiment, Variant
 from maniskill_tomato.evaluation.metrics import summarise
 from maniskill_tomato.evaluation.rollout import Episode, run_episodes
+from maniskill_tomato.files import write_atomically
 from maniskill_tomato.learning.agent import make_actor, make_normalizer
-from maniskill_tomato.learning.checkpoint import write_atomically
 from maniskill_tomato.learning.envs import LearnerEnv, make_env, make_learner_env
 from maniskill_tomato.learning.history import load_history
 from maniskill_tomato.learning.policy import Policy, load_policy

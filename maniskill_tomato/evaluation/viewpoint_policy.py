@@ -9,7 +9,7 @@ from torch import Tensor
 from maniskill_tomato.errors import CheckpointError
 from maniskill_tomato.evaluation.exported import open_policy
 from maniskill_tomato.evaluation.rollout import ActingPolicy
-from maniskill_tomato.learning.checkpoint import read_tensors
+from maniskill_tomato.files import read_tensors
 from maniskill_tomato.planners.base import Planner
 from maniskill_tomato.planners.env_truth import EnvironmentTruth
 from maniskill_tomato.planners.learned import LearnedPolicy

@@ -1,11 +1,7 @@
 """Checkpoints: weights with everything needed to use them, written whole or not at all."""
 
-import contextlib
 import io
 import json
-import os
-import pickle
-import zipfile
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +10,7 @@ from torch import Tensor
 
 import maniskill_tomato
 from maniskill_tomato.errors import CheckpointError
+from maniskill_tomato.files import read_tensors, write_atomically
 from maniskill_tomato.learning.agent import Agent
 from maniskill_tomato.learning.presets import ACTION_NAMES, OBSERVATION_NAMES
 
@@ -112,76 +109,6 @@ def save_checkpoint(path: Path, data: dict[str, Any]) -> None:
     buffer = io.BytesIO()
     torch.save(data, buffer)
     write_atomically(path, buffer.getvalue())
-
-
-def write_atomically(path: Path, content: bytes) -> None:
-    """Replaces the file `path` by one with `content` in a single step.
-
-    Raises:
-        CheckpointError: The file cannot be written.
-    """
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        with temporary.open("wb") as file:
-            file.write(content)
-            file.flush()
-            os.fsync(file.fileno())
-        temporary.replace(path)
-        _sync_folder(path.parent)
-    except OSError as error:
-        with contextlib.suppress(OSError):
-            temporary.unlink(missing_ok=True)
-        raise CheckpointError(
-            f"cannot write {path}: {error.strerror or error}; what was there before is kept. Free some space "
-            "or choose another --out; a run goes on with --resume"
-        ) from error
-
-
-def _sync_folder(folder: Path) -> None:
-    """Makes a rename in `folder` last through a power failure, where the file system can."""
-    descriptor = os.open(folder, os.O_RDONLY)
-    try:
-        with contextlib.suppress(OSError):
-            os.fsync(descriptor)
-    finally:
-        os.close(descriptor)
-
-
-def read_tensors(path: Path | str, device: torch.device | str = "cpu") -> Any:
-    """What `torch.save` wrote into a file: tensors, numbers, strings and containers of them, never code.
-
-    Raises:
-        CheckpointError: The file is missing or damaged.
-    """
-    path = Path(path)
-    if not path.is_file():
-        raise CheckpointError(
-            f"no checkpoint at {path}; `maniskill-tomato train` writes policy.pt into its run folder"
-        )
-    try:
-        content = io.BytesIO(path.read_bytes())
-        # torch does not compare the archive's checksums, so that flipped bits would become weights.
-        with zipfile.ZipFile(content) as archive:
-            if (bad := archive.testzip()) is not None:
-                raise zipfile.BadZipFile(f"wrong checksum of {bad}")
-        content.seek(0)
-        data = torch.load(content, map_location=device, weights_only=True)
-    except (
-        RuntimeError,
-        EOFError,
-        OSError,
-        ValueError,
-        KeyError,
-        pickle.UnpicklingError,
-        zipfile.BadZipFile,
-    ) as error:
-        reason = (str(error).splitlines() or [type(error).__name__])[0]
-        raise CheckpointError(
-            f"{path} is not a readable checkpoint ({reason}); it may be truncated: "
-            "use an earlier one from its run folder"
-        ) from error
-    return data
 
 
 def load_checkpoint(path: Path | str, device: torch.device | str = "cpu") -> dict[str, Any]:

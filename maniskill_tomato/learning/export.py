@@ -22,7 +22,8 @@ from torch import nn
 
 import maniskill_tomato
 from maniskill_tomato.errors import InvalidInputError, PolicyError
-from maniskill_tomato.learning.checkpoint import load_checkpoint, write_atomically
+from maniskill_tomato.files import write_atomically
+from maniskill_tomato.learning.checkpoint import load_checkpoint
 from maniskill_tomato.learning.networks import ObservationNormalizer
 from maniskill_tomato.learning.policy import load_policy
 from maniskill_tomato.policy.description import (

@@ -14,7 +14,7 @@ import torch
 from numpy.typing import NDArray
 
 from maniskill_tomato.errors import InvalidInputError
-from maniskill_tomato.learning.checkpoint import write_atomically
+from maniskill_tomato.files import write_atomically
 
 _Record = TypeVar("_Record")
 

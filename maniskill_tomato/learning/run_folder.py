@@ -12,7 +12,8 @@ from typing import Any
 
 import maniskill_tomato
 from maniskill_tomato.errors import CheckpointError, InvalidInputError
-from maniskill_tomato.learning.checkpoint import load_checkpoint, write_atomically
+from maniskill_tomato.files import write_atomically
+from maniskill_tomato.learning.checkpoint import load_checkpoint
 from maniskill_tomato.learning.presets import MAY_CHANGE, TrainConfig
 
 logger = logging.getLogger(__name__)

@@ -20,7 +20,7 @@ from tqdm import tqdm
 
 import maniskill_tomato
 from maniskill_tomato.errors import InvalidInputError
-from maniskill_tomato.learning.checkpoint import write_atomically
+from maniskill_tomato.files import write_atomically
 from maniskill_tomato.learning.interrupt import stop_on_signals
 from maniskill_tomato.learning.presets import TrainConfig
 from maniskill_tomato.learning.run_folder import LOG_NAME, check_run_dir, clear_run

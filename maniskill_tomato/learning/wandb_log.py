@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from maniskill_tomato.errors import InvalidInputError
-from maniskill_tomato.learning.checkpoint import write_atomically
+from maniskill_tomato.files import write_atomically
 
 ID_FILE = "wandb.json"
 """Keeps the run's id in the run folder, so that a continued run goes on with the same curves."""

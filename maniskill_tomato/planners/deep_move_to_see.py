@@ -23,7 +23,7 @@ import torch
 from torch import Tensor, nn
 
 from maniskill_tomato.errors import CheckpointError, InvalidInputError
-from maniskill_tomato.learning.checkpoint import write_atomically
+from maniskill_tomato.files import write_atomically
 from maniskill_tomato.planners.base import Planner
 from maniskill_tomato.visibility.situation import Situation
 from maniskill_tomato.visibility.view_rays import RAYS_PER_SIDE, RayLabel, ViewRays

@@ -16,7 +16,7 @@ import torch
 from torch import Tensor
 
 from maniskill_tomato.errors import CheckpointError, InvalidInputError
-from maniskill_tomato.learning.checkpoint import read_tensors, write_atomically
+from maniskill_tomato.files import read_tensors, write_atomically
 from maniskill_tomato.planners.base import Planner
 from maniskill_tomato.planners.moves import move_towards, moves_needed
 from maniskill_tomato.planners.quality_features import MAP_CHANNELS, SCALARS, quality_features
@@ -64,6 +64,13 @@ class ViewQuality(Planner):
         self._refused = torch.zeros(0, 0, dtype=torch.bool)
         self._chosen = torch.zeros(0, dtype=torch.int64)
         self._before = torch.zeros(0, 3)
+
+    @classmethod
+    def shipped(cls, device: str | torch.device = "cpu") -> "ViewQuality":
+        """The policy that ships with the package."""
+        from maniskill_tomato.assets import asset_path
+
+        return load_view_quality(asset_path("policies/TomatoViewpoint-v1.pt"), device)
 
     def begin(self, situation: Situation, env_idx: Tensor) -> None:
         if self._refused.shape != situation.reachable.shape:

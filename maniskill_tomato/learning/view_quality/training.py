@@ -15,7 +15,7 @@ import torch
 
 import maniskill_tomato
 from maniskill_tomato.errors import CheckpointError, InvalidInputError
-from maniskill_tomato.learning.checkpoint import read_tensors, write_atomically
+from maniskill_tomato.files import read_tensors, write_atomically
 from maniskill_tomato.learning.envs import make_env
 from maniskill_tomato.learning.view_quality.collect import QualityData, collect_episodes
 from maniskill_tomato.learning.view_quality.fit import FitConfig, fit

@@ -1,0 +1,83 @@
+"""Files that are written whole or not at all, and tensors read from them without running code."""
+
+import contextlib
+import io
+import os
+import pickle
+import zipfile
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from maniskill_tomato.errors import CheckpointError
+
+
+def write_atomically(path: Path, content: bytes) -> None:
+    """Replaces the file `path` by one with `content` in a single step.
+
+    Raises:
+        CheckpointError: The file cannot be written.
+    """
+    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with temporary.open("wb") as file:
+            file.write(content)
+            file.flush()
+            os.fsync(file.fileno())
+        temporary.replace(path)
+        _sync_folder(path.parent)
+    except OSError as error:
+        with contextlib.suppress(OSError):
+            temporary.unlink(missing_ok=True)
+        raise CheckpointError(
+            f"cannot write {path}: {error.strerror or error}; what was there before is kept. Free some space "
+            "or choose another --out; a run goes on with --resume"
+        ) from error
+
+
+def read_tensors(path: Path | str, device: torch.device | str = "cpu") -> Any:
+    """What `torch.save` wrote into a file: tensors, numbers, strings and containers of them, never code.
+
+    Raises:
+        CheckpointError: The file is missing or damaged.
+    """
+    path = Path(path)
+    if not path.is_file():
+        raise CheckpointError(
+            f"no checkpoint at {path}; `maniskill-tomato train` writes policy.pt into its run folder"
+        )
+    try:
+        content = io.BytesIO(path.read_bytes())
+        # torch does not compare the archive's checksums, so that flipped bits would become weights.
+        with zipfile.ZipFile(content) as archive:
+            if (bad := archive.testzip()) is not None:
+                raise zipfile.BadZipFile(f"wrong checksum of {bad}")
+        content.seek(0)
+        data = torch.load(content, map_location=device, weights_only=True)
+    except (
+        RuntimeError,
+        EOFError,
+        OSError,
+        ValueError,
+        KeyError,
+        pickle.UnpicklingError,
+        zipfile.BadZipFile,
+    ) as error:
+        reason = (str(error).splitlines() or [type(error).__name__])[0]
+        raise CheckpointError(
+            f"{path} is not a readable checkpoint ({reason}); it may be truncated: "
+            "use an earlier one from its run folder"
+        ) from error
+    return data
+
+
+def _sync_folder(folder: Path) -> None:
+    """Makes a rename in `folder` last through a power failure, where the file system can."""
+    descriptor = os.open(folder, os.O_RDONLY)
+    try:
+        with contextlib.suppress(OSError):
+            os.fsync(descriptor)
+    finally:
+        os.close(descriptor)
