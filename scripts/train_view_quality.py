@@ -31,7 +31,7 @@ class Args:
 def main(argv: list[str] | None = None) -> None:
     """Trains; errors made on purpose end with one line and exit status 2."""
     logging.basicConfig(level=logging.WARNING, format="%(message)s", stream=sys.stderr)
-    args = tyro.cli(Args, args=argv, description=__doc__, config=(tyro.conf.OmitArgPrefixes,))
+    args = tyro.cli(Args, args=argv, description=__doc__)
     start = time.perf_counter()
     try:
         path = train_view_quality(

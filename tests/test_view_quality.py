@@ -2,6 +2,8 @@
 
 import json
 import math
+import subprocess
+import sys
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -248,6 +250,13 @@ def test_a_training_goes_on_where_it_was(tmp_path: Path) -> None:
     assert load_view_quality(path).facts["looks"] > 0 and len(path.read_bytes()) == len(content)
     with pytest.raises(InvalidInputError, match="other settings"):
         train_view_quality(tmp_path / "run", QualityTrainConfig(), env_options=options)
+
+
+def test_the_script_offers_every_setting() -> None:
+    script = Path(__file__).resolve().parent.parent / "scripts" / "train_view_quality.py"
+    done = subprocess.run([sys.executable, str(script), "--help"], capture_output=True, text=True, check=True)
+    for flag in ("--jobs", "--config.rounds", "--config.fit.learning-rate", "--config.fit.seed"):
+        assert flag in done.stdout
 
 
 # ------------------------------------------------------------ files, evaluation
