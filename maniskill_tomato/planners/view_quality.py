@@ -65,13 +65,6 @@ class ViewQuality(Planner):
         self._chosen = torch.zeros(0, dtype=torch.int64)
         self._before = torch.zeros(0, 3)
 
-    @classmethod
-    def shipped(cls, device: str | torch.device = "cpu") -> "ViewQuality":
-        """The policy that ships with the package."""
-        from maniskill_tomato.assets import asset_path
-
-        return load_view_quality(asset_path("policies/TomatoViewpoint-v1.pt"), device)
-
     def begin(self, situation: Situation, env_idx: Tensor) -> None:
         if self._refused.shape != situation.reachable.shape:
             self._refused = torch.zeros_like(situation.reachable)
