@@ -307,3 +307,10 @@ def test_eval_runs_the_same_episodes_as_the_benchmark(
     assert metrics["per_episode"]["success"] == [e.success for e in episodes]
     contacts = sum(int(e.contact.sum()) for e in episodes) / sum(e.moves for e in episodes)
     assert metrics["plant_contact_step_share"] == pytest.approx(contacts)
+
+
+def test_without_a_policy_eval_says_how_to_get_one(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as stopped:
+        main(["eval", "TomatoViewpoint-v1"])
+    told = capsys.readouterr().err
+    assert stopped.value.code == 2 and "nbv" in told and "train_view_quality.py" in told

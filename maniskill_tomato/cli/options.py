@@ -70,7 +70,11 @@ def shipped_policy(env_id: str) -> Path:
     try:
         return asset_path(f"policies/{name}.pt")
     except FileNotFoundError as error:
+        how = (
+            "give --policy a planner's name such as nbv, or train one with scripts/train_view_quality.py"
+            if env_id in GENERAL_IDS
+            else f"train one with `maniskill-tomato train {env_id}`"
+        )
         raise InvalidInputError(
-            f"no policy for {env_id} ships with this version; train one with `maniskill-tomato train {env_id}` and "
-            "give its policy.pt with --policy"
+            f"no policy for {env_id} ships with this version; {how} and give its policy.pt with --policy"
         ) from error
