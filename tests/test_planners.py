@@ -341,7 +341,7 @@ def test_a_costly_way_keeps_the_next_best_view_near(world: FreeWorld) -> None:
         planner.begin(world.situation, torch.tensor([0]))
         planner.act(world.situation)
         candidates = world.situation.lattice.positions(world.situation.target_position)[0]
-        way = (candidates[planner._chosen] - world.situation.camera_position).norm()
+        way = (candidates[planner.tried.chosen] - world.situation.camera_position).norm()
         ways.append(float(way))
     candidates = world.situation.lattice.positions(world.situation.target_position)[0]
     allowed = candidates[world.situation.reachable[0]]

@@ -95,3 +95,50 @@ class Goals:
         position = situation.camera_position
         self._before = (self._goal - position).norm(dim=-1)
         return move_towards(position, situation.target_position, self._goal)
+
+
+class Candidates:
+    """Which candidate of the lattice each environment goes to, and which ones the arm refused in the episode.
+
+    A candidate towards which the camera moved less than a tenth of a move is not tried again.
+    """
+
+    def __init__(self) -> None:
+        self.refused = torch.zeros(0, 0, dtype=torch.bool)
+        """Shape (B, K)."""
+        self.chosen = torch.zeros(0, dtype=torch.int64)
+        """Shape (B,)."""
+        self._before = torch.zeros(0, 3)
+
+    def begin(self, situation: Situation, env_idx: Tensor) -> None:
+        """Forgets the episodes of some environments."""
+        if self.refused.shape != situation.reachable.shape:
+            self.refused = torch.zeros_like(situation.reachable)
+            self.chosen = torch.zeros_like(situation.reachable[:, 0], dtype=torch.int64)
+            self._before = torch.full_like(situation.camera_position, math.nan)
+        self.refused[env_idx] = False
+        self._before[env_idx] = math.nan
+
+    def note_refusals(self, situation: Situation) -> None:
+        """Looks whether the last moves were made; to be called before the next choice."""
+        stuck = (situation.camera_position - self._before).norm(dim=-1) < 0.1 * MAX_MOVE
+        rows = torch.nonzero(stuck)[:, 0]
+        self.refused[rows, self.chosen[rows]] = True
+
+    def move_to_best(self, situation: Situation, positions: Tensor, worth: Tensor, allowed: Tensor) -> Tensor:
+        """The moves towards the best candidates that are allowed and were not refused.
+
+        Args:
+            situation: What is known.
+            positions: Of the candidates, in the world frame, in [m]. Shape (B, K, 3).
+            worth: Shape (B, K).
+            allowed: Shape (B, K), bool.
+
+        Returns:
+            Shape (B, 3).
+        """
+        position = situation.camera_position
+        self.chosen = torch.where(allowed & ~self.refused, worth, -math.inf).argmax(dim=1)
+        self._before = position.clone()
+        rows = torch.arange(len(position), device=position.device)
+        return move_towards(position, situation.target_position, positions[rows, self.chosen])

@@ -19,7 +19,7 @@ from torch import Tensor
 
 from maniskill_tomato.errors import InvalidInputError
 from maniskill_tomato.planners.base import Planner
-from maniskill_tomato.planners.moves import move_towards
+from maniskill_tomato.planners.moves import Candidates
 from maniskill_tomato.robot.look_at_move import MAX_MOVE
 from maniskill_tomato.visibility.situation import Situation
 
@@ -105,32 +105,19 @@ class NextBestView(Planner):
     def __init__(self, device: str | torch.device = "cpu", config: NextBestViewConfig | None = None) -> None:
         self.config = config or NextBestViewConfig()
         self._measured = MeasuredViews()
-        self._refused = torch.zeros(0, 0, dtype=torch.bool, device=device)
-        self._chosen = torch.zeros(0, dtype=torch.int64, device=device)
-        self._before = torch.zeros(0, 3, device=device)
+        self.tried = Candidates()
 
     def begin(self, situation: Situation, env_idx: Tensor) -> None:
         self._measured.begin(situation, env_idx)
-        if self._refused.shape != situation.reachable.shape:
-            self._refused = torch.zeros_like(situation.reachable)
-            self._chosen = torch.zeros_like(situation.reachable[:, 0], dtype=torch.int64)
-            self._before = torch.full_like(situation.camera_position, math.nan)
-        self._refused[env_idx] = False
-        self._before[env_idx] = math.nan
+        self.tried.begin(situation, env_idx)
 
     def act(self, situation: Situation) -> Tensor:
         """Towards the best view."""
         self._measured.add(situation)
-        self._note_refusals(situation)
+        self.tried.note_refusals(situation)
         candidates = self._candidates(situation)
         utility = self.utility(situation, candidates)
-        allowed = self._allowed(situation) & ~self._refused
-        self._chosen = torch.where(allowed, utility, -math.inf).argmax(dim=1)
-        rows = torch.arange(len(self._chosen), device=self._chosen.device)
-        self._before = situation.camera_position.clone()
-        return move_towards(
-            situation.camera_position, situation.target_position, candidates[rows, self._chosen]
-        )
+        return self.tried.move_to_best(situation, candidates, utility, self._allowed(situation))
 
     def utility(self, situation: Situation, candidates: Tensor) -> Tensor:
         """What views are worth now.
@@ -157,12 +144,6 @@ class NextBestView(Planner):
     def _allowed(self, situation: Situation) -> Tensor:
         """Which of them may be chosen. Shape (B, K), bool."""
         return situation.reachable
-
-    def _note_refusals(self, situation: Situation) -> None:
-        """A view towards which the arm did not move is not tried again in the episode."""
-        stuck = (situation.camera_position - self._before).norm(dim=-1) < 0.1 * MAX_MOVE
-        rows = torch.nonzero(stuck)[:, 0]
-        self._refused[rows, self._chosen[rows]] = True
 
 
 class NextBestDirection(NextBestView):

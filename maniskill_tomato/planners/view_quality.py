@@ -18,7 +18,7 @@ from torch import Tensor
 from maniskill_tomato.errors import CheckpointError, InvalidInputError
 from maniskill_tomato.files import read_tensors, write_atomically
 from maniskill_tomato.planners.base import Planner
-from maniskill_tomato.planners.moves import move_towards, moves_needed
+from maniskill_tomato.planners.moves import Candidates, moves_needed
 from maniskill_tomato.planners.quality_features import MAP_CHANNELS, SCALARS, quality_features
 from maniskill_tomato.planners.quality_network import ViewQualityNetwork
 from maniskill_tomato.robot.look_at_move import MAX_MOVE
@@ -61,17 +61,10 @@ class ViewQuality(Planner):
         self.network = network.eval().requires_grad_(False)
         self.config = config or ViewQualityConfig()
         self.facts = facts or {}
-        self._refused = torch.zeros(0, 0, dtype=torch.bool)
-        self._chosen = torch.zeros(0, dtype=torch.int64)
-        self._before = torch.zeros(0, 3)
+        self.tried = Candidates()
 
     def begin(self, situation: Situation, env_idx: Tensor) -> None:
-        if self._refused.shape != situation.reachable.shape:
-            self._refused = torch.zeros_like(situation.reachable)
-            self._chosen = torch.zeros_like(situation.reachable[:, 0], dtype=torch.int64)
-            self._before = torch.full_like(situation.camera_position, math.nan)
-        self._refused[env_idx] = False
-        self._before[env_idx] = math.nan
+        self.tried.begin(situation, env_idx)
 
     def success_probability(self, situation: Situation) -> Tensor:
         """P(full view) of every candidate. Shape (B, K)."""
@@ -83,17 +76,13 @@ class ViewQuality(Planner):
     def act(self, situation: Situation) -> Tensor:
         """Towards the best view."""
         position, target = situation.camera_position, situation.target_position
-        stuck = (position - self._before).norm(dim=-1) < 0.1 * MAX_MOVE
-        rows = torch.arange(len(position), device=position.device)
-        self._refused[rows[stuck], self._chosen[stuck]] = True
+        self.tried.note_refusals(situation)
         candidates = situation.lattice.positions(target)
         way = (candidates - position[:, None]).norm(dim=-1)
         worth = self.config.patience * self.success_probability(situation) - moves_needed(way)
-        # A view from here has been taken; a refused one was tried in vain.
-        allowed = situation.reachable & ~self._refused & (way > 0.25 * MAX_MOVE)
-        self._chosen = torch.where(allowed, worth, -math.inf).argmax(dim=1)
-        self._before = position.clone()
-        return move_towards(position, target, candidates[rows, self._chosen])
+        # A view from here has been taken.
+        allowed = situation.reachable & (way > 0.25 * MAX_MOVE)
+        return self.tried.move_to_best(situation, candidates, worth, allowed)
 
 
 def save_view_quality(path: Path, policy: ViewQuality) -> None:
