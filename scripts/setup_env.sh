@@ -87,7 +87,7 @@ fi
 
 say "installing the packages (about 5 GB; minutes the first time, seconds when they are in uv's cache)"
 install() {
-    "$venv/bin/uv" pip install --python "$python" --override overrides.txt -c constraints.txt -e ".[dev,perception,sb3]"
+    "$venv/bin/uv" pip install --python "$python" --override overrides.txt -c constraints.txt -e ".[dev,perception,deploy,hardware,sb3]"
 }
 if [[ -t 2 ]]; then
     install && status=0 || status=$?
