@@ -7,8 +7,8 @@ from typing import Any
 import gymnasium as gym
 import torch
 
+from maniskill_tomato.plants.episode_list import Episode
 from maniskill_tomato.plants.row import leaf_density_of
-from maniskill_tomato.tasks.episode_list import Episode
 
 CHUNK = 100
 """Episodes drawn before they are looked at again, so that their plants are still at hand."""
@@ -24,7 +24,7 @@ def draw_episodes(split: str, count: int, first_seed: int = 0, taken: Collection
     """Episodes of `TomatoViewpoint-v1` on different plants of a split, as their list replays them.
 
     Args:
-        split: A name of `plant_choice.SEED_SPLITS`.
+        split: A name of `plants.choice.SEED_SPLITS`.
         count: How many.
         first_seed: Seed of the first reset; the next ones follow.
         taken: Seeds of plants that are not drawn.
