@@ -7,14 +7,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from maniskill_tomato.errors import InvalidInputError
+from maniskill_tomato.perception.annotations import FRUIT_CATEGORIES as FRUIT_CATEGORIES
 
 Image = NDArray[np.uint8]
 """Colours red, green, blue. Shape (H, W, 3)."""
 
 TOMATO = "tomato"
 """Category of a fruit whose ripeness is not known; the others begin with it."""
-
-FRUIT_CATEGORIES = ("tomato_ripe", "tomato_turning", "tomato_unripe")
 
 
 @dataclass(frozen=True, kw_only=True)
