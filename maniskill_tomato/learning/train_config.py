@@ -228,8 +228,8 @@ class TrainConfig:
                 raise InvalidInputError.choice(name, getattr(self, name), allowed)
         if self.exploration_noise_per_env and self.exploration == "epsilon-greedy":
             raise InvalidInputError(
-                "exploration_noise_per_env needs noise, so decaying-gaussian, look-at-goals or correlated exploration; "
-                "epsilon-greedy has none"
+                "exploration_noise_per_env needs an exploration with noise: decaying-gaussian, look-at-goals or "
+                "correlated; epsilon-greedy has none"
             )
 
     @property

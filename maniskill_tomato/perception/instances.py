@@ -41,7 +41,9 @@ class Instances:
                 f"{self.boxes.shape}, {self.scores.shape}, {len(self.categories)} and {self.masks.shape}"
             )
         if self.amodal_boxes is not None and self.amodal_boxes.shape != (count, 4):
-            raise InvalidInputError(f"amodal boxes must have shape ({count}, 4), got {self.amodal_boxes.shape}")
+            raise InvalidInputError(
+                f"amodal boxes must have shape ({count}, 4), got {self.amodal_boxes.shape}"
+            )
 
     def __len__(self) -> int:
         return len(self.boxes)
@@ -102,7 +104,9 @@ class Instances:
             InvalidInputError: The segmenter does not tell amodal boxes.
         """
         if self.amodal_boxes is None:
-            raise InvalidInputError("these instances have no amodal boxes; use a segmenter that predicts them")
+            raise InvalidInputError(
+                "these instances have no amodal boxes; use a segmenter that predicts them"
+            )
         height, width = self.masks.shape[1:]
         y, x = np.mgrid[:height, :width] + 0.5
         ellipses = [
@@ -122,7 +126,9 @@ class Instances:
             InvalidInputError: The segmenter does not tell amodal boxes.
         """
         if self.amodal_boxes is None:
-            raise InvalidInputError("these instances have no amodal boxes; use a segmenter that predicts them")
+            raise InvalidInputError(
+                "these instances have no amodal boxes; use a segmenter that predicts them"
+            )
         size = np.maximum(self.amodal_boxes[:, 2:] - self.amodal_boxes[:, :2], 1)
         visible = self.masks.sum(axis=(1, 2))
         return np.minimum(visible / (np.pi / 4 * size.prod(axis=1)), 1).astype(np.float32)

@@ -18,7 +18,12 @@ from maniskill_tomato.files import read_tensors, write_atomically
 from maniskill_tomato.perception.annotations import AnnotatedImage
 from maniskill_tomato.perception.augmentation import AugmentationConfig, augmented
 from maniskill_tomato.perception.fruit_network import FruitNetwork, FruitNetworkConfig
-from maniskill_tomato.perception.fruit_targets import LOSS_WEIGHTS, TrainingPicture, fruit_losses, make_targets
+from maniskill_tomato.perception.fruit_targets import (
+    LOSS_WEIGHTS,
+    TrainingPicture,
+    fruit_losses,
+    make_targets,
+)
 from maniskill_tomato.perception.training_pictures import PictureDraw
 from maniskill_tomato.perception.weights import load_weights, save_weights
 
@@ -109,7 +114,9 @@ class LightTraining:
         self.history: list[dict[str, float]] = []
         self.validation = _fixed_batches(validation, config) if validation else []
 
-    def run(self, out: Path, report: Callable[[str], None], stopped: Callable[[], bool] = lambda: False) -> Path | None:
+    def run(
+        self, out: Path, report: Callable[[str], None], stopped: Callable[[], bool] = lambda: False
+    ) -> Path | None:
         """Trains to the end.
 
         Args:

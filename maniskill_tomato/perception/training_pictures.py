@@ -53,7 +53,8 @@ def training_picture(image: AnnotatedImage) -> TrainingPicture:
         labels=labels if with_masks or not count else None,
         whole_boxes=whole,
         categories=np.array(
-            [FRUIT_CATEGORIES.index(f.category) if f.category in FRUIT_CATEGORIES else -1 for f in fruits], np.int64
+            [FRUIT_CATEGORIES.index(f.category) if f.category in FRUIT_CATEGORIES else -1 for f in fruits],
+            np.int64,
         ),
     )
 
