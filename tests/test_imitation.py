@@ -27,6 +27,7 @@ from maniskill_tomato.planners.lattice_oracle import LatticeOracle
 from maniskill_tomato.planners.recurrent import RecurrentActor, RecurrentPolicy, columns_of, save_recurrent
 from maniskill_tomato.robot.look_at import look_at_pose
 from maniskill_tomato.robot.look_at_move import MAX_MOVE
+from maniskill_tomato.visibility.observation import Part
 
 PLANT = {"seed": 7, "row": False, "leaf_density": 1.2}
 ONE = torch.zeros(1, dtype=torch.int64)
@@ -151,7 +152,7 @@ def test_step_by_step_a_recurrent_actor_says_what_it_says_at_once() -> None:
 
 
 def test_a_recurrent_policy_begins_anew_and_survives_its_file(env: Any, tmp_path: Path) -> None:
-    parts = ("pose", "visible_fraction")
+    parts: tuple[Part, ...] = ("pose", "visible_fraction")
     torch.manual_seed(0)
     policy = RecurrentPolicy(RecurrentActor(8, width=16), parts, {"steps": 3})
     env.reset(seed=3)
@@ -181,7 +182,7 @@ def test_a_training_goes_on_where_it_was(student: Any, tmp_path: Path) -> None:
         pool=1,
         fit=ImitationFitConfig(steps=2, batch_size=8),
     )
-    options = {"plant": {"row": False, "pool": 1}}
+    options: dict[str, Any] = {"plant": {"row": False, "pool": 1}}
     lines: list[str] = []
     path = train_imitation(tmp_path / "run", config, env_options=options, report=lines.append)
     assert sum("blocks)" in line for line in lines) == 3
