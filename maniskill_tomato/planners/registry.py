@@ -14,6 +14,7 @@ from maniskill_tomato.planners.lattice_oracle import LatticeOracle
 from maniskill_tomato.planners.move_to_see import MoveToSee, MoveToSeeOnMemory
 from maniskill_tomato.planners.next_best_view import NextBestDirection, NextBestView
 from maniskill_tomato.planners.oracle import AcceptWay, Oracle, OracleSearch
+from maniskill_tomato.planners.view_quality import ViewQuality
 
 
 class _Setting:
@@ -53,6 +54,7 @@ _MAKERS: dict[str, Callable[[_Setting], Planner]] = {
     GradientView.name: lambda s: GradientView(s.device),
     NextBestDirection.name: lambda s: NextBestDirection(s.device),
     NextBestView.name: lambda s: NextBestView(s.device),
+    ViewQuality.name: lambda s: ViewQuality.shipped(s.device),
     MoveToSee.name: lambda s: MoveToSee(s.truth, s.device),
     GreedyTruth.name: lambda s: GreedyTruth(s.truth, s.device),
     LatticeOracle.name: lambda s: LatticeOracle(s.truth, s.threshold),
