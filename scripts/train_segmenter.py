@@ -16,8 +16,8 @@ import tyro
 from maniskill_tomato.errors import TomatoError
 from maniskill_tomato.learning.interrupt import stop_on_signals
 from maniskill_tomato.perception.annotations import AnnotatedImage
-from maniskill_tomato.perception.formats import read_annotated
 from maniskill_tomato.perception.light_training import CHECKPOINT, LightTrainConfig, LightTraining
+from maniskill_tomato.perception.training_pictures import read_place
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -41,9 +41,8 @@ class Args:
 
 
 def read_images(place: str, limit: int | None = None) -> tuple[AnnotatedImage, ...]:
-    """The images of FOLDER or FOLDER:SPLIT."""
-    folder, _, split = place.partition(":") if not Path(place).exists() else (place, "", "")
-    found = read_annotated(folder, split or None)
+    """The first images of FOLDER or FOLDER:SPLIT; what is left out is named on standard error."""
+    found = read_place(place)
     if found.skipped:
         print(f"{place}: {found.skipped_text()}", file=sys.stderr)
     return found.images[:limit]

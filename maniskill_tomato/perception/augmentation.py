@@ -62,7 +62,10 @@ def augmented(
 
 
 def _placed(
-    picture: TrainingPicture, region: tuple[int, int, int, int], config: AugmentationConfig, rng: np.random.Generator
+    picture: TrainingPicture,
+    region: tuple[int, int, int, int],
+    config: AugmentationConfig,
+    rng: np.random.Generator,
 ) -> TrainingPicture:
     """The picture scaled, mirrored and cut to the size of a region, with its boxes and labels."""
     width, height = region[2] - region[0], region[3] - region[1]
@@ -89,8 +92,10 @@ def _placed(
     clipped = np.clip(boxes, 0, [width, height, width, height]).astype(np.float32)
     sides = clipped[:, 2:] - clipped[:, :2]
     share = sides.prod(axis=1) / np.maximum((boxes[:, 2:] - boxes[:, :2]).prod(axis=1), 1e-6)
-    ignored = picture.ignored | (sides.min(axis=1, initial=np.inf) < config.smallest_side) | (
-        share < config.smallest_share
+    ignored = (
+        picture.ignored
+        | (sides.min(axis=1, initial=np.inf) < config.smallest_side)
+        | (share < config.smallest_share)
     )
     kept = np.flatnonzero((sides > 0.5).all(axis=1))
     return TrainingPicture(

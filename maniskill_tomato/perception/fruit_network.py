@@ -98,7 +98,9 @@ class FruitNetwork(nn.Module):
         stages: list[nn.Module] = []
         previous = 12
         for width, blocks in zip(widths, self.config.blocks, strict=True):
-            stages.append(nn.Sequential(_conv(previous, width, stride=2), *(_Block(width) for _ in range(blocks))))
+            stages.append(
+                nn.Sequential(_conv(previous, width, stride=2), *(_Block(width) for _ in range(blocks)))
+            )
             previous = width
         self.stages = nn.ModuleList(stages)
         self.laterals = nn.ModuleList(nn.Conv2d(width, neck, 1) for width in widths)
@@ -127,7 +129,9 @@ class FruitNetwork(nn.Module):
             image: Red, green, blue from 0 to 255, as floats. Height and width are multiples of `SIZE_MULTIPLE`.
                 Shape (B, 3, H, W).
         """
-        x = functional.pixel_unshuffle((image - 110.0) / 64.0, 2).contiguous(memory_format=torch.channels_last)
+        x = functional.pixel_unshuffle((image - 110.0) / 64.0, 2).contiguous(
+            memory_format=torch.channels_last
+        )
         features = []
         for stage in self.stages:
             x = stage(x)

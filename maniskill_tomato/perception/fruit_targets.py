@@ -217,7 +217,9 @@ def _fruit_term(logits: Tensor, fruit: Tensor, weight: Tensor) -> Tensor:
     """Binary cross entropy plus one minus the Dice coefficient, over the pictures with masks."""
     if weight.sum() == 0:
         return logits.sum() * 0
-    entropy = functional.binary_cross_entropy_with_logits(logits, fruit, weight, reduction="sum") / weight.sum()
+    entropy = (
+        functional.binary_cross_entropy_with_logits(logits, fruit, weight, reduction="sum") / weight.sum()
+    )
     probability, fruit = logits.sigmoid() * weight, fruit * weight
     dice = (2 * (probability * fruit).sum() + 1) / (probability.sum() + fruit.sum() + 1)
     return entropy + 1 - dice

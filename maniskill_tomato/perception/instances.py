@@ -41,7 +41,9 @@ class Instances:
                 f"{self.boxes.shape}, {self.scores.shape}, {len(self.categories)} and {self.masks.shape}"
             )
         if self.amodal_boxes is not None and self.amodal_boxes.shape != (count, 4):
-            raise InvalidInputError(f"amodal boxes must have shape ({count}, 4), got {self.amodal_boxes.shape}")
+            raise InvalidInputError(
+                f"amodal boxes must have shape ({count}, 4), got {self.amodal_boxes.shape}"
+            )
 
     def __len__(self) -> int:
         return len(self.boxes)
@@ -102,15 +104,11 @@ class Instances:
             InvalidInputError: The segmenter does not tell amodal boxes.
         """
         if self.amodal_boxes is None:
-            raise InvalidInputError("these instances have no amodal boxes; use a segmenter that predicts them")
+            raise InvalidInputError(
+                "these instances have no amodal boxes; use a segmenter that predicts them"
+            )
         height, width = self.masks.shape[1:]
-        y, x = np.mgrid[:height, :width] + 0.5
-        ellipses = [
-            ((x - (left + right) / 2) / max((right - left) / 2, 1e-6)) ** 2
-            + ((y - (top + bottom) / 2) / max((bottom - top) / 2, 1e-6)) ** 2
-            <= 1
-            for left, top, right, bottom in self.amodal_boxes
-        ]
+        ellipses = [box_ellipse(box, height, width) for box in self.amodal_boxes]
         return np.array(ellipses, bool).reshape(-1, height, width) | self.masks
 
     def visible_fractions(self) -> NDArray[np.float32]:
@@ -122,7 +120,9 @@ class Instances:
             InvalidInputError: The segmenter does not tell amodal boxes.
         """
         if self.amodal_boxes is None:
-            raise InvalidInputError("these instances have no amodal boxes; use a segmenter that predicts them")
+            raise InvalidInputError(
+                "these instances have no amodal boxes; use a segmenter that predicts them"
+            )
         size = np.maximum(self.amodal_boxes[:, 2:] - self.amodal_boxes[:, :2], 1)
         visible = self.masks.sum(axis=(1, 2))
         return np.minimum(visible / (np.pi / 4 * size.prod(axis=1)), 1).astype(np.float32)
@@ -132,3 +132,12 @@ def mask_box(mask: NDArray[np.bool_]) -> tuple[int, int, int, int]:
     """Left, top, right, bottom around the true pixels of a mask that has some; the last two are exclusive, in [px]."""
     rows, columns = np.flatnonzero(mask.any(axis=1)), np.flatnonzero(mask.any(axis=0))
     return int(columns[0]), int(rows[0]), int(columns[-1]) + 1, int(rows[-1]) + 1
+
+
+def box_ellipse(box: NDArray[np.float32], height: int, width: int) -> NDArray[np.bool_]:
+    """Pixels of the ellipse that touches the sides of a box, left, top, right, bottom in [px]. Shape (H, W)."""
+    left, top, right, bottom = (float(v) for v in box)
+    y, x = np.ogrid[:height, :width]
+    across = (x + 0.5 - (left + right) / 2) / max((right - left) / 2, 1e-6)
+    down = (y + 0.5 - (top + bottom) / 2) / max((bottom - top) / 2, 1e-6)
+    return np.asarray(across**2 + down**2 <= 1)

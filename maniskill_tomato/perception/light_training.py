@@ -18,7 +18,12 @@ from maniskill_tomato.files import read_tensors, write_atomically
 from maniskill_tomato.perception.annotations import AnnotatedImage
 from maniskill_tomato.perception.augmentation import AugmentationConfig, augmented
 from maniskill_tomato.perception.fruit_network import FruitNetwork, FruitNetworkConfig
-from maniskill_tomato.perception.fruit_targets import LOSS_WEIGHTS, TrainingPicture, fruit_losses, make_targets
+from maniskill_tomato.perception.fruit_targets import (
+    LOSS_WEIGHTS,
+    TrainingPicture,
+    fruit_losses,
+    make_targets,
+)
 from maniskill_tomato.perception.training_pictures import PictureDraw
 from maniskill_tomato.perception.weights import load_weights, save_weights
 
@@ -109,7 +114,9 @@ class LightTraining:
         self.history: list[dict[str, float]] = []
         self.validation = _fixed_batches(validation, config) if validation else []
 
-    def run(self, out: Path, report: Callable[[str], None], stopped: Callable[[], bool] = lambda: False) -> Path | None:
+    def run(
+        self, out: Path, report: Callable[[str], None], stopped: Callable[[], bool] = lambda: False
+    ) -> Path | None:
         """Trains to the end.
 
         Args:
@@ -144,7 +151,12 @@ class LightTraining:
             "light",
             self.config.network.to_dict(),
             self.averaged.state_dict(),
-            {"steps": self.step, "pictures": self.step * self.config.batch_size, "config": self.described()},
+            {
+                "steps": self.step,
+                "pictures": self.step * self.config.batch_size,
+                "boxes_only": not _with_masks(self.draw.sets),
+                "config": self.described(),
+            },
         )
         return out / WEIGHTS
 
@@ -294,3 +306,10 @@ def _fixed_batches(
     pictures = [augmented(lambda image=image: training_picture(image), plain, rng) for image in chosen]  # type: ignore[misc]
     size = config.batch_size
     return [pictures[i : i + size] for i in range(0, len(pictures), size)]
+
+
+def _with_masks(sets: Sequence[Sequence[AnnotatedImage]]) -> bool:
+    """Whether any fruit has a mask, so that masks are learned."""
+    return any(
+        fruit.visible_mask is not None for images in sets for image in images for fruit in image.fruits
+    )

@@ -63,7 +63,9 @@ def load_weights(path: Path, kind: str) -> dict[str, Any]:
         )
     data = read_tensors(path)
     if not isinstance(data, dict) or "segmenter" not in data or "state" not in data:
-        raise CheckpointError(f"{path} holds no segmenter's weights; scripts/train_segmenter.py writes such files")
+        raise CheckpointError(
+            f"{path} holds no segmenter's weights; scripts/train_segmenter.py writes such files"
+        )
     if data["segmenter"] != kind:
         raise CheckpointError(f"{path} holds weights of the segmenter {data['segmenter']!r}, not of {kind!r}")
     if not isinstance(data["format"], int) or data["format"] > FORMAT:
@@ -91,5 +93,7 @@ def read_kind(path: Path) -> str:
         )
     data = read_tensors(path)
     if not isinstance(data, dict) or not isinstance(data.get("segmenter"), str):
-        raise CheckpointError(f"{path} holds no segmenter's weights; scripts/train_segmenter.py writes such files")
+        raise CheckpointError(
+            f"{path} holds no segmenter's weights; scripts/train_segmenter.py writes such files"
+        )
     return str(data["segmenter"])
