@@ -49,3 +49,7 @@ class MissingPackageError(TomatoError):
     def extra(cls, package: str, extra: str) -> "MissingPackageError":
         """The error for a package that an extra of this one installs."""
         return cls(f'{package} is not installed; install it with `pip install "maniskill-tomato[{extra}]"`')
+
+
+class MissingWeightsError(TomatoError):
+    """Weights that would have to be downloaded cannot be."""

@@ -1,7 +1,7 @@
 """Evaluates a segmenter on annotated images: precision, recall, AP (Eq. 4-1 to 4-3), COCO's AP, curves and pictures.
 
 Example:
-    python scripts/evaluate_segmenter.py --data real_photos:val --segmenter runs/segmenter/weights.pt --out runs/evaluation
+    python scripts/evaluate_segmenter.py --data real_photos:val --segmenter runs/segmenter/weights.pt --out runs/judged
 """
 
 import json
