@@ -8,6 +8,7 @@ Examples:
     maniskill-tomato benchmark --policies nbv,oracle,runs/general/policy.pt --episodes 500
     maniskill-tomato demo
     maniskill-tomato export --policy runs/demo/training/policy.pt --out exported
+    maniskill-tomato detect photos --out detections.json
 """
 
 import logging
@@ -20,18 +21,30 @@ import tyro
 
 from maniskill_tomato.cli.benchmark import Benchmark
 from maniskill_tomato.cli.demo import Demo
+from maniskill_tomato.cli.detect import Detect
 from maniskill_tomato.cli.evaluate import Eval
 from maniskill_tomato.cli.export import Export
 from maniskill_tomato.cli.options import PlantOptions, merge_options
 from maniskill_tomato.cli.train import Train, train_default
 from maniskill_tomato.errors import TomatoError
 
-__all__ = ["Benchmark", "Demo", "Eval", "Export", "PlantOptions", "Train", "main", "merge_options", "parse"]
+__all__ = [
+    "Benchmark",
+    "Demo",
+    "Detect",
+    "Eval",
+    "Export",
+    "PlantOptions",
+    "Train",
+    "main",
+    "merge_options",
+    "parse",
+]
 
 # PyTorch and ManiSkill take seconds to import, so that every command imports what it needs when it runs.
 
 
-def parse(argv: Sequence[str]) -> Train | Eval | Benchmark | Demo | Export:
+def parse(argv: Sequence[str]) -> Train | Eval | Benchmark | Demo | Export | Detect:
     """The command that the arguments describe.
 
     The options of `train` default to those of the run that it continues or of its `--config` file, and these to
@@ -47,8 +60,9 @@ def parse(argv: Sequence[str]) -> Train | Eval | Benchmark | Demo | Export:
         | Annotated[Benchmark, tyro.conf.subcommand("benchmark")]
         | Annotated[Demo, tyro.conf.subcommand("demo")]
         | Annotated[Export, tyro.conf.subcommand("export")]
+        | Annotated[Detect, tyro.conf.subcommand("detect")]
     )
-    command: Train | Eval | Benchmark | Demo | Export = tyro.cli(
+    command: Train | Eval | Benchmark | Demo | Export | Detect = tyro.cli(
         commands,
         prog="maniskill-tomato",
         description="Active perception for tomato harvesting: train, evaluate, compare, demonstrate, export.",

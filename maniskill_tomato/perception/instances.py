@@ -108,13 +108,7 @@ class Instances:
                 "these instances have no amodal boxes; use a segmenter that predicts them"
             )
         height, width = self.masks.shape[1:]
-        y, x = np.mgrid[:height, :width] + 0.5
-        ellipses = [
-            ((x - (left + right) / 2) / max((right - left) / 2, 1e-6)) ** 2
-            + ((y - (top + bottom) / 2) / max((bottom - top) / 2, 1e-6)) ** 2
-            <= 1
-            for left, top, right, bottom in self.amodal_boxes
-        ]
+        ellipses = [box_ellipse(box, height, width) for box in self.amodal_boxes]
         return np.array(ellipses, bool).reshape(-1, height, width) | self.masks
 
     def visible_fractions(self) -> NDArray[np.float32]:
@@ -138,3 +132,12 @@ def mask_box(mask: NDArray[np.bool_]) -> tuple[int, int, int, int]:
     """Left, top, right, bottom around the true pixels of a mask that has some; the last two are exclusive, in [px]."""
     rows, columns = np.flatnonzero(mask.any(axis=1)), np.flatnonzero(mask.any(axis=0))
     return int(columns[0]), int(rows[0]), int(columns[-1]) + 1, int(rows[-1]) + 1
+
+
+def box_ellipse(box: NDArray[np.float32], height: int, width: int) -> NDArray[np.bool_]:
+    """Pixels of the ellipse that touches the sides of a box, left, top, right, bottom in [px]. Shape (H, W)."""
+    left, top, right, bottom = (float(v) for v in box)
+    y, x = np.ogrid[:height, :width]
+    across = (x + 0.5 - (left + right) / 2) / max((right - left) / 2, 1e-6)
+    down = (y + 0.5 - (top + bottom) / 2) / max((bottom - top) / 2, 1e-6)
+    return np.asarray(across**2 + down**2 <= 1)

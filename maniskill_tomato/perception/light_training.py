@@ -1,10 +1,9 @@
 """Training of the light segmenter from random weights, resumable step by step."""
 
 import copy
-import io
 import json
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
@@ -13,8 +12,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from maniskill_tomato.errors import CheckpointError, InvalidInputError, TrainingDivergedError
-from maniskill_tomato.files import read_tensors, write_atomically
+from maniskill_tomato.errors import CheckpointError, InvalidInputError
 from maniskill_tomato.perception.annotations import AnnotatedImage
 from maniskill_tomato.perception.augmentation import AugmentationConfig, augmented
 from maniskill_tomato.perception.fruit_network import FruitNetwork, FruitNetworkConfig
@@ -24,12 +22,9 @@ from maniskill_tomato.perception.fruit_targets import (
     fruit_losses,
     make_targets,
 )
-from maniskill_tomato.perception.training_pictures import PictureDraw
+from maniskill_tomato.perception.resumable_training import ResumableTraining
+from maniskill_tomato.perception.training_pictures import PictureDraw, training_picture
 from maniskill_tomato.perception.weights import load_weights, save_weights
-
-CHECKPOINT = "checkpoint.pt"
-WEIGHTS = "weights.pt"
-HISTORY = "history.json"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -75,7 +70,7 @@ class LightTrainConfig:
             raise InvalidInputError(f"averaging must be from 0 to below 1, got {self.averaging}")
 
 
-class LightTraining:
+class LightTraining(ResumableTraining):
     """A training that can be stopped after any step and goes on where it was."""
 
     def __init__(
@@ -99,8 +94,10 @@ class LightTraining:
             InvalidInputError: A set is empty, or the shares do not fit.
             CheckpointError: The weights to begin with cannot be used.
         """
+        super().__init__()
         torch.manual_seed(config.seed)
         self.config = config
+        self.steps, self.log_every, self.save_every = config.steps, config.log_every, config.save_every
         self.rng = np.random.default_rng(config.seed)
         self.draw = PictureDraw(sets=sets, shares=shares, rng=self.rng)
         self.network = FruitNetwork(config.network).to(memory_format=torch.channels_last)
@@ -110,57 +107,10 @@ class LightTraining:
         self.optimizer = torch.optim.AdamW(
             self.network.parameters(), config.learning_rate, weight_decay=config.weight_decay
         )
-        self.step = 0
-        self.history: list[dict[str, float]] = []
         self.validation = _fixed_batches(validation, config) if validation else []
 
-    def run(
-        self, out: Path, report: Callable[[str], None], stopped: Callable[[], bool] = lambda: False
-    ) -> Path | None:
-        """Trains to the end.
-
-        Args:
-            out: Folder of checkpoints, history and weights.
-            report: Takes a line now and then.
-            stopped: Asked after every step; if true, the state is saved and the training ends early.
-
-        Returns:
-            File of the weights, or None if it was stopped.
-
-        Raises:
-            TrainingDivergedError: A loss is no longer a finite number.
-            CheckpointError: A file cannot be written.
-        """
-        sums: dict[str, float] = {}
-        while self.step < self.config.steps:
-            for name, value in self.train_step().items():
-                sums[name] = sums.get(name, 0.0) + value
-            if self.step % self.config.log_every == 0:
-                line = {"step": float(self.step), **{k: v / self.config.log_every for k, v in sums.items()}}
-                sums = {}
-                self.history.append(line)
-                report("  ".join(f"{k} {v:.4g}" for k, v in line.items()))
-            if stopped() or self.step % self.config.save_every == 0 or self.step == self.config.steps:
-                if self.validation and self.history:
-                    self.history[-1] |= self.validation_losses()
-                self.save(out)
-            if stopped():
-                return None
-        save_weights(
-            out / WEIGHTS,
-            "light",
-            self.config.network.to_dict(),
-            self.averaged.state_dict(),
-            {"steps": self.step, "pictures": self.step * self.config.batch_size, "config": self.described()},
-        )
-        return out / WEIGHTS
-
     def train_step(self) -> dict[str, float]:
-        """One batch; the loss terms.
-
-        Raises:
-            TrainingDivergedError: A loss is no longer a finite number.
-        """
+        """One batch; the loss terms."""
         config = self.config
         variation = config.augmentation
         if self.step >= config.steps * (1 - config.plain_share):
@@ -171,10 +121,6 @@ class LightTraining:
         self.network.train()
         terms = self._losses(self.network, pictures)
         loss = torch.stack([LOSS_WEIGHTS[name] * term for name, term in terms.items()]).sum()
-        if not torch.isfinite(loss):
-            raise TrainingDivergedError(
-                f"the loss is {float(loss.detach())} at step {self.step}; lower --config.learning-rate"
-            )
         self.optimizer.zero_grad(set_to_none=True)
         loss.backward()  # type: ignore[no-untyped-call]
         nn.utils.clip_grad_norm_(self.network.parameters(), config.gradient_norm)
@@ -185,6 +131,8 @@ class LightTraining:
 
     def validation_losses(self) -> dict[str, float]:
         """The loss terms of the averaged weights on pictures that are always the same, named `val_...`."""
+        if not self.validation:
+            return {}
         self.averaged.eval()
         sums: dict[str, float] = {}
         with torch.no_grad():
@@ -195,48 +143,26 @@ class LightTraining:
                     sums[name] = sums.get(name, 0.0) + float(term)
         return {f"val_{name}": value / len(self.validation) for name, value in sums.items()}
 
-    def save(self, out: Path) -> None:
-        """Writes the state and the history.
+    def modules(self) -> dict[str, nn.Module]:
+        """The network and its average."""
+        return {"network": self.network, "averaged": self.averaged}
+
+    def write_weights(self, path: Path) -> None:
+        """Writes the averaged weights.
 
         Raises:
-            CheckpointError: A file cannot be written.
+            CheckpointError: The file cannot be written.
         """
-        state = {
-            "step": self.step,
-            "config": json.dumps(self.described()),
-            "network": self.network.state_dict(),
-            "averaged": self.averaged.state_dict(),
-            "optimizer": self.optimizer.state_dict(),
-            "rng": json.dumps(self.rng.bit_generator.state),
-            "history": json.dumps(self.history),
+        training = {
+            "steps": self.step,
+            "pictures": self.step * self.config.batch_size,
+            "boxes_only": not _with_masks(self.draw.sets),
+            "config": self.described(),
         }
-        buffer = io.BytesIO()
-        torch.save(state, buffer)
-        write_atomically(out / CHECKPOINT, buffer.getvalue())
-        write_atomically(out / HISTORY, json.dumps(self.history, indent=1).encode())
-
-    def resume(self, out: Path) -> None:
-        """Goes on where `save` was called last.
-
-        Raises:
-            CheckpointError: There is no usable checkpoint, or it is of other settings.
-        """
-        state = read_tensors(out / CHECKPOINT)
-        try:
-            if json.loads(state["config"]) != json.loads(json.dumps(self.described())):
-                raise CheckpointError(
-                    f"{out / CHECKPOINT} was trained with other settings; repeat them, or choose another --out"
-                )
-            self.network.load_state_dict(state["network"])
-            self.averaged.load_state_dict(state["averaged"])
-            self.optimizer.load_state_dict(state["optimizer"])
-            self.rng.bit_generator.state = json.loads(state["rng"])
-            self.step, self.history = int(state["step"]), json.loads(state["history"])
-        except (KeyError, TypeError, RuntimeError) as error:
-            raise CheckpointError(f"{out / CHECKPOINT} is no state of this training ({error})") from error
+        save_weights(path, "light", self.config.network.to_dict(), self.averaged.state_dict(), training)
 
     def described(self) -> dict[str, Any]:
-        """The settings that decide the result, as JSON can hold them."""
+        """The settings and the data."""
         described: dict[str, Any] = json.loads(json.dumps(asdict(self.config)))
         described["images"] = [len(s) for s in self.draw.sets]
         described["shares"] = list(self.draw.shares)
@@ -281,8 +207,6 @@ def _fixed_batches(
     images: Sequence[AnnotatedImage], config: LightTrainConfig, limit: int = 64
 ) -> list[list[TrainingPicture]]:
     """Pictures that are cut once, without a change of light."""
-    from maniskill_tomato.perception.training_pictures import training_picture
-
     rng = np.random.default_rng(0)
     plain = AugmentationConfig(
         size=config.augmentation.size,
@@ -301,3 +225,10 @@ def _fixed_batches(
     pictures = [augmented(lambda image=image: training_picture(image), plain, rng) for image in chosen]  # type: ignore[misc]
     size = config.batch_size
     return [pictures[i : i + size] for i in range(0, len(pictures), size)]
+
+
+def _with_masks(sets: Sequence[Sequence[AnnotatedImage]]) -> bool:
+    """Whether any fruit has a mask, so that masks are learned."""
+    return any(
+        fruit.visible_mask is not None for images in sets for image in images for fruit in image.fruits
+    )

@@ -2,12 +2,19 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import Path
 
 import cv2
 import numpy as np
 
 from maniskill_tomato.errors import InvalidInputError
-from maniskill_tomato.perception.annotations import FRUIT_CATEGORIES, AnnotatedImage, Instance
+from maniskill_tomato.perception.annotations import (
+    FRUIT_CATEGORIES,
+    AnnotatedImage,
+    AnnotatedImages,
+    Instance,
+)
+from maniskill_tomato.perception.formats import read_annotated
 from maniskill_tomato.perception.fruit_targets import TrainingPicture
 
 LEAST_VISIBLE = 0.1
@@ -15,6 +22,18 @@ LEAST_VISIBLE = 0.1
 
 SMALLEST_SIDE = 6.0
 """Nor are those whose visible box is narrower than this, in [px]."""
+
+
+def read_place(place: str) -> AnnotatedImages:
+    """The annotated images of FOLDER, or of FOLDER:SPLIT for one list of it.
+
+    Raises:
+        InvalidInputError: There is nothing usable.
+    """
+    if Path(place).exists():
+        return read_annotated(place)
+    folder, _, split = place.rpartition(":")
+    return read_annotated(folder, split) if folder else read_annotated(place)
 
 
 def ignored_fruit(fruit: Instance) -> bool:
