@@ -47,7 +47,7 @@ class DriverContext:
     _shared: dict[str, Any] = field(default_factory=dict)
 
     def shared(self, key: str, make: Callable[[], T]) -> T:
-        """One object for several drivers of the run, made when the first asks: arm and camera of the twin meet in it."""
+        """One object for several drivers of the run, made when the first asks: the twin's arm and camera share one."""
         if key not in self._shared:
             self._shared[key] = make()
         found: T = self._shared[key]

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from maniskill_tomato.deploy.errors import ProtocolError
 from maniskill_tomato.robot.d435 import CameraIntrinsics
 from maniskill_tomato.robot.iiwa14 import NUM_JOINTS
+from maniskill_tomato.visibility.view_rays import ViewRays
 
 Float64 = NDArray[np.float64]
 
@@ -77,6 +78,10 @@ class FrameTruth:
     """Centre of the target, world frame, in [m]. Shape (3,)."""
     visible_fraction: float
     """V_f of the target by ray casting, as in the simulated tasks."""
+    ripe_labels: tuple[int, ...]
+    """Labels of the ripe fruits, the target's among them."""
+    rays: ViewRays
+    """What the task's pattern of rays about the target meets."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

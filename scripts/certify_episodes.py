@@ -28,8 +28,8 @@ from maniskill_tomato.errors import InvalidInputError, TomatoError
 from maniskill_tomato.learning.envs import make_env
 from maniskill_tomato.planners.env_truth import EnvironmentTruth
 from maniskill_tomato.planners.oracle import OracleSearch
+from maniskill_tomato.plants.episode_list import EPISODE_LISTS, Episode, read_episodes, write_episodes
 from maniskill_tomato.tasks.episode_draw import draw_episodes
-from maniskill_tomato.tasks.episode_list import EPISODE_LISTS, Episode, read_episodes, write_episodes
 
 logger = logging.getLogger("certify_episodes")
 

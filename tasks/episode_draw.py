@@ -7,8 +7,8 @@ from typing import Any
 import gymnasium as gym
 import torch
 
+from maniskill_tomato.plants.episode_list import Episode
 from maniskill_tomato.plants.row import leaf_density_of
-from maniskill_tomato.tasks.episode_list import Episode
 
 CHUNK = 100
 """Episodes drawn before they are looked at again, so that their plants are still at hand."""
@@ -20,7 +20,7 @@ def draw_episodes(
     """Episodes of `TomatoViewpoint-v1` on different plants of a split, as their list replays them.
 
     Args:
-        split: A name of `plant_choice.SEED_SPLITS`.
+        split: A name of `plants.choice.SEED_SPLITS`.
         count: How many.
         first_seed: Seed of the first reset; the next ones follow.
         on_episode: Called with the number of finished episodes.

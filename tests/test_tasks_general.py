@@ -12,19 +12,19 @@ import torch
 
 import maniskill_tomato  # noqa: F401
 from maniskill_tomato.errors import InvalidInputError
-from maniskill_tomato.robot.iiwa14 import NUM_JOINTS
-from maniskill_tomato.robot.kinematics import forward_kinematics
-from maniskill_tomato.robot.look_at import flange_to_camera
-from maniskill_tomato.tasks.episode_draw import draw_episodes
-from maniskill_tomato.tasks.episode_list import (
+from maniskill_tomato.plants.choice import SEED_SPLITS
+from maniskill_tomato.plants.episode_list import (
     EPISODE_LISTS,
     Episode,
     load_episodes,
     read_episodes,
     write_episodes,
 )
+from maniskill_tomato.robot.iiwa14 import NUM_JOINTS
+from maniskill_tomato.robot.kinematics import forward_kinematics
+from maniskill_tomato.robot.look_at import flange_to_camera
+from maniskill_tomato.tasks.episode_draw import draw_episodes
 from maniskill_tomato.tasks.general_rewards import view_gain_reward
-from maniskill_tomato.tasks.plant_choice import SEED_SPLITS
 from maniskill_tomato.visibility.caster import VisibilityCaster
 from maniskill_tomato.visibility.observation import ObservationLayout
 

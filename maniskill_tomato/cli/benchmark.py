@@ -57,7 +57,7 @@ class Benchmark:
         )
         from maniskill_tomato.evaluation.benchmark_store import EpisodeStore
         from maniskill_tomato.planners.registry import PRIVILEGED
-        from maniskill_tomato.tasks.episode_list import load_episodes
+        from maniskill_tomato.plants.episode_list import load_episodes
         from maniskill_tomato.tasks.general_config import GeneralTaskConfig
 
         specs = parse_policies(self.policies)
