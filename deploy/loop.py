@@ -58,7 +58,7 @@ class LoopConfig:
     """Moves in which it must be."""
     lost_after: int = 12
     """Looks without any of the target in a row after which it counts as lost."""
-    refused_after: int = 5
+    refused_after: int = 8
     """Refused moves in a row after which the run ends."""
     settle: float = 0.2
     """Between the end of a move and the next picture, in [s]."""
@@ -259,7 +259,7 @@ class Loop:
         """Solves the move, has it checked and carried out, or counts it as refused."""
         assert step.action is not None and self._target is not None
         with self._timed("kinematics"):
-            joints = torch.as_tensor(step.joint_positions[None], dtype=torch.float32)
+            joints = torch.tensor(step.joint_positions[None], dtype=torch.float32)
             position = torch.as_tensor(step.T_world_camera[None, :3, 3])
             target = torch.as_tensor(self._target[None])
             solved = self._mover.move(joints, position, target, torch.tensor([step.action]))
