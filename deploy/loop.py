@@ -12,6 +12,7 @@ from collections import defaultdict
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
+from itertools import islice
 from typing import Final, Literal
 
 import numpy as np
@@ -26,18 +27,23 @@ from maniskill_tomato.deploy.observing import Observing
 from maniskill_tomato.deploy.perceive import Perception
 from maniskill_tomato.deploy.plant_points import PlantPoints
 from maniskill_tomato.deploy.policies import decide
+from maniskill_tomato.deploy.postures import Postures
+from maniskill_tomato.deploy.safety import Refusal
 from maniskill_tomato.deploy.steps import Recorder, RunResult, Step
 from maniskill_tomato.deploy.stops import Stops
 from maniskill_tomato.errors import InvalidInputError, PolicyError, TomatoError
 from maniskill_tomato.planners.base import Planner
 from maniskill_tomato.robot.inverse_kinematics import Reach
-from maniskill_tomato.robot.look_at_move import LookAtMover
+from maniskill_tomato.robot.look_at_move import LookAtMover, moved_position
 
 Mode = Literal["dry_run", "confirm", "unattended"]
 """Show the first move and end; ask before every move; go on alone."""
 
 WAIT_SLICE: Final = 0.1
 """While the arm moves, stops are looked for this often, in [s]."""
+
+OTHERS_TRIED: Final = 16
+"""So many other postures are held against `safety` before a move counts as refused."""
 
 _logger = logging.getLogger(__name__)
 
@@ -52,7 +58,7 @@ class LoopConfig:
     """Moves in which it must be."""
     lost_after: int = 12
     """Looks without any of the target in a row after which it counts as lost."""
-    refused_after: int = 5
+    refused_after: int = 8
     """Refused moves in a row after which the run ends."""
     settle: float = 0.2
     """Between the end of a move and the next picture, in [s]."""
@@ -138,6 +144,7 @@ class Loop:
         self._target = target_position
         self._observing = Observing(T_flange_camera, config.max_moves)
         self._mover = LookAtMover(T_flange_camera=np.array(T_flange_camera, dtype=np.float64))
+        self._postures = Postures(T_flange_camera, arm.safety.config.joint_margin)
         self._points = PlantPoints()
         self._fractions: list[float] = []
         self._moves = self._refused = self._refused_in_a_row = self._lost_in_a_row = 0
@@ -252,20 +259,22 @@ class Loop:
         """Solves the move, has it checked and carried out, or counts it as refused."""
         assert step.action is not None and self._target is not None
         with self._timed("kinematics"):
-            joints = torch.as_tensor(step.joint_positions[None], dtype=torch.float32)
+            joints = torch.tensor(step.joint_positions[None], dtype=torch.float32)
             position = torch.as_tensor(step.T_world_camera[None, :3, 3])
             target = torch.as_tensor(self._target[None])
             solved = self._mover.move(joints, position, target, torch.tensor([step.action]))
         if int(solved.reach[0]) == int(Reach.UNREACHABLE):
             self._refuse(step, "out of reach")
             return
-        goal = solved.qpos[0].float().double().numpy()
-        move = JointMove(joint_positions=goal, speed_fraction=self._arm.safety.config.speed_fraction)
+        with self._timed("safety"):
+            move, refusal = self._safe_move(step, solved.qpos[0].float().double().numpy(), frame)
         if self._mode != "unattended":
-            self._ask(step, move, frame)
+            self._ask(step, move, refusal)
+        if refusal is not None:
+            self._refuse(step, str(refusal))
+            return
         try:
-            with self._timed("safety"):
-                sent = self._arm.command(move, frame.stamp, self._points.points_w)
+            sent = self._arm.command(move, frame.stamp, self._points.points_w)
         except RefusedError as error:
             self._refuse(step, str(error))
             return
@@ -288,10 +297,37 @@ class Loop:
         self._clock.sleep(self._config.settle)
         self._settled_at = self._clock.now()
 
-    def _ask(self, step: Step, move: JointMove, frame: Frame) -> None:
+    def _safe_move(self, step: Step, goal: Float64, frame: Frame) -> tuple[JointMove, Refusal | None]:
+        """The task's own posture, or another one of the same or a shorter move that `safety` accepts.
+
+        If there is none: the task's own, and why it is refused.
+        """
+        safety, state = self._arm.safety, self._arm.read()
+        speed = safety.config.speed_fraction
+        own = JointMove(joint_positions=goal, speed_fraction=speed)
+        points, now = self._points.points_w, self._clock.now()
+        refusal = safety.check(own, state, now, frame.stamp, points)
+        if refusal is None or step.action is None or self._target is None:
+            return own, refusal
+        position = step.T_world_camera[:3, 3]
+        aim = moved_position(
+            torch.as_tensor(position),
+            torch.as_tensor(self._target),
+            torch.tensor(step.action, dtype=torch.float64),
+        )
+        others = self._postures.of_move(
+            state.joint_positions, position, aim.numpy(), self._target, safety.config.max_joint_step
+        )
+        for posture in islice(others, OTHERS_TRIED):
+            move = JointMove(joint_positions=posture, speed_fraction=speed)
+            if safety.check(move, state, now, frame.stamp, points) is None:
+                _logger.info("move %d in another posture, because %s", self._moves, refusal)
+                return move, None
+        return own, refusal
+
+    def _ask(self, step: Step, move: JointMove, refusal: Refusal | None) -> None:
         """Shows the move; goes on only if a person wants it."""
         state = self._arm.read()
-        refusal = self._arm.safety.check(move, state, self._clock.now(), frame.stamp, self._points.points_w)
         after = self._observing.camera_pose(move.joint_positions)
         proposal = Proposal(
             number=self._moves - 1,

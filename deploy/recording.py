@@ -153,8 +153,8 @@ class McapRecorder:
 
     def _error(self, error: OSError) -> RecordingError:
         return RecordingError(
-            f"cannot write the recording {self.path}: {error.strerror or error}; free some space, choose another --out, "
-            "or pass --no-record"
+            f"cannot write the recording {self.path}: {error.strerror or error}; free some space, choose another "
+            "--out, or pass --no-record"
         )
 
 

@@ -87,8 +87,8 @@ def run(
     if not station.simulated and not profile.calibrated:
         if mode != "dry_run":
             raise ProfileError(
-                "the camera's place on the flange is not calibrated: run `maniskill-tomato deploy calibrate` and name its "
-                "file in calibration.file; without it only a dry run is allowed"
+                "the camera's place on the flange is not calibrated: run `maniskill-tomato deploy calibrate` and name "
+                "its file in calibration.file; without it only a dry run is allowed"
             )
         _logger.warning("not calibrated: the camera's place on the flange is that of the drawings")
     facts: dict[str, Any] = {

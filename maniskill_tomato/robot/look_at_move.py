@@ -106,7 +106,7 @@ class LookAtMover:
         """
         self._inverse_kinematics = InverseKinematics(device=device)
         device = self._inverse_kinematics.device
-        inverse = np.linalg.inv(T_flange_camera)
+        inverse = np.asarray(np.linalg.inv(T_flange_camera), dtype=np.float64)
         self._T_camera_flange = torch.as_tensor(inverse, dtype=torch.float64, device=device)
         self._rolls = torch.tensor(CAMERA_ROLLS, dtype=torch.float64, device=device)
         # Upright first, then 30 degrees to either side, 60, ...; between the two sides the joints decide.
