@@ -17,8 +17,10 @@ DICTIONARIES: Final = ("DICT_4X4_50", "DICT_4X4_100", "DICT_5X5_50", "DICT_5X5_1
 
 @dataclass(frozen=True, kw_only=True)
 class CharucoBoard:
-    """A chessboard with markers in its white squares. Board frame: origin in the top-left corner of the print, x right, y
-    down, z into the board."""
+    """A chessboard with markers in its white squares.
+
+    Board frame: origin in the top-left corner of the print, x right, y down, z into the board.
+    """
 
     columns: int = 8
     """Squares side by side."""
@@ -44,7 +46,9 @@ class CharucoBoard:
         if self.dictionary not in DICTIONARIES:
             raise InvalidInputError.choice("dictionary", self.dictionary, DICTIONARIES)
         if self.columns * self.rows // 2 > int(self.dictionary.rsplit("_", 1)[1]):
-            raise InvalidInputError(f"{self.dictionary} has too few markers for {self.columns} x {self.rows} squares")
+            raise InvalidInputError(
+                f"{self.dictionary} has too few markers for {self.columns} x {self.rows} squares"
+            )
 
     @cached_property
     def _board(self) -> Any:

@@ -1,7 +1,7 @@
-"""The calibration as a TOML file, to which a profile refers."""
+"""The calibration as a JSON file, which a profile names in `calibration.file`."""
 
-import tomllib
-from dataclasses import dataclass
+import json
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Final
 
@@ -66,22 +66,12 @@ def write_calibration(
         rotation_std=result.rotation_std,
         view_count=len(result.views),
     )
-    rows = ",\n".join("    [" + ", ".join(f"{v:.12g}" for v in row) + "]" for row in result.T_flange_camera.tolist())
-    safe_serial = "".join(c for c in serial if c.isalnum() or c in "-_.")
-    path_text = f"""# Hand-eye calibration: the colour camera's optical frame (z forward, x right, y down) in the flange's
-# frame link_ee (the plain flange face), in metres. Refer to this file from a profile.
-T_flange_camera = [
-{rows},
-]
-color_size = [{intrinsics.width}, {intrinsics.height}]
-color_focal = [{intrinsics.fx:.9g}, {intrinsics.fy:.9g}]
-serial = "{safe_serial}"
-rms_px = {calibration.rms_px:.6g}
-position_std = {calibration.position_std:.6g} # metres
-rotation_std = {calibration.rotation_std:.6g} # radians
-view_count = {calibration.view_count}
-"""
-    write_atomically(path, path_text.encode())
+    content = asdict(calibration) | {
+        "T_flange_camera": result.T_flange_camera.tolist(),
+        "about": "T_flange_camera: the colour camera's optical frame (z forward, x right, y down) in the flange's "
+        "frame link_ee (the plain flange face); metres, radians",
+    }
+    write_atomically(path, (json.dumps(content, indent=1) + "\n").encode())
     return calibration
 
 
@@ -92,21 +82,25 @@ def read_calibration(path: Path) -> HandEyeCalibration:
         CalibrationError: It is missing, or a value is missing or cannot be; the message names it.
     """
     try:
-        table = tomllib.loads(path.read_text())
+        table = json.loads(path.read_text())
     except FileNotFoundError as error:
         raise CalibrationError(
             f"no calibration at {path}; `maniskill-tomato deploy calibrate` writes one"
         ) from error
-    except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
+    except (OSError, ValueError, RecursionError) as error:
         raise CalibrationError(f"{path} cannot be read: {error}") from error
+    if not isinstance(table, dict):
+        raise CalibrationError(f"{path} must hold a JSON object")
     pose = _numbers(table, "T_flange_camera", (4, 4), path)
     off = np.abs(pose[:3, :3] - nearest_rotation(pose[:3, :3])).max()
     if off > 1e-6 or not np.array_equal(pose[3], [0.0, 0.0, 0.0, 1.0]):
-        raise CalibrationError(f"{path}: T_flange_camera must be a rotation and a translation, last row 0 0 0 1")
+        raise CalibrationError(
+            f"{path}: T_flange_camera must be a rotation and a translation, last row 0 0 0 1"
+        )
     if np.linalg.norm(pose[:3, 3]) > LARGEST_LEVER:
         raise CalibrationError(
-            f"{path}: T_flange_camera puts the camera {np.linalg.norm(pose[:3, 3]):.2f} m from the flange; {LARGEST_LEVER} "
-            "m at most are taken (is it in metres?)"
+            f"{path}: T_flange_camera puts the camera {np.linalg.norm(pose[:3, 3]):.2f} m from the flange; "
+            f"{LARGEST_LEVER} m at most are taken (is it in metres?)"
         )
     size = _numbers(table, "color_size", (2,), path)
     focal = _numbers(table, "color_focal", (2,), path)

@@ -16,15 +16,14 @@ from maniskill_tomato.deploy.calibration.hand_eye import (
     CalibrationError,
     board_pose,
 )
-from maniskill_tomato.deploy.calibration.rigid import inverse
+from maniskill_tomato.deploy.calibration.rigid import inverse, rotation_from_vector, transform
 from maniskill_tomato.deploy.calibration.view_folder import RecordedView, board_view, flange_pose, write_views
 from maniskill_tomato.deploy.clock import Clock
 from maniskill_tomato.deploy.guarded_arm import GuardedArm
-from maniskill_tomato.deploy.interface import Camera, Float64, JointMove
+from maniskill_tomato.deploy.interface import ArmState, Camera, Float64, JointMove
 from maniskill_tomato.errors import InvalidInputError
 from maniskill_tomato.robot.d435 import T_flange_camera_color_optical
 from maniskill_tomato.robot.inverse_kinematics import InverseKinematics, Reach
-from maniskill_tomato.robot.look_at import look_at_pose
 
 logger = logging.getLogger(__name__)
 
@@ -57,13 +56,16 @@ class CapturePlan:
                 raise InvalidInputError(f"{name} must be from 0 to {most}, got {getattr(self, name)}")
 
 
-def camera_poses(board: CharucoBoard, T_base_board: Float64, T_base_camera: Float64, plan: CapturePlan) -> Float64:
+def camera_poses(
+    board: CharucoBoard, T_base_board: Float64, T_base_camera: Float64, plan: CapturePlan
+) -> Float64:
     """Poses of the camera round a board, twice as many as views are wanted: not all can be reached.
 
     Args:
         board: The print.
         T_base_board: Where it is. Shape (4, 4).
-        T_base_camera: The first camera's optical frame, whose roll is kept in the middle. Shape (4, 4).
+        T_base_camera: The first camera's optical frame, from which the others are turned as little as can be.
+            Shape (4, 4).
         plan: How far and how much turned.
 
     Returns:
@@ -73,20 +75,28 @@ def camera_poses(board: CharucoBoard, T_base_board: Float64, T_base_camera: Floa
     # The board's z axis goes into the print.
     x, y, normal = T_base_board[:3, 0], T_base_board[:3, 1], -T_base_board[:3, 2]
     count = 2 * plan.views
-    target = torch.from_numpy(middle[:3].copy())
-    upright = look_at_pose(torch.from_numpy(T_base_camera[:3, 3].copy()), target)[:3, :3].numpy()
-    first = upright.T @ T_base_camera[:3, :3]
-    roll_0 = math.atan2(first[1, 0], first[0, 0])
     poses = []
     for k in range(count):
         tilt = plan.largest_tilt * math.sqrt((k + 0.5) / count)
         azimuth = k * math.pi * (3.0 - math.sqrt(5.0))  # The golden angle spreads them evenly.
         distance = plan.distances[0] + (plan.distances[1] - plan.distances[0]) * ((k * 0.618) % 1.0)
-        roll = roll_0 + plan.largest_roll * (2.0 * ((k * 0.755) % 1.0) - 1.0)
+        roll = plan.largest_roll * (2.0 * ((k * 0.755) % 1.0) - 1.0)
         sideways = math.cos(azimuth) * x + math.sin(azimuth) * y
-        position = middle[:3] + distance * (math.cos(tilt) * normal + math.sin(tilt) * sideways)
-        poses.append(look_at_pose(torch.from_numpy(position), target, roll).numpy())
+        away = math.cos(tilt) * normal + math.sin(tilt) * sideways
+        # Turned from the first view by the shortest way: "upright" means little for a camera that looks down.
+        aimed = _shortest_turn(T_base_camera[:3, 2], -away) @ T_base_camera[:3, :3]
+        rotation = aimed @ rotation_from_vector(np.array([0.0, 0.0, roll]))
+        poses.append(transform(rotation, middle[:3] + distance * away))
     return np.asarray(poses, dtype=np.float64)
+
+
+def _shortest_turn(start: Float64, end: Float64) -> Float64:
+    """The rotation that takes one unit vector to another about the axis at right angles to both. Shape (3, 3)."""
+    axis = np.cross(start, end)
+    length = float(np.linalg.norm(axis))
+    if length < 1e-9:
+        return np.eye(3)
+    return rotation_from_vector(axis / length * math.atan2(length, float(start @ end)))
 
 
 def capture_views(
@@ -140,43 +150,59 @@ def capture_views(
     first = look()
     if first is None:
         raise CalibrationError(
-            "the board is not in the picture; bring the arm to where the camera sees all of it, about 0.35 m away, and check "
-            "the board's columns, rows and dictionary"
+            "the board is not in the picture; bring the arm to where the camera sees all of it, about 0.35 m away, "
+            "and check the board's columns, rows and dictionary"
         )
     T_base_camera = first.T_base_flange @ T_flange_camera
     T_base_board = T_base_camera @ board_pose(board, first, camera.intrinsics)
     left = list(camera_poses(board, T_base_board, T_base_camera, plan) @ inverse(T_flange_camera))
+    start, at_start = views[0].joint_positions, True
     while left and len(views) < plan.views:
         k, move = _next_move(arm, kinematics, left)
-        if move is None:
-            logger.warning("%d views; the other %d poses are not safe to go to from here", len(views), len(left))
+        going_back = move is None and not at_start
+        if going_back:
+            # Poses that are out of reach of one move from here may be within one from the start.
+            move = JointMove(joint_positions=start, speed_fraction=arm.safety.config.speed_fraction)
+        elif move is not None:
+            del left[k]
+        if move is None or arm.safety.check(move, state := arm.read(), state.stamp) is not None:
+            logger.warning("%d views; the other %d poses are not safe to go to", len(views), len(left))
             break
-        del left[k]
-        position = flange_pose(move.joint_positions)[:3, 3]
-        turn = np.degrees(np.abs(move.joint_positions - arm.read().joint_positions).max())
-        question = (
-            f"view {len(views) + 1} of {plan.views}: flange to x {position[0]:.3f}, y {position[1]:.3f}, z {position[2]:.3f} m, "
-            f"largest joint turn {turn:.0f} degrees, speed {move.speed_fraction:.0%}"
-        )
-        if not confirm(question):
+        at_start = going_back
+        what = "back to the start" if going_back else f"view {len(views) + 1} of {plan.views}"
+        if not confirm(f"{what}: {_in_words(move, state)}"):
+            if going_back:
+                break
             continue
         arm.command(move)
         while not arm.wait(0.2):
             pass
-        if look() is None:
+        if not going_back and look() is None:
             logger.info("the board is not in this picture; it is left out")
     return views
 
 
-def _next_move(arm: GuardedArm, kinematics: InverseKinematics, flanges: list[Float64]) -> tuple[int, JointMove | None]:
-    """The first pose that can be reached and is safe to go to, and its place in the list."""
+def _in_words(move: JointMove, state: ArmState) -> str:
+    x, y, z = flange_pose(move.joint_positions)[:3, 3]
+    turn = np.degrees(np.abs(move.joint_positions - state.joint_positions).max())
+    return (
+        f"flange to x {x:.3f}, y {y:.3f}, z {z:.3f} m, largest joint turn {turn:.0f} degrees, "
+        f"speed {move.speed_fraction:.0%}"
+    )
+
+
+def _next_move(
+    arm: GuardedArm, kinematics: InverseKinematics, flanges: list[Float64]
+) -> tuple[int, JointMove | None]:
+    """The nearest pose by joint turns that can be reached and is safe to go to, and its place in the list."""
     state = arm.read()
     solution = kinematics.solve(
         torch.from_numpy(np.array(flanges)),
         torch.from_numpy(np.tile(state.joint_positions, (len(flanges), 1))),
         neighbour=False,
     )
-    for k in range(len(flanges)):
+    turns = np.abs(solution.qpos.numpy() - state.joint_positions).max(axis=1)
+    for k in np.argsort(turns).tolist():
         if int(solution.reach[k]) != Reach.REACHABLE:
             continue
         move = JointMove(

@@ -2,9 +2,10 @@
 
 With A the flange in the base, X the camera on the flange, B the board before the camera and Z the board in the base,
 every view has A X B = Z. A first X follows in closed form from pairs of views (Park and Martin, "Robot sensor
-calibration: solving AX = XB on the Euclidean group", IEEE Transactions on Robotics and Automation 10, 1994); then X and Z
-are moved until the board's corners are where the pictures show them (least squares, Levenberg-Marquardt), because errors
-are equal in pixels and not in poses. OpenCV has closed forms of this as well, but not in every version of its Python module.
+calibration: solving AX = XB on the Euclidean group", IEEE Transactions on Robotics and Automation 10, 1994); then X
+and Z are moved until the board's corners are where the pictures show them (least squares, Levenberg-Marquardt),
+because errors are equal in pixels and not in poses. OpenCV has closed forms of this too, but its Python module lacks
+them from 5.0.0 on.
 """
 
 from collections.abc import Sequence
@@ -13,6 +14,7 @@ from typing import Final
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 
 from maniskill_tomato.deploy.calibration.board import CharucoBoard
 from maniskill_tomato.deploy.calibration.rigid import (
@@ -54,8 +56,8 @@ class BoardView:
     """Of the picture, for messages."""
     T_base_flange: Float64
     """Where `link_ee` was. Shape (4, 4)."""
-    corner_ids: Float64
-    """Which corners of the board are seen. Shape (M,), int64."""
+    corner_ids: NDArray[np.int64]
+    """Which corners of the board are seen. Shape (M,)."""
     corners_px: Float64
     """Where, in continuous image coordinates, in [px]. Shape (M, 2)."""
 
@@ -134,7 +136,8 @@ def calibrate_hand_eye(
         if len(used) < MIN_VIEWS:
             detail = f" (left out: {'; '.join(left_out)})" if left_out else ""
             raise CalibrationError(
-                f"{len(used)} usable views, {MIN_VIEWS} are needed{detail}; take more with the whole board in the picture"
+                f"{len(used)} usable views, {MIN_VIEWS} are needed{detail}; take more with the whole board in "
+                "the picture"
             )
         flanges = np.stack([v.T_base_flange for v in used])
         boards = np.stack([board_pose(board, v, intrinsics) for v in used])
@@ -163,7 +166,7 @@ def calibrate_hand_eye(
 
 def _closed_form(flanges: Float64, boards: Float64) -> Float64:
     """X of A X = X B over all pairs of views, A and B the motions of flange and camera (Park and Martin, 1994)."""
-    alphas, betas, rows, right = [], [], [], []
+    alphas, betas, rows = [], [], []
     pairs = [(i, j) for i in range(len(flanges)) for j in range(i + 1, len(flanges))]
     for i, j in pairs:
         a = inverse(flanges[j]) @ flanges[i]
@@ -200,23 +203,22 @@ def _refine(
     corners = board.corners
     points = [corners[v.corner_ids] for v in views]
     seen = np.concatenate([v.corners_px for v in views])
-    to_flange = [inverse(v.T_base_flange) for v in views]
+    to_flange = np.stack([inverse(v.T_base_flange) for v in views])
+    of_view = np.repeat(np.arange(len(views)), [len(p) for p in points])
+    stacked = np.concatenate(points)
 
     def moved(pose: Float64, step: Float64) -> Float64:
         return pose @ transform(rotation_from_vector(step[:3]), step[3:])
 
     def residual(pose: Float64, about: Float64) -> Float64:
-        to_camera = inverse(pose)
-        shown = [
-            intrinsics.project(p @ (chain := to_camera @ flange @ about)[:3, :3].T + chain[:3, 3])
-            for p, flange in zip(points, to_flange, strict=True)
-        ]
-        return np.nan_to_num((seen - np.concatenate(shown)).ravel(), nan=1e4)
+        chains = (inverse(pose) @ to_flange @ about)[of_view]
+        in_camera = (chains[:, :3, :3] @ stacked[:, :, None])[..., 0] + chains[:, :3, 3]
+        return np.nan_to_num((seen - intrinsics.project(in_camera)).ravel(), nan=1e4)
 
     pose, about = T_flange_camera, T_base_board
     error = residual(pose, about)
     damping, small = 1e-3, 1e-6
-    jacobian = np.zeros((len(error), 12))
+    jacobian, normal = np.zeros((len(error), 12)), np.zeros((12, 12))
     for _ in range(100):
         for k in range(12):
             step = np.zeros(12)
@@ -226,7 +228,8 @@ def _refine(
             jacobian[:, k] = (ahead - behind) / (2.0 * small)
         normal, slope = jacobian.T @ jacobian, -(jacobian.T @ error)
         for _ in range(20):
-            change = np.linalg.solve(normal + damping * np.diag(np.diag(normal) + 1e-12), slope)
+            lifted = normal + damping * np.diag(np.diag(normal) + 1e-12)
+            change = np.asarray(np.linalg.solve(lifted, slope), np.float64)
             trial = moved(pose, change[:6]), moved(about, change[6:])
             trial_error = residual(*trial)
             if trial_error @ trial_error <= error @ error:
@@ -241,6 +244,6 @@ def _refine(
         if np.linalg.norm(change) < 1e-10 or gain < 1e-12 * (error @ error):
             break
     variance = float(error @ error) / max(1, len(error) - 12)
-    covariance = variance * np.linalg.pinv(normal)
+    covariance = np.asarray(variance * np.linalg.pinv(normal), np.float64)
     ends = np.cumsum([len(p) for p in points])[:-1]
     return pose, about, covariance, [np.asarray(r) for r in np.split(error.reshape(-1, 2), ends)]

@@ -1,5 +1,6 @@
 """A calibration in one picture: where corners are off, by view, and where each view alone puts the board."""
 
+import io
 from pathlib import Path
 from typing import Any
 
@@ -13,8 +14,8 @@ from maniskill_tomato.deploy.calibration.rigid import difference
 from maniskill_tomato.files import write_atomically
 from maniskill_tomato.robot.d435 import CameraIntrinsics, T_flange_camera_color_optical
 
-ARROW_SCALE = 60.0
-"""Residuals are drawn this many times as long as they are."""
+ARROW_LENGTH = 12.0
+"""So long is the arrow of a residual of the root mean square, in [px]."""
 
 
 def draw_calibration(path: Path, result: HandEyeResult, intrinsics: CameraIntrinsics) -> None:
@@ -28,8 +29,6 @@ def draw_calibration(path: Path, result: HandEyeResult, intrinsics: CameraIntrin
     Raises:
         CheckpointError: It cannot be written.
     """
-    import io
-
     figure = Figure(figsize=(14, 8.4), layout="constrained")
     FigureCanvasAgg(figure)
     grid: Any = figure.add_gridspec(2, 3, height_ratios=(1.5, 1.0))
@@ -45,6 +44,9 @@ def draw_calibration(path: Path, result: HandEyeResult, intrinsics: CameraIntrin
 
 
 def _arrows(axes: Any, result: HandEyeResult, intrinsics: CameraIntrinsics, colors: Any) -> None:
+    # A round number, so that the title tells it.
+    wanted = ARROW_LENGTH / max(result.rms_px, 1e-6)
+    times = min((1, 2, 5, 10, 20, 50, 100, 200, 500, 1000), key=lambda t: abs(np.log(t / wanted)))
     for view, residuals, color in zip(result.views, result.residuals_px, colors, strict=True):
         u, v = view.corners_px.T
         axes.quiver(
@@ -55,8 +57,8 @@ def _arrows(axes: Any, result: HandEyeResult, intrinsics: CameraIntrinsics, colo
             color=color,
             angles="xy",
             scale_units="xy",
-            scale=1.0 / ARROW_SCALE,
-            width=0.0018,
+            scale=1.0 / times,
+            width=0.002,
         )
     axes.set(
         xlim=(0, intrinsics.width),
@@ -64,7 +66,7 @@ def _arrows(axes: Any, result: HandEyeResult, intrinsics: CameraIntrinsics, colo
         aspect="equal",
         xlabel="column (px)",
         ylabel="row (px)",
-        title=f"Seen less predicted corners, {ARROW_SCALE:.0f} times as long; one colour a view",
+        title=f"Seen less predicted corners, {times} times as long; one colour a view",
     )
 
 
