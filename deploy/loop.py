@@ -263,11 +263,13 @@ class Loop:
             position = torch.as_tensor(step.T_world_camera[None, :3, 3])
             target = torch.as_tensor(self._target[None])
             solved = self._mover.move(joints, position, target, torch.tensor([step.action]))
-        if int(solved.reach[0]) == int(Reach.UNREACHABLE):
+        reachable = int(solved.reach[0]) != int(Reach.UNREACHABLE)
+        goal = solved.qpos[0].float().double().numpy()
+        with self._timed("safety"):
+            move, refusal = self._safe_move(step, goal if reachable else None, frame)
+        if move is None:
             self._refuse(step, "out of reach")
             return
-        with self._timed("safety"):
-            move, refusal = self._safe_move(step, solved.qpos[0].float().double().numpy(), frame)
         if self._mode != "unattended":
             self._ask(step, move, refusal)
         if refusal is not None:
@@ -297,18 +299,24 @@ class Loop:
         self._clock.sleep(self._config.settle)
         self._settled_at = self._clock.now()
 
-    def _safe_move(self, step: Step, goal: Float64, frame: Frame) -> tuple[JointMove, Refusal | None]:
+    def _safe_move(
+        self, step: Step, goal: Float64 | None, frame: Frame
+    ) -> tuple[JointMove | None, Refusal | None]:
         """The task's own posture, or another one of the same or a shorter move that `safety` accepts.
 
-        If there is none: the task's own, and why it is refused.
+        If there is none: the task's own (None where it has none either), and why it is refused.
         """
+        assert step.action is not None and self._target is not None
         safety, state = self._arm.safety, self._arm.read()
         speed = safety.config.speed_fraction
-        own = JointMove(joint_positions=goal, speed_fraction=speed)
         points, now = self._points.points_w, self._clock.now()
-        refusal = safety.check(own, state, now, frame.stamp, points)
-        if refusal is None or step.action is None or self._target is None:
-            return own, refusal
+        own: JointMove | None = None
+        refusal: Refusal | None = None
+        if goal is not None:
+            own = JointMove(joint_positions=goal, speed_fraction=speed)
+            refusal = safety.check(own, state, now, frame.stamp, points)
+            if refusal is None:
+                return own, None
         position = step.T_world_camera[:3, 3]
         aim = moved_position(
             torch.as_tensor(position),
@@ -321,7 +329,7 @@ class Loop:
         for posture in islice(others, OTHERS_TRIED):
             move = JointMove(joint_positions=posture, speed_fraction=speed)
             if safety.check(move, state, now, frame.stamp, points) is None:
-                _logger.info("move %d in another posture, because %s", self._moves, refusal)
+                _logger.info("move %d in another posture, because %s", self._moves, refusal or "out of reach")
                 return move, None
         return own, refusal
 
