@@ -99,7 +99,9 @@ class CollisionChecker:
                 if self._are_neighbours(a, b) or not contact.dist < self._needed(a, b):
                     continue
                 if worst is None or contact.dist < worst.distance:
-                    names = sorted((self._names[a], self._names[b]), key=lambda n: not n.startswith("link"))
+                    names = sorted(
+                        (self._names[a], self._names[b]), key=lambda name: name.startswith((TABLE, OBSTACLE))
+                    )
                     worst = Contact(first=names[0], second=names[1], distance=float(contact.dist), sample=k)
             if worst is not None:
                 return worst

@@ -101,7 +101,7 @@ def sphere_distances(joint_positions: Float64, points_w: Float64) -> Float64:
         In [m], negative inside a sphere. Shape (N, P).
     """
     links, spheres = sphere_table()
-    T = link_transforms(torch.as_tensor(np.ascontiguousarray(joint_positions), dtype=torch.float64)).numpy()
+    T = link_transforms(torch.as_tensor(np.array(joint_positions), dtype=torch.float64)).numpy()
     centres_l = np.concatenate([spheres[:, :3], np.ones((len(spheres), 1))], axis=1).astype(np.float64)
     centres = np.einsum("nsij,sj->nsi", T[:, links], centres_l)[..., :3]
     distances = np.full((len(joint_positions), len(points_w)), np.inf)

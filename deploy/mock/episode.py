@@ -1,22 +1,28 @@
 """Which plant the twin stands before: an episode of the simulated task's lists, the same in every number."""
 
 from dataclasses import dataclass
-from typing import Literal
+from typing import Final, Literal
 
 import numpy as np
 import torch
 from torch import Tensor
 
+from maniskill_tomato.deploy.collision import CollisionChecker
 from maniskill_tomato.deploy.errors import ProfileError
 from maniskill_tomato.deploy.interface import Float64
+from maniskill_tomato.deploy.postures import Postures
 from maniskill_tomato.plants.choice import ROW_PLANT
 from maniskill_tomato.plants.episode_list import Episode, load_episodes
 from maniskill_tomato.plants.organs import Plant
-from maniskill_tomato.robot.iiwa14 import READY_QPOS
+from maniskill_tomato.robot.d435 import T_flange_camera_color_optical
+from maniskill_tomato.robot.iiwa14 import JOINT_LOWER, JOINT_UPPER, READY_QPOS
 from maniskill_tomato.robot.inverse_kinematics import Reach
 from maniskill_tomato.robot.look_at_move import LookAtMover
 
 EpisodeListName = Literal["held_out", "validation"]
+
+START_MARGIN: Final = 0.05
+"""How far the start's joints stay from their limits where they can, in [rad]."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -67,13 +73,29 @@ def make_episode(episode: Episode) -> TwinEpisode:
     look = LookAtMover().look_from(ready, position, looked_at, largest_joint_step=10.0)
     if int(look.reach[0]) != Reach.REACHABLE:
         raise ProfileError(f"the arm cannot look at the target from {episode.camera_position} [m]")
+    start = look.qpos[0].float().double().numpy()
     return TwinEpisode(
         plant=plant,
         T_world_plant=T_world_plant,
         target=episode.target,
         target_position=target_position,
-        start_joints=look.qpos[0].float().double().numpy(),
+        start_joints=_clear_start(start, position[0].numpy(), looked_at[0].numpy()),
     )
+
+
+def _clear_start(start: Float64, position: Float64, target: Float64) -> Float64:
+    """The task's start posture, or if that touches the table or itself, the nearest other one that does not.
+
+    The task moves joints without collisions; an operator would not leave a real arm there.
+    """
+    checker = CollisionChecker()
+    inside = (start > JOINT_LOWER + START_MARGIN).all() and (start < JOINT_UPPER - START_MARGIN).all()
+    if inside and checker.nearest(start[None]) is None:
+        return start
+    for posture in Postures(T_flange_camera_color_optical, START_MARGIN).at(position, target, start):
+        if checker.nearest(posture[None]) is None:
+            return posture
+    return start
 
 
 def _plant_pose(pose: tuple[float, float, float]) -> Tensor:
