@@ -260,7 +260,7 @@ class Loop:
         assert step.action is not None and self._target is not None
         with self._timed("kinematics"):
             joints = torch.tensor(step.joint_positions[None], dtype=torch.float32)
-            position = torch.as_tensor(step.T_world_camera[None, :3, 3])
+            position = torch.as_tensor(self._observing.camera_position(step.joint_positions)[None])
             target = torch.as_tensor(self._target[None])
             solved = self._mover.move(joints, position, target, torch.tensor([step.action]))
         reachable = int(solved.reach[0]) != int(Reach.UNREACHABLE)
