@@ -44,6 +44,4 @@ class LatticeOracle(Planner):
         way = (candidates - position[:, None]).norm(dim=-1)
         near = -moves_needed(way) - way / (1e3 * MAX_MOVE)
         worth = torch.where(self.seen > self._threshold, near, self.seen - 1e3)
-        # A view from here has been taken.
-        allowed = situation.reachable & (way > 0.25 * MAX_MOVE)
-        return self.tried.move_to_best(situation, candidates, worth, allowed)
+        return self.tried.move_to_best(situation, candidates, worth, situation.reachable)

@@ -21,7 +21,6 @@ from maniskill_tomato.planners.base import Planner
 from maniskill_tomato.planners.moves import Candidates, moves_needed
 from maniskill_tomato.planners.quality_features import MAP_CHANNELS, SCALARS, quality_features
 from maniskill_tomato.planners.quality_network import ViewQualityNetwork
-from maniskill_tomato.robot.look_at_move import MAX_MOVE
 from maniskill_tomato.visibility.situation import Situation
 from maniskill_tomato.visibility.view_lattice import DISTANCES
 
@@ -98,9 +97,7 @@ class ViewQuality(Planner):
         candidates = situation.lattice.positions(target)
         way = (candidates - position[:, None]).norm(dim=-1)
         worth = self.config.patience * self.success_probability(situation) - moves_needed(way)
-        # A view from here has been taken.
-        allowed = situation.reachable & (way > 0.25 * MAX_MOVE)
-        return self.tried.move_to_best(situation, candidates, worth, allowed)
+        return self.tried.move_to_best(situation, candidates, worth, situation.reachable)
 
 
 def save_view_quality(path: Path, policy: ViewQuality) -> None:
