@@ -1,4 +1,4 @@
-"""The command `maniskill-tomato`: train, evaluate, compare, demonstrate, export.
+"""The command `maniskill-tomato`: train, evaluate, compare, demonstrate, export, render data sets.
 
 Examples:
     maniskill-tomato train TomatoViewpointGuided-v1
@@ -8,6 +8,7 @@ Examples:
     maniskill-tomato benchmark --policies nbv,oracle,runs/general/policy.pt --episodes 500
     maniskill-tomato demo
     maniskill-tomato export --policy runs/demo/training/policy.pt --out exported
+    maniskill-tomato dataset --count 1000 --split train --out runs/dataset
 """
 
 import logging
@@ -19,6 +20,7 @@ from typing import Annotated, Any
 import tyro
 
 from maniskill_tomato.cli.benchmark import Benchmark
+from maniskill_tomato.cli.dataset import Dataset
 from maniskill_tomato.cli.demo import Demo
 from maniskill_tomato.cli.evaluate import Eval
 from maniskill_tomato.cli.export import Export
@@ -26,12 +28,23 @@ from maniskill_tomato.cli.options import PlantOptions, merge_options
 from maniskill_tomato.cli.train import Train, train_default
 from maniskill_tomato.errors import TomatoError
 
-__all__ = ["Benchmark", "Demo", "Eval", "Export", "PlantOptions", "Train", "main", "merge_options", "parse"]
+__all__ = [
+    "Benchmark",
+    "Dataset",
+    "Demo",
+    "Eval",
+    "Export",
+    "PlantOptions",
+    "Train",
+    "main",
+    "merge_options",
+    "parse",
+]
 
 # PyTorch and ManiSkill take seconds to import, so that every command imports what it needs when it runs.
 
 
-def parse(argv: Sequence[str]) -> Train | Eval | Benchmark | Demo | Export:
+def parse(argv: Sequence[str]) -> Train | Eval | Benchmark | Demo | Export | Dataset:
     """The command that the arguments describe.
 
     The options of `train` default to those of the run that it continues or of its `--config` file, and these to
@@ -47,11 +60,12 @@ def parse(argv: Sequence[str]) -> Train | Eval | Benchmark | Demo | Export:
         | Annotated[Benchmark, tyro.conf.subcommand("benchmark")]
         | Annotated[Demo, tyro.conf.subcommand("demo")]
         | Annotated[Export, tyro.conf.subcommand("export")]
+        | Annotated[Dataset, tyro.conf.subcommand("dataset")]
     )
-    command: Train | Eval | Benchmark | Demo | Export = tyro.cli(
+    command: Train | Eval | Benchmark | Demo | Export | Dataset = tyro.cli(
         commands,
         prog="maniskill-tomato",
-        description="Active perception for tomato harvesting: train, evaluate, compare, demonstrate, export.",
+        description="Active perception for tomato harvesting: train, evaluate, compare, demonstrate, export, render.",
         args=list(argv),
         config=(tyro.conf.OmitArgPrefixes,),
     )

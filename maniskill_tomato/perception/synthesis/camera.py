@@ -132,7 +132,9 @@ def _defocused(picture: Float32, depth_m: NDArray[np.float64], look: CameraLook,
     if look.defocus * scale < 0.5:
         return picture
     depth = np.minimum(depth_m, 6.0).astype(np.float32)
-    radius = look.defocus * scale * np.minimum(np.abs(1 / depth - 1 / look.focus_m) / (1 / 0.3 - 1 / 0.8), 1.5)
+    radius = (
+        look.defocus * scale * np.minimum(np.abs(1 / depth - 1 / look.focus_m) / (1 / 0.3 - 1 / 0.8), 1.5)
+    )
     radius = cv2.GaussianBlur(radius.astype(np.float32), (0, 0), 1.5)
     levels = [0.0, 1.0, 2.0, 4.0, 7.0]
     result = picture

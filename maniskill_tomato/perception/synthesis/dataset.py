@@ -148,7 +148,9 @@ def _claim(config: DatasetConfig, out: Path) -> None:
                 f"{out} holds a data set with another {', '.join(differing)}; choose another folder or the same values"
             )
     elif out.is_dir() and any(out.iterdir()):
-        raise InvalidInputError(f"{out} is not empty and holds no data set of this command; choose another folder")
+        raise InvalidInputError(
+            f"{out} is not empty and holds no data set of this command; choose another folder"
+        )
     write_atomically(path, json.dumps(config.identity() | {"count": config.count}, indent=2).encode())
 
 
@@ -224,7 +226,9 @@ def render_scene(config: DatasetConfig, out: Path, scene: int) -> int:
         built.relight(replace(look, sun=sun.sun, sun_direction=sun.sun_direction))
         shot = built.shoot(view.T_plant_optical)
         photo = develop(shot.light, shot.depth_m, draw_camera_look(rng), rng)
-        noise = DepthNoise(subpixel_rms=float(rng.uniform(0.03, 0.12)), hole_share=float(rng.uniform(0.0, 0.04)))
+        noise = DepthNoise(
+            subpixel_rms=float(rng.uniform(0.03, 0.12)), hole_share=float(rng.uniform(0.0, 0.04))
+        )
         depth_mm = np.round(measure_depth(shot.depth_m, intrinsics, noise, rng) * 1000).astype(np.uint16)
         name = f"images/{number:06d}.jpg"
         depth_path = out / "depth" / f"{number:06d}.png"

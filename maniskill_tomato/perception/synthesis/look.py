@@ -67,7 +67,9 @@ def draw_crop(rng: Generator) -> PlantConfig:
     """The plants of a row: mostly truss tomatoes, some cherry or beef tomatoes."""
     base = make_full_config()
     kind = rng.random()
-    leaf = replace(LeafConfig(), leaflet_aspect=float(rng.uniform(0.6, 0.8)), lobe_depth=float(rng.uniform(0.1, 0.4)))
+    leaf = replace(
+        LeafConfig(), leaflet_aspect=float(rng.uniform(0.6, 0.8)), lobe_depth=float(rng.uniform(0.1, 0.4))
+    )
     truss = replace(TrussConfig(), azimuth_spread_deg=float(rng.uniform(30, 60)))
     fruit = FruitConfig()
     counts = base.fruits_per_truss
@@ -81,7 +83,9 @@ def draw_crop(rng: Generator) -> PlantConfig:
             fruit_ripening_step=float(rng.uniform(0.03, 0.08)),
             truss_ripening_step=float(rng.uniform(0.12, 0.3)),
         )
-        truss = replace(truss, pedicel_spacing=float(rng.uniform(0.016, 0.022)), pedicel_length_range=(0.012, 0.022))
+        truss = replace(
+            truss, pedicel_spacing=float(rng.uniform(0.016, 0.022)), pedicel_length_range=(0.012, 0.022)
+        )
         counts = (11, 11, 10, 8, 4)
     elif kind < 0.45:  # Beef tomatoes: few, large, ribbed.
         fruit = replace(fruit, radius_range=(0.036, 0.046), rib_depth_range=(0.015, 0.04))

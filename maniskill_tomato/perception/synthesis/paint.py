@@ -75,7 +75,9 @@ def _dirt(variant: int) -> NDArray[np.float64]:
     rng = np.random.default_rng([4242, variant])
     broad, fine = cloud(rng, 256, 256, 3), cloud(rng, 256, 256, 30, octaves=2)
     streaks = cloud(rng, 1, 256, 40, octaves=2)
-    return np.asarray(0.55 * np.clip(broad, 0, 1) + 0.25 * np.clip(fine, 0, 1) ** 2 + 0.2 * np.clip(streaks, 0, 1))
+    return np.asarray(
+        0.55 * np.clip(broad, 0, 1) + 0.25 * np.clip(fine, 0, 1) ** 2 + 0.2 * np.clip(streaks, 0, 1)
+    )
 
 
 def dirty(colour: tuple[float, float, float], rng: Generator, *, dirt: float) -> sapien.render.RenderMaterial:

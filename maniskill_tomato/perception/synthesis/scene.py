@@ -98,7 +98,13 @@ class GreenhouseScene:
     """A row in its surroundings, with one camera."""
 
     def __init__(
-        self, row: Plant, look: SceneLook, intrinsics: CameraIntrinsics, rng: Generator, *, first_seed: int = 0
+        self,
+        row: Plant,
+        look: SceneLook,
+        intrinsics: CameraIntrinsics,
+        rng: Generator,
+        *,
+        first_seed: int = 0,
     ) -> None:
         """Builds the scene; the plant frame is the world's.
 

@@ -52,7 +52,10 @@ def add_surroundings(add: AddBody, look: SceneLook, rng: Generator) -> None:
         rng: Their places and stains.
     """
     rows = [0.0] + [look.row_distance * k for k in (1, 2)] + [-look.row_distance]
-    gutter, slab = paint.dirty(look.paint, rng, dirt=float(rng.uniform(0, 0.6))), paint.printed(look.paint, rng)
+    gutter, slab = (
+        paint.dirty(look.paint, rng, dirt=float(rng.uniform(0, 0.6))),
+        paint.printed(look.paint, rng),
+    )
     wool, pipe = paint.dirty((0.42, 0.36, 0.26), rng, dirt=0.6), paint.plain((0.8, 0.8, 0.78), roughness=0.4)
     for x in rows:
         low = float(rng.uniform(-0.01, 0.01))
@@ -62,7 +65,9 @@ def add_surroundings(add: AddBody, look: SceneLook, rng: Generator) -> None:
             add([_box([0.05, 0.05, 0.05], wool)], sapien.Pose([x, 0.5 * k, low - 0.05]))
         for side in (-0.25, 0.25):
             rail = sapien.render.RenderShapeCylinder(0.026, HALF_LENGTH, pipe)
-            turned = sapien.Pose([x + 0.5 * look.row_distance + side, 0, look.floor + 0.1], [0.7071, 0, 0, 0.7071])
+            turned = sapien.Pose(
+                [x + 0.5 * look.row_distance + side, 0, look.floor + 0.1], [0.7071, 0, 0, 0.7071]
+            )
             add([rail], turned)
         if rng.random() < 0.5:
             wide = sapien.render.RenderShapeCylinder(0.05, HALF_LENGTH, gutter)
@@ -82,12 +87,15 @@ def _add_strings(add: AddBody, look: SceneLook, rng: Generator) -> None:
         lean = rng.normal(0, 0.08, 2)
         # A cylinder lies along x; this turns it up, and a little aside.
         axis = np.array([lean[0], lean[1], 1.0]) / np.sqrt(1 + lean @ lean)
-        add([sapien.render.RenderShapeCylinder(radius, 1.6, material)], sapien.Pose(_x_axis_to([x, y, 0.9], axis)))
+        add(
+            [sapien.render.RenderShapeCylinder(radius, 1.6, material)],
+            sapien.Pose(_x_axis_to([x, y, 0.9], axis)),
+        )
 
 
-def _x_axis_to(position: list[float], axis: np.ndarray[tuple[int], np.dtype[np.float64]]) -> np.ndarray[
-    tuple[int, int], np.dtype[np.float64]
-]:
+def _x_axis_to(
+    position: list[float], axis: np.ndarray[tuple[int], np.dtype[np.float64]]
+) -> np.ndarray[tuple[int, int], np.dtype[np.float64]]:
     side = np.cross([0.0, 1.0, 0.0], axis)
     side /= np.linalg.norm(side)
     pose = np.eye(4)
