@@ -64,6 +64,8 @@ class Estimate:
     """T: pixels of the whole silhouette."""
     whole: BinaryMask | None
     """The whole silhouette inside the image. Shape (height, width)."""
+    centre_optical: tuple[float, float, float] | None = None
+    """The tomato's centre in the optical frame, in [m], if the model knows it."""
 
     @property
     def visible_fraction(self) -> float:

@@ -144,7 +144,8 @@ def markdown(judged: list[Judged], milliseconds: Mapping[str, float]) -> str:
     for name in milliseconds:
         s = score([j for j in judged if j.model == name])
         lines.append(
-            f"| {name} | {s.count} | {s.mae:.3f} | {s.bias:+.3f} | {s.rmse:.3f} | {s.failures} | {milliseconds[name]:.0f} |"
+            f"| {name} | {s.count} | {s.mae:.3f} | {s.bias:+.3f} | {s.rmse:.3f} | {s.failures} "
+            f"| {milliseconds[name]:.0f} |"
         )
     lines += ["", "| true V_f | " + " | ".join(f"{n}: MAE (bias)" for n in milliseconds) + " | tomatoes |"]
     lines.append("|---" * (len(milliseconds) + 2) + "|")

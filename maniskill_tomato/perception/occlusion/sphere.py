@@ -118,8 +118,17 @@ class SphereModel:
         if measured_here:
             whole &= ~((depth > own + self.config.edge_step_m) | (depth == 0))
         whole |= mask
-        visible = int(np.count_nonzero(mask))
-        return Estimate(visible=visible, total=int(np.count_nonzero(whole)) + outside, whole=whole)
+        centre = None
+        if measured_here:
+            i = view.intrinsics
+            depth_c = _centre_depth(evidence.mask_depth, circle, own, focal)
+            centre = ((x - i.cx) / i.fx * depth_c, (y - i.cy) / i.fy * depth_c, depth_c)
+        return Estimate(
+            visible=int(np.count_nonzero(mask)),
+            total=int(np.count_nonzero(whole)) + outside,
+            whole=whole,
+            centre_optical=centre,
+        )
 
     def _collect(self, here: BinaryMask, z: Float64, measured: Float64, own: float) -> _Evidence:
         """Samples of the four kinds of evidence, as x, y in the window, in [px]."""
@@ -204,6 +213,15 @@ class SphereModel:
             error = (centre - np.median(centre, 1, keepdims=True)) / c.depth_error_m
             cost = cost + 12 * np.mean(np.minimum(0.5 * error**2, 4.5), 1)
         return np.asarray(cost)
+
+
+def _centre_depth(points: Float64, circle: Float64, own: float, focal: float) -> float:
+    """Depth of a sphere's centre from points of its surface: x, y in [px] and depth in [m]. Shape (N, 3)."""
+    radius_m = circle[2] * own / focal
+    if not len(points):
+        return own + 0.7 * float(radius_m)
+    across = np.hypot(points[:, 0] - circle[0], points[:, 1] - circle[1]) * own / focal
+    return float(np.median(points[:, 2] + np.sqrt(np.maximum(radius_m**2 - across**2, 0))))
 
 
 def _thinned(points: Float64, count: int = SAMPLES) -> Float64:
