@@ -39,6 +39,8 @@ class Args:
     """Which tomatoes count; the thesis's model knows red ones only."""
     min_visible: int = 100
     """Tomatoes seen in fewer pixels are left out."""
+    min_total: int = 400
+    """Tomatoes whose whole silhouette has fewer pixels are left out: those of the rows behind."""
 
 
 def main(args: Args) -> None:
@@ -54,11 +56,16 @@ def main(args: Args) -> None:
     images = read_annotated(args.data).images[: args.count]
     with tqdm(total=len(images), unit="image", disable=None) as bar:
         judged, milliseconds = judge(
-            images, {n: known[n] for n in args.models}, min_visible=args.min_visible, on_image=bar.update
+            images,
+            {n: known[n] for n in args.models},
+            min_visible=args.min_visible,
+            min_total=args.min_total,
+            on_image=bar.update,
         )
     judged = [j for j in judged if j.category in args.categories]
     table = markdown(judged, milliseconds)
-    text = f"{len(images)} images, {', '.join(args.categories)}, at least {args.min_visible} px visible.\n\n{table}"
+    text = f"{len(images)} images, {', '.join(args.categories)}, at least {args.min_visible} px visible, "
+    text += f"{args.min_total} px in all.\n\n{table}"
     write_atomically(args.out / "occlusion.md", text.encode())
     write_atomically(args.out / "occlusion.json", json.dumps([asdict(j) for j in judged]).encode())
     print(text)

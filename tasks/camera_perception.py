@@ -53,7 +53,7 @@ class CameraPerception:
         """
         self._images = ImageCaster(caster, intrinsics or color_intrinsics(*IMAGE_SIZE))
         self._noise = noise or DepthNoise()
-        self._model = model or SphereModel(SphereConfig(radius_spread=0.14))
+        self._model = model or SphereModel(SphereConfig(radius_m=0.029, radius_spread=0.14))
         b, device = caster.num_envs, caster.device
         self._rng = [np.random.default_rng(0) for _ in range(b)]
         self._offset = torch.zeros(b, 3, device=device)
