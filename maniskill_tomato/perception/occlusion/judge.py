@@ -43,15 +43,9 @@ class Score:
     """Tomatoes about which the model said nothing."""
 
 
-def judged_fruits(image: AnnotatedImage, min_visible: int) -> list[Instance]:
-    """The tomatoes of an image that models are judged by: seen in at least `min_visible` pixels, V_f known."""
-    return [
-        i
-        for i in image.fruits
-        if i.visible_mask is not None
-        and i.visible_fraction is not None
-        and i.visible_mask.area >= min_visible
-    ]
+def annotated_fruits(image: AnnotatedImage) -> list[Instance]:
+    """The visible tomatoes of an image whose masks and V_f are known."""
+    return [i for i in image.fruits if i.visible_mask is not None and i.visible_fraction is not None]
 
 
 def make_view(image: AnnotatedImage, fruits: list[Instance]) -> TomatoView | None:
