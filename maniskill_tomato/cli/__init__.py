@@ -9,6 +9,7 @@ Examples:
     maniskill-tomato demo
     maniskill-tomato export --policy runs/demo/training/policy.pt --out exported
     maniskill-tomato deploy run --profile mock --out runs/deploy
+    maniskill-tomato dataset --count 1000 --split train --out runs/dataset
     maniskill-tomato detect photos --out detections.json
 """
 
@@ -21,6 +22,7 @@ from typing import Annotated, Any
 import tyro
 
 from maniskill_tomato.cli.benchmark import Benchmark
+from maniskill_tomato.cli.dataset import Dataset
 from maniskill_tomato.cli.demo import Demo
 from maniskill_tomato.cli.deploy import Deploy
 from maniskill_tomato.cli.detect import Detect
@@ -32,6 +34,7 @@ from maniskill_tomato.errors import TomatoError
 
 __all__ = [
     "Benchmark",
+    "Dataset",
     "Demo",
     "Deploy",
     "Detect",
@@ -44,7 +47,7 @@ __all__ = [
     "parse",
 ]
 
-Command = Train | Eval | Benchmark | Demo | Export | Detect | Deploy
+Command = Train | Eval | Benchmark | Demo | Export | Dataset | Detect | Deploy
 
 # PyTorch and ManiSkill take seconds to import, so that every command imports what it needs when it runs.
 
@@ -65,6 +68,7 @@ def parse(argv: Sequence[str]) -> Command:
         | Annotated[Benchmark, tyro.conf.subcommand("benchmark")]
         | Annotated[Demo, tyro.conf.subcommand("demo")]
         | Annotated[Export, tyro.conf.subcommand("export")]
+        | Annotated[Dataset, tyro.conf.subcommand("dataset")]
         | Annotated[Detect, tyro.conf.subcommand("detect")]
         | Annotated[Deploy, tyro.conf.subcommand("deploy")]
     )
