@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from typing import Any
+from typing import Any, get_args
 
 import numpy as np
 import torch
@@ -14,6 +14,7 @@ from maniskill_tomato.plants.row import Row
 from maniskill_tomato.robot.kinematics import link_transforms
 from maniskill_tomato.robot.look_at import camera_to_viewpoint
 from maniskill_tomato.tasks import MAX_GENERAL_STEPS, options
+from maniskill_tomato.tasks.camera_perception import CameraPerception, Perception
 from maniskill_tomato.tasks.episode_list import EPISODE_LISTS, Episode, load_episodes
 from maniskill_tomato.tasks.general_config import GeneralTaskConfig
 from maniskill_tomato.tasks.general_rewards import view_gain_reward
@@ -59,6 +60,9 @@ class TomatoViewpointGeneralEnv(TomatoEnv):
     - `contact_penalty`: what a move with plant contact costs.
     - `sensor_noise`: a `SensorNoise` or a mapping of its fields, what camera and segmenter get wrong. A saved state
       keeps no errors: taken back, the views are measured anew.
+    - `perception`: `"ground_truth"` or `"occlusion_model"`; with the latter V_f, success, reward, the target's position
+      and the rays' labels come from a camera image (mask and noisy depth), and the info also has
+      `true_visible_fraction` and `true_success`.
 
     `reset(options=...)` takes `episode` (index in the list), `target` (index of a ripe fruit in `Plant.fruits`) and
     `camera_position` (x, y, z [m], world frame).
@@ -81,12 +85,20 @@ class TomatoViewpointGeneralEnv(TomatoEnv):
         start_visibility: Sequence[float] | None = None,
         contact_penalty: float | None = None,
         sensor_noise: SensorNoise | Mapping[str, float] | None = None,
+        perception: Perception = "ground_truth",
         plant: PlantChoice | Mapping[str, object] | str | None = None,
         plant_pose_noise: Sequence[float] | None = None,
         control_mode: str | None = "pd_look_at",
         **kwargs: Any,
     ) -> None:
         self._sensor_noise = SensorNoise.parse(sensor_noise)
+        options.check_choice("perception", perception, get_args(Perception))
+        if perception != "ground_truth" and self._sensor_noise != SensorNoise():
+            raise InvalidInputError(
+                "sensor_noise disturbs ground truth; leave it out with perception='occlusion_model', "
+                "whose depth has noise of its own"
+            )
+        self.perception: Perception = perception
         task = task or GeneralTaskConfig()
         if start_visibility is not None:
             low, high = options.check_range("start_visibility", start_visibility)
@@ -128,6 +140,7 @@ class TomatoViewpointGeneralEnv(TomatoEnv):
         )
         """What only the simulator knows; for planners that need the truth."""
         self._errors = SensorErrors(self._sensor_noise, n, device)
+        self._eyes = CameraPerception(self._caster) if self.perception == "occlusion_model" else None
         self.soft_starts = 0
         """Episodes so far that no drawn start made as hard as asked for."""
         self._views = torch.zeros(n, MAX_VIEWS, 7, device=device)
@@ -193,6 +206,8 @@ class TomatoViewpointGeneralEnv(TomatoEnv):
         self._set_arm(env_idx, viewpoint, torch.stack([start.qpos for start in starts]))
         for i, rng in zip(indices, rngs, strict=True):
             self._errors.begin(i, rng)
+            if self._eyes is not None:
+                self._eyes.begin(i, rng)
         self._begin(env_idx)
 
     def _start(
@@ -226,10 +241,12 @@ class TomatoViewpointGeneralEnv(TomatoEnv):
         clearance = self._plant_clearance.at(qpos, self.planting.T_world_plant)
         self._clearance[env_idx] = clearance[env_idx]
         self._look_anew(env_idx)
-        self._visible_fraction = self._seen.visible_fraction.clone()
+        self._visible_fraction = self._measured_fraction().clone()
 
     def _look_anew(self, env_idx: Tensor) -> None:
         """Forgets what was seen in some environments and takes a first look at their targets."""
+        if self._eyes is not None:
+            self._eyes.forget(env_idx)
         self._observer.begin(env_idx, self._known_target_position()[env_idx])
         self._view_count[env_idx] = 0
         self._views[env_idx] = 0.0
@@ -245,6 +262,13 @@ class TomatoViewpointGeneralEnv(TomatoEnv):
         self._views[rows, self._view_count[rows].clamp_max(MAX_VIEWS - 1)] = qpos[rows]
         self._view_count[rows] += 1
         self._observe(qpos, mask)
+        if self._eyes is not None:
+            located = self._eyes.locate(self._target_position_w)
+            if mask is not None:
+                located = located & mask
+            if bool(located.any()):
+                # What was seen before stands about the place where the target was thought to be.
+                self._replay(located.nonzero()[:, 0])
 
     def _observe(self, qpos: Tensor, mask: Tensor | None) -> None:
         T_w_links = link_transforms(qpos)
@@ -252,14 +276,27 @@ class TomatoViewpointGeneralEnv(TomatoEnv):
         T_w_plant = self.planting.T_world_plant
         self._seen: Visibility = self._caster.cast(T_w_camera, self._target, T_w_plant, T_w_links)
         known = self._known_target_position()
-        rays = self._ray_caster.cast(T_w_camera, self._target, known, T_w_plant, T_w_links)
         self._camera_position = T_w_camera[:, :3, 3]
-        measured = self._errors.visible_fraction(self._seen.visible_fraction)
+        if self._eyes is None:
+            rays = self._errors.rays(
+                self._ray_caster.cast(T_w_camera, self._target, known, T_w_plant, T_w_links)
+            )
+            measured = self._errors.visible_fraction(self._seen.visible_fraction)
+        else:
+            self._eyes.look(T_w_camera, self._target, T_w_plant, T_w_links)
+            rays = self._eyes.rays(T_w_camera, known)
+            measured = self._eyes.visible_fraction.clone()
         self._observation = self._observer.observe(
-            self._viewpoint, T_w_camera, self._errors.rays(rays), measured, self._moves_left(), mask
+            self._viewpoint, T_w_camera, rays, measured, self._moves_left(), mask
         )
 
+    def _measured_fraction(self) -> Tensor:
+        """V_f that success and reward go by. Shape (num_envs,)."""
+        return self._seen.visible_fraction if self._eyes is None else self._eyes.visible_fraction
+
     def _known_target_position(self) -> Tensor:
+        if self._eyes is not None:
+            return self._eyes.known_target(self._target_position_w)
         return self._errors.known_target(self._target_position_w)
 
     def _moves_left(self) -> Tensor:
@@ -267,7 +304,7 @@ class TomatoViewpointGeneralEnv(TomatoEnv):
 
     def _step_action(self, action: Any) -> Tensor | None:
         before, position = self.agent.robot.get_qpos().clone(), self._camera_position
-        fraction = self._seen.visible_fraction
+        fraction = self._measured_fraction().clone()
         batch = super()._step_action(action)
         if batch is None:
             return None
@@ -276,14 +313,18 @@ class TomatoViewpointGeneralEnv(TomatoEnv):
         self._moves = self._moves + 1
         self._look(qpos, None)
         self._path_length = self._path_length + (self._camera_position - position).norm(dim=-1)
-        self._visible_fraction = self._seen.visible_fraction
+        self._visible_fraction = self._measured_fraction().clone()
         self._gain = self._visible_fraction - fraction
         return batch
 
     def evaluate(self) -> dict[str, Tensor]:
         """What came of the last move: V_f, whether that is a success, and what the move touched."""
         fraction = self._visible_fraction
-        return {
+        truth = {}
+        if self._eyes is not None:
+            seen = self._seen.visible_fraction
+            truth = {"true_visible_fraction": seen.clone(), "true_success": seen > self.task.full_visibility}
+        return truth | {
             "success": fraction > self.task.full_visibility,
             "fail": torch.zeros_like(fraction, dtype=torch.bool),
             "visible_fraction": fraction.clone(),
@@ -349,7 +390,7 @@ class TomatoViewpointGeneralEnv(TomatoEnv):
             self._observe(self._views[:, k], chosen & (k < count))
         # Once more for the numbers alone, with all arms where they are now.
         self._observe(self.agent.robot.get_qpos(), torch.zeros_like(chosen))
-        self._visible_fraction = self._seen.visible_fraction
+        self._visible_fraction = self._measured_fraction().clone()
 
 
 # Gymnasium's registry has the id already, lazily; this line tells ManiSkill's own.

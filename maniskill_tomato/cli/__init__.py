@@ -1,4 +1,4 @@
-"""The command `maniskill-tomato`: train, evaluate, compare, demonstrate, export.
+"""The command `maniskill-tomato`: train, evaluate, compare, demonstrate, export, detect, render data sets.
 
 Examples:
     maniskill-tomato train TomatoViewpointGuided-v1
@@ -9,6 +9,7 @@ Examples:
     maniskill-tomato demo
     maniskill-tomato export --policy runs/demo/training/policy.pt --out exported
     maniskill-tomato detect photos --out detections.json
+    maniskill-tomato dataset --count 1000 --split train --out runs/dataset
 """
 
 import logging
@@ -20,6 +21,7 @@ from typing import Annotated, Any
 import tyro
 
 from maniskill_tomato.cli.benchmark import Benchmark
+from maniskill_tomato.cli.dataset import Dataset
 from maniskill_tomato.cli.demo import Demo
 from maniskill_tomato.cli.detect import Detect
 from maniskill_tomato.cli.evaluate import Eval
@@ -30,6 +32,7 @@ from maniskill_tomato.errors import TomatoError
 
 __all__ = [
     "Benchmark",
+    "Dataset",
     "Demo",
     "Detect",
     "Eval",
@@ -44,7 +47,7 @@ __all__ = [
 # PyTorch and ManiSkill take seconds to import, so that every command imports what it needs when it runs.
 
 
-def parse(argv: Sequence[str]) -> Train | Eval | Benchmark | Demo | Export | Detect:
+def parse(argv: Sequence[str]) -> Train | Eval | Benchmark | Demo | Export | Detect | Dataset:
     """The command that the arguments describe.
 
     The options of `train` default to those of the run that it continues or of its `--config` file, and these to
@@ -61,11 +64,12 @@ def parse(argv: Sequence[str]) -> Train | Eval | Benchmark | Demo | Export | Det
         | Annotated[Demo, tyro.conf.subcommand("demo")]
         | Annotated[Export, tyro.conf.subcommand("export")]
         | Annotated[Detect, tyro.conf.subcommand("detect")]
+        | Annotated[Dataset, tyro.conf.subcommand("dataset")]
     )
-    command: Train | Eval | Benchmark | Demo | Export | Detect = tyro.cli(
+    command: Train | Eval | Benchmark | Demo | Export | Detect | Dataset = tyro.cli(
         commands,
         prog="maniskill-tomato",
-        description="Active perception for tomato harvesting: train, evaluate, compare, demonstrate, export.",
+        description="Active perception for tomato harvesting: train, evaluate, compare, demonstrate, export, detect, render.",
         args=list(argv),
         config=(tyro.conf.OmitArgPrefixes,),
     )

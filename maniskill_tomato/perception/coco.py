@@ -29,7 +29,6 @@ from maniskill_tomato.perception.annotations import (
 from maniskill_tomato.perception.masks import Box, EncodedMask
 
 VISIBLE_FILE = "annotations.json"
-AMODAL_FILE = "annotations_amodal.json"
 
 
 def find_coco_file(folder: Path, split: str | None = None) -> Path | None:
@@ -46,7 +45,7 @@ def find_coco_file(folder: Path, split: str | None = None) -> Path | None:
     return candidates[0] if len(candidates) == 1 else None
 
 
-def read_coco(path: Path | str, split: str | None = None) -> AnnotatedImages:
+def read_coco(path: Path | str, split: str | None = None, *, root: Path | None = None) -> AnnotatedImages:
     """Reads a COCO file, and the amodal file beside it if there is one.
 
     Images without their file are left out and counted; so are annotations of unknown images or categories, crowds,
@@ -55,6 +54,7 @@ def read_coco(path: Path | str, split: str | None = None) -> AnnotatedImages:
     Args:
         path: The file, or its folder.
         split: Part of the file's name, if the folder has several.
+        root: Folder that the images' names start from; by default the file's own, or that above `annotations`.
 
     Raises:
         InvalidInputError: The file cannot be read, or is not COCO.
@@ -76,7 +76,7 @@ def read_coco(path: Path | str, split: str | None = None) -> AnnotatedImages:
     instances: dict[str, list[Instance]] = {}
     unread = set()
     for entry in content["images"]:
-        key, image = _key(entry, "id"), _read_image(entry, path.parent, skipped)
+        key, image = _key(entry, "id"), _read_image(entry, root or path.parent, skipped)
         if key and image is not None:
             images[key], instances[key] = image, []
         elif key:
@@ -106,12 +106,15 @@ def read_coco(path: Path | str, split: str | None = None) -> AnnotatedImages:
     )
 
 
-def write_coco(images: AnnotatedImages, folder: Path | str) -> tuple[Path, Path | None]:
+def write_coco(
+    images: AnnotatedImages, folder: Path | str, *, name: str = "annotations"
+) -> tuple[Path, Path | None]:
     """Writes `annotations.json` and, if an amodal mask is known, `annotations_amodal.json`.
 
     Args:
         images: What to write. The names of their files are written as they are.
         folder: Where; the images themselves are not copied.
+        name: Of the files, without `.json`.
 
     Returns:
         The two files.
@@ -149,8 +152,9 @@ def write_coco(images: AnnotatedImages, folder: Path | str) -> tuple[Path, Path 
             if instance.amodal_mask is not None:
                 box = instance.amodal_box_xywh or instance.amodal_mask.box_xywh
                 amodal.append(entry | _shape(instance.amodal_mask, box))
-    paths = (folder / VISIBLE_FILE, folder / AMODAL_FILE if amodal else None)
-    for path, annotations in zip(paths, (visible, amodal), strict=True):
+    paths = (folder / f"{name}.json", folder / f"{name}_amodal.json" if amodal else None)
+    # The visible file last: where it is, the other one is whole.
+    for path, annotations in zip(reversed(paths), (amodal, visible), strict=True):
         if path is not None:
             write_atomically(path, json.dumps(head | {"annotations": annotations}).encode())
     return paths

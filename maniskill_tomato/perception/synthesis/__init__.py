@@ -1,0 +1,1 @@
+"""Rendered training images of tomato rows with exact annotations."""

@@ -1,0 +1,72 @@
+"""Judges the occlusion models by their error in V_f on rendered images of plants that nothing was tuned on.
+
+Usage:
+    maniskill-tomato dataset --count 1000 --split held_out --no-vary-crop --out runs/held_out
+    python scripts/judge_occlusion.py --data runs/held_out --out runs/occlusion
+"""
+
+import json
+import sys
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+import tyro
+from tqdm import tqdm
+
+from maniskill_tomato.errors import InvalidInputError, TomatoError
+from maniskill_tomato.files import write_atomically
+from maniskill_tomato.perception.formats import read_annotated
+from maniskill_tomato.perception.occlusion.estimate import OcclusionModel
+from maniskill_tomato.perception.occlusion.improved import ImprovedModel
+from maniskill_tomato.perception.occlusion.judge import judge, markdown
+from maniskill_tomato.perception.occlusion.sphere import SphereModel
+from maniskill_tomato.perception.occlusion.thesis import ThesisModel
+
+
+@dataclass(frozen=True, kw_only=True)
+class Args:
+    """Judge occlusion models."""
+
+    data: Path
+    """A folder of `maniskill-tomato dataset`."""
+    out: Path = Path("runs/occlusion")
+    """Folder of the results."""
+    models: tuple[str, ...] = ("thesis", "improved", "sphere")
+    """Which models."""
+    count: int | None = None
+    """Only the first images; all by default."""
+    categories: tuple[str, ...] = ("tomato_ripe",)
+    """Which tomatoes count; the thesis's model knows red ones only."""
+    min_visible: int = 100
+    """Tomatoes seen in fewer pixels are left out."""
+
+
+def main(args: Args) -> None:
+    """Runs the models, prints the tables and writes them with every single judgement."""
+    known: dict[str, OcclusionModel] = {
+        "thesis": ThesisModel(),
+        "improved": ImprovedModel(),
+        "sphere": SphereModel(),
+    }
+    for name in args.models:
+        if name not in known:
+            raise InvalidInputError.choice("--models", name, known)
+    images = read_annotated(args.data).images[: args.count]
+    with tqdm(total=len(images), unit="image", disable=None) as bar:
+        judged, milliseconds = judge(
+            images, {n: known[n] for n in args.models}, min_visible=args.min_visible, on_image=bar.update
+        )
+    judged = [j for j in judged if j.category in args.categories]
+    table = markdown(judged, milliseconds)
+    text = f"{len(images)} images, {', '.join(args.categories)}, at least {args.min_visible} px visible.\n\n{table}"
+    write_atomically(args.out / "occlusion.md", text.encode())
+    write_atomically(args.out / "occlusion.json", json.dumps([asdict(j) for j in judged]).encode())
+    print(text)
+
+
+if __name__ == "__main__":
+    try:
+        main(tyro.cli(Args))
+    except TomatoError as error:
+        print(f"error: {error}", file=sys.stderr)
+        raise SystemExit(2) from None
