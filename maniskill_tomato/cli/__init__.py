@@ -69,7 +69,7 @@ def parse(argv: Sequence[str]) -> Train | Eval | Benchmark | Demo | Export | Det
     command: Train | Eval | Benchmark | Demo | Export | Detect | Dataset = tyro.cli(
         commands,
         prog="maniskill-tomato",
-        description="Active perception for tomato harvesting: train, evaluate, compare, demonstrate, export, detect, render.",
+        description="Active perception for tomato harvesting: train, evaluate, compare, export, detect, render.",
         args=list(argv),
         config=(tyro.conf.OmitArgPrefixes,),
     )
