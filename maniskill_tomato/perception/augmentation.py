@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from maniskill_tomato.perception.fruit_targets import TrainingPicture
+from maniskill_tomato.perception.instances import mask_box
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -90,6 +91,9 @@ def _placed(
     boxes = _moved(picture.boxes, matrix)
     whole = None if picture.whole_boxes is None else _moved(picture.whole_boxes, matrix)
     clipped = np.clip(boxes, 0, [width, height, width, height]).astype(np.float32)
+    if labels is not None:
+        for index in np.flatnonzero((clipped != boxes).any(axis=1)):
+            clipped[index] = _visible_box(labels, index + 1, clipped[index])
     sides = clipped[:, 2:] - clipped[:, :2]
     share = sides.prod(axis=1) / np.maximum((boxes[:, 2:] - boxes[:, :2]).prod(axis=1), 1e-6)
     ignored = (
@@ -112,6 +116,18 @@ def _moved(boxes: NDArray[np.float32], matrix: NDArray[np.float64]) -> NDArray[n
     """Boxes under an affine map without rotation."""
     corners = boxes.reshape(-1, 2, 2) @ matrix[:, :2].T + matrix[:, 2]
     return np.concatenate([corners.min(axis=1), corners.max(axis=1)], axis=1).astype(np.float32)
+
+
+def _visible_box(labels: NDArray[np.int16], number: int, box: NDArray[np.float32]) -> NDArray[np.float32]:
+    """The box around what a cut box still has of a fruit's pixels; empty if it has none. Shape (4,)."""
+    left, top = np.floor(box[:2]).astype(int)
+    right, bottom = np.ceil(box[2:]).astype(int)
+    inside = labels[top:bottom, left:right] == number
+    if not inside.any():
+        return np.array([left, top, left, top], np.float32)
+    found = np.array(mask_box(inside), np.float32) + np.array([left, top, left, top], np.float32)
+    # The edges that were not cut stay where they were, to a fraction of a pixel.
+    return np.array([*np.maximum(found[:2], box[:2]), *np.minimum(found[2:], box[2:])], np.float32)
 
 
 def _renumbered(labels: NDArray[np.int16], kept: NDArray[np.int64], count: int) -> NDArray[np.int16]:

@@ -1,4 +1,4 @@
-"""Settings of the thesis's detectors: YOLOv3 (Table 4-1), Mask R-CNN strategies 1 and 2 (Tables 4-2 to 4-4), 3 (6-2)."""
+"""The thesis's detectors: YOLOv3 (Table 4-1), Mask R-CNN strategies 1 and 2 (Tables 4-2 to 4-4) and 3 (6-2)."""
 
 from dataclasses import dataclass
 from typing import Literal

@@ -125,7 +125,7 @@ class Instances:
             )
         size = np.maximum(self.amodal_boxes[:, 2:] - self.amodal_boxes[:, :2], 1)
         visible = self.masks.sum(axis=(1, 2))
-        return np.minimum(visible / (np.pi / 4 * size.prod(axis=1)), 1).astype(np.float32)
+        return np.asarray(np.minimum(visible / (np.pi / 4 * size.prod(axis=1)), 1), np.float32)
 
 
 def mask_box(mask: NDArray[np.bool_]) -> tuple[int, int, int, int]:

@@ -11,7 +11,7 @@ from typing import Any, Protocol, cast
 import numpy as np
 from numpy.typing import NDArray
 
-from maniskill_tomato.errors import InvalidInputError
+from maniskill_tomato.errors import CheckpointError, InvalidInputError
 from maniskill_tomato.perception.instances import Image, Instances
 
 SEGMENTERS = {
@@ -61,6 +61,8 @@ def make_segmenter(name_or_path: str | Path = DEFAULT_SEGMENTER, **options: Any)
             raise InvalidInputError.choice("segmenter", name, [*SEGMENTERS, "FILE.pt"])
         options["weights"] = path
         name = weights_kind(path)
+        if name not in SEGMENTERS:
+            raise CheckpointError(f"{path} is for a segmenter {name!r}, which this version does not know")
     module, function = SEGMENTERS[name].split(":")
     opener = cast(Callable[..., Segmenter], getattr(importlib.import_module(module), function))
     try:

@@ -145,8 +145,8 @@ def train_yolo(
 ) -> Path:
     """Trains from random weights with the settings of Table 4-1.
 
-    Deviations: Ultralytics lowers the learning rate along its own schedule instead of at plateaus; the size of the
-    input varies around the largest one by its `multi_scale`.
+    Deviations: Ultralytics lowers the learning rate along its own schedule instead of at plateaus, and rounds the sizes
+    of the input to multiples of 32.
 
     Args:
         data: What `write_yolo_data` wrote.
@@ -167,8 +167,9 @@ def train_yolo(
         epochs=config.epochs,
         batch=config.batch_size,
         lr0=config.learning_rate,
-        imgsz=config.largest_input,
-        multi_scale=True,
+        imgsz=(config.smallest_input + config.largest_input) // 2,
+        multi_scale=(config.largest_input - config.smallest_input)
+        / (config.largest_input + config.smallest_input),
         patience=config.patience,
         optimizer="Adam",
         pretrained=config.pretrained,
