@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
+from maniskill_tomato.cli.calibrate import DeployCalibrate
 from maniskill_tomato.errors import InvalidInputError
 
 if TYPE_CHECKING:
@@ -151,6 +152,7 @@ class Deploy:
     command: tyro.conf.OmitSubcommandPrefixes[
         Annotated[DeployRun, tyro.conf.subcommand("run")]
         | Annotated[DeployCheck, tyro.conf.subcommand("check")]
+        | Annotated[DeployCalibrate, tyro.conf.subcommand("calibrate")]
         | Annotated[DeployReplay, tyro.conf.subcommand("replay")]
         | Annotated[DeployProfiles, tyro.conf.subcommand("profiles")]
     ]
