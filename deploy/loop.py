@@ -10,7 +10,7 @@ import logging
 import time
 from collections import defaultdict
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
 from itertools import islice
 from typing import Final, Literal
@@ -41,6 +41,9 @@ Mode = Literal["dry_run", "confirm", "unattended"]
 
 WAIT_SLICE: Final = 0.1
 """While the arm moves, stops are looked for this often, in [s]."""
+
+STOP_TIME: Final = 2.0
+"""An arm that was told to stop stands after so long, in [s]."""
 
 OTHERS_TRIED: Final = 16
 """So many other postures are held against `safety` before a move counts as refused."""
@@ -260,7 +263,7 @@ class Loop:
         assert step.action is not None and self._target is not None
         with self._timed("kinematics"):
             joints = torch.tensor(step.joint_positions[None], dtype=torch.float32)
-            position = torch.as_tensor(step.T_world_camera[None, :3, 3])
+            position = torch.as_tensor(self._observing.camera_position(step.joint_positions)[None])
             target = torch.as_tensor(self._target[None])
             solved = self._mover.move(joints, position, target, torch.tensor([step.action]))
         reachable = int(solved.reach[0]) != int(Reach.UNREACHABLE)
@@ -383,6 +386,8 @@ class Loop:
         except DeployError:
             pass
         if self._arm.stop():
+            with suppress(DeployError):
+                self._arm.wait(STOP_TIME)
             return "the arm was stopped and holds its position"
         return "a move may still be under way and goes on to its end; only the smartPAD or the emergency stop halts it"
 

@@ -5,7 +5,7 @@ import torch
 
 from maniskill_tomato.deploy.interface import Float64
 from maniskill_tomato.deploy.perceive import View
-from maniskill_tomato.robot.kinematics import link_transforms
+from maniskill_tomato.robot.kinematics import forward_kinematics, link_transforms
 from maniskill_tomato.robot.rotations import matrix_to_rpy
 from maniskill_tomato.visibility.observation import ObservationLayout, ViewpointObserver
 from maniskill_tomato.visibility.situation import Situation
@@ -27,7 +27,8 @@ class Observing:
             max_moves: Moves of an episode.
             layout: What the vector holds.
         """
-        self._mount = torch.as_tensor(np.array(T_flange_camera), dtype=torch.float32)
+        self._exact_mount = torch.as_tensor(np.array(T_flange_camera), dtype=torch.float64)
+        self._mount = self._exact_mount.float()
         self._observer = ViewpointObserver(1, layout=layout, max_moves=max_moves)
         self._rpy = torch.tensor([FIRST_RPY])
         self._target: Float64 | None = None
@@ -48,6 +49,13 @@ class Observing:
         """Pose of the optical frame, in single precision as in the task. Shape (4, 4)."""
         pose: Float64 = self._poses(joint_positions)[1][0].double().numpy()
         return pose
+
+    def camera_position(self, joint_positions: Float64) -> Float64:
+        """Where a move begins, in the precision of the task's `pd_look_at`, world frame, in [m]. Shape (3,)."""
+        joints = torch.tensor(joint_positions[None], dtype=torch.float32).double()
+        pose = forward_kinematics(joints) @ self._exact_mount
+        position: Float64 = pose[0, :3, 3].numpy()
+        return position
 
     def observe(self, joint_positions: Float64, view: View, moves_left: int) -> Situation:
         """Takes a view into the memory; once for every view.

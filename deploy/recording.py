@@ -7,6 +7,7 @@ as they were), `/truth` (simulated cameras only), `/log` (`foxglove.Log`).
 
 import base64
 import json
+import logging
 import zlib
 from collections.abc import Iterator
 from contextlib import suppress
@@ -20,6 +21,11 @@ from numpy.typing import NDArray
 from maniskill_tomato.deploy.errors import RecordingError
 from maniskill_tomato.deploy.interface import Frame
 from maniskill_tomato.deploy.steps import Step
+
+_logger = logging.getLogger(__name__)
+
+CHUNK: Final = 32 * 1024
+"""So much is kept in memory before it goes to the disk, in bytes: less than one look."""
 
 FORMAT: Final = "maniskill-tomato-deploy-1"
 
@@ -83,7 +89,7 @@ class McapRecorder:
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
             self._file: BinaryIO = path.open("wb")
-            self._writer: Any = Writer(self._file)
+            self._writer: Any = Writer(self._file, chunk_size=CHUNK)
             self._writer.start(library="maniskill-tomato")
             self._channels = {
                 topic: self._writer.register_channel(
@@ -108,8 +114,10 @@ class McapRecorder:
     def close(self) -> None:
         """Finishes the file; on a full disk what was written stays readable up to there. Never raises."""
         if not self._failed:
-            with suppress(OSError):
+            try:
                 self._writer.finish()
+            except OSError as error:
+                _logger.warning("%s", self._error(error))
         with suppress(OSError):
             self._file.close()
 

@@ -3,7 +3,7 @@
 import logging
 from collections.abc import Callable
 from contextlib import ExitStack
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -77,7 +77,7 @@ def run(
     Raises:
         DeployError: It could not begin: a profile, a device or a folder cannot be used.
         PolicyError: The policy cannot be used.
-        RecordingError: The report cannot be written.
+        RecordingError: The folder or the recording cannot be begun.
     """
     profile = config.profile
     name = config.policy or default_policy()
@@ -124,5 +124,10 @@ def run(
             )
         )
         result = station.loop(policy, stops, mode, _Several(recorders), confirm).run()
-    write_report(config.out, result, {**facts, "devices": devices}, contact)
+    try:
+        write_report(config.out, result, {**facts, "devices": devices}, contact)
+    except RecordingError as error:
+        _logger.error("%s", error)
+        if not result.is_fault:
+            result = replace(result, reason=error.reason, detail=str(error), is_fault=True)
     return result

@@ -150,7 +150,7 @@ def test_the_plant_that_was_seen_is_kept_clear_of(safety: Safety) -> None:
 
 
 def test_sphere_distances_never_exceed_those_of_mujocos_shapes() -> None:
-    """The spheres hold every link mesh; MuJoCo's primitives hold the meshes to 17 mm."""
+    """The spheres hold every link mesh; MuJoCo's primitives stand out from them by up to 25 mm."""
     spec = mj.MjSpec.from_file(urdf_path())
     spec.worldbody.add_geom(
         name="probe", type=mj.mjtGeom.mjGEOM_SPHERE, size=[1e-4, 0, 0], pos=[0.1, 0.2, 0.3]
@@ -170,7 +170,7 @@ def test_sphere_distances_never_exceed_those_of_mujocos_shapes() -> None:
         mj.mj_kinematics(model, data)
         exact = min(mj.mj_geomDistance(model, data, probe, g, 2.0, fromto) for g in shapes)
         ours = float(sphere_distances(np.array(data.qpos)[None], point[None])[0, 0])
-        assert ours < exact + 0.018
+        assert ours < exact + 0.025
         assert ours > exact - 0.06
 
 
@@ -204,7 +204,7 @@ def test_the_safety_configuration_refuses_what_makes_no_sense() -> None:
         {"speed_fraction": float("nan")},
     ):
         with pytest.raises(InvalidInputError):
-            SafetyConfig(**wrong)  # type: ignore[arg-type]
+            SafetyConfig(**wrong)
     with pytest.raises(InvalidInputError, match="low must lie below high"):
         Box(low=(0.0, 0.0, 0.0), high=(1.0, 0.0, 1.0))
 

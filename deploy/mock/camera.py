@@ -18,6 +18,9 @@ from maniskill_tomato.robot.d435 import CameraIntrinsics
 EXPOSURE = 1.0 / 30.0
 """Between two pictures, in [s]."""
 
+BACKGROUND = 4.0
+"""Depth of what stands behind the row, in [m]: a glasshouse is no void, and a D435 sees as far."""
+
 
 class MockCamera(Camera):
     """A camera that draws what the twin's arm points it at."""
@@ -74,9 +77,10 @@ class MockCamera(Camera):
         stamp = self._world.advance()
         picture = self._world.picture()
         rng = np.random.default_rng((self._seed, number))
+        exact = np.where(picture.labels == 0, np.float32(BACKGROUND), picture.depth)
         return Frame(
             color=self._painter.paint(self._world, picture),
-            depth=measured_depth(picture.depth, self._options.depth_noise, rng),
+            depth=measured_depth(exact, self._options.depth_noise, rng),
             intrinsics=self._world.intrinsics,
             stamp=stamp,
             number=number,

@@ -1,6 +1,7 @@
 """Which plant the twin stands before: an episode of the simulated task's lists, the same in every number."""
 
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Final, Literal
 
 import numpy as np
@@ -40,6 +41,7 @@ class TwinEpisode:
     """Joint positions of the first view, in [rad]. Shape (7,)."""
 
 
+@lru_cache(maxsize=4)
 def load_episode(name: EpisodeListName, index: int) -> TwinEpisode:
     """The episode that `TomatoViewpoint-v1` with `episodes=name` begins at `reset(seed=index)`.
 
