@@ -67,4 +67,5 @@ def _warped(
     warped = cv2.warpAffine(
         picture, matrix, (wanted.width, wanted.height), flags=interpolation | cv2.WARP_INVERSE_MAP
     )
-    return np.asarray(warped, dtype=picture.dtype)
+    result: NDArray[Any] = warped
+    return result

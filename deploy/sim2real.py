@@ -69,10 +69,11 @@ class TomatoSim2RealEnv(Sim2RealEnv):  # type: ignore[misc]
         self._fraction_before = 0.0
         self._refused = False
         self._moves = 0
+        reset: Any = _reset_without_moving
         super().__init__(
             sim_env,
             agent,
-            real_reset_function=_reset_without_moving,
+            real_reset_function=reset,
             sensor_data_preprocessing_function=_as_it_is,
             skip_data_checks=skip_data_checks,
         )
@@ -107,16 +108,19 @@ class TomatoSim2RealEnv(Sim2RealEnv):  # type: ignore[misc]
         self._moves, self._refused, self._fraction_before = 0, False, 0.0
         layout = getattr(self.base_sim_env, "layout", None)
         if layout is not None:
-            self._observing = Observing(
-                station.profile.T_flange_camera, self.base_sim_env.task.max_moves, layout
-            )
+            self._observing = Observing(station.profile.T_flange_camera, self._max_moves, layout)
             self._observing.begin(target)
         self._reach = torch.full((1,), int(Reach.REACHABLE), dtype=torch.int64)
         self._take_view()
         assert self._view is not None
         self._fraction_before = self._view.visible_fraction
 
-    def _step_action(self, action: Any) -> Tensor | None:
+    @property
+    def _max_moves(self) -> int:
+        base: Any = self.base_sim_env
+        return int(base.task.max_moves)
+
+    def _step_action(self, action: Any) -> Any:
         if action is None:
             return None
         base: Any = self.base_sim_env
@@ -171,13 +175,15 @@ class TomatoSim2RealEnv(Sim2RealEnv):  # type: ignore[misc]
     def compute_dense_reward(self, obs: Any, action: Tensor, info: Mapping[str, Tensor]) -> Tensor:
         """The task's reward of what the camera sees, without contact. Shape (1,)."""
         known = {"plant_contact": torch.zeros(1, dtype=torch.bool), **info}
-        reward: Tensor = type(self.base_sim_env).compute_dense_reward(self, obs, action, known)
+        task: Any = type(self.base_sim_env)
+        reward: Tensor = task.compute_dense_reward(self, obs, action, known)
         return reward
 
     def compute_normalized_dense_reward(self, obs: Any, action: Tensor, info: Mapping[str, Tensor]) -> Tensor:
         """The reward over its largest value. Shape (1,)."""
         known = {"plant_contact": torch.zeros(1, dtype=torch.bool), **info}
-        reward: Tensor = type(self.base_sim_env).compute_normalized_dense_reward(self, obs, action, known)
+        task: Any = type(self.base_sim_env)
+        reward: Tensor = task.compute_normalized_dense_reward(self, obs, action, known)
         return reward
 
     def _get_obs_state_dict(self, info: Mapping[str, Any]) -> dict[str, Any]:
@@ -198,7 +204,8 @@ class TomatoSim2RealEnv(Sim2RealEnv):  # type: ignore[misc]
     def _flatten_raw_obs(self, obs: Any) -> Any:
         if self._obs_mode == "state":
             return torch.cat(tuple(obs["extra"].values()), dim=-1)
-        return BaseEnv._flatten_raw_obs(self, obs)
+        base: Any = BaseEnv
+        return base._flatten_raw_obs(self, obs)
 
     def _take_view(self) -> None:
         """Looks, once for every place where the arm stands."""
@@ -208,7 +215,7 @@ class TomatoSim2RealEnv(Sim2RealEnv):  # type: ignore[misc]
         )
         self._follow_the_arm()
         if self._observing is not None:
-            left = max(0, self.base_sim_env.task.max_moves - self._moves)
+            left = max(0, self._max_moves - self._moves)
             self._vector = self._observing.observe(joints, self._view, left).observation
 
     def _follow_the_arm(self) -> None:

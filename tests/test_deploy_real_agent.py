@@ -48,7 +48,7 @@ def simulation() -> Any:
 def test_the_general_task_observes_on_the_twin_what_it_observes_in_simulation(simulation: Any) -> None:
     real = agent(seed=3)
     real.start()
-    env = TomatoSim2RealEnv(simulation, real, skip_data_checks=True)
+    env: Any = TomatoSim2RealEnv(simulation, real, skip_data_checks=True)
     wanted, _ = simulation.reset(seed=3)
     got, _ = env.reset(seed=3)
     # The twin's arm gives way by microradians under its weight.
@@ -74,7 +74,7 @@ def test_the_general_task_observes_on_the_twin_what_it_observes_in_simulation(si
 def test_a_step_ends_where_the_arm_stands_and_a_refused_one_leaves_it(simulation: Any) -> None:
     real = agent(seed=3, extra="[safety]\nmax_joint_step = 0.001\n")
     real.start()
-    env = TomatoSim2RealEnv(simulation, real, skip_data_checks=True)
+    env: Any = TomatoSim2RealEnv(simulation, real, skip_data_checks=True)
     env.reset(seed=3)
     before = real.get_qpos()
     _, _, _, _, info = env.step(np.array([0.5, 0.0, 0.0]))
@@ -87,10 +87,10 @@ def test_a_step_ends_where_the_arm_stands_and_a_refused_one_leaves_it(simulation
 
 
 def test_the_guided_task_runs_with_its_nine_numbers() -> None:
-    sim = gym.make("TomatoViewpointGuided-v1", obs_mode="state")
+    sim: Any = gym.make("TomatoViewpointGuided-v1", obs_mode="state")
     real = agent()
     real.start()
-    env = TomatoSim2RealEnv(sim, real)  # With ManiSkill's own comparison of both observations.
+    env: Any = TomatoSim2RealEnv(sim, real)  # With ManiSkill's own comparison of both observations.
     observation, _ = env.reset(seed=0)
     np.testing.assert_allclose(observation[0, 6:], env.target_position, atol=1e-6)
     position = observation[0, :3].clone()
@@ -105,10 +105,10 @@ def test_the_guided_task_runs_with_its_nine_numbers() -> None:
 
 @pytest.mark.render
 def test_pictures_have_the_simulations_shapes_and_poses() -> None:
-    sim = gym.make("TomatoViewpoint-v1", obs_mode="rgb+depth", episodes="held_out")
+    sim: Any = gym.make("TomatoViewpoint-v1", obs_mode="rgb+depth", episodes="held_out")
     real = agent(seed=2)
     real.start()
-    env = TomatoSim2RealEnv(sim, real)
+    env: Any = TomatoSim2RealEnv(sim, real)
     wanted, _ = sim.reset(seed=2)
     got, _ = env.reset(seed=2)
     sensor, simulated = got["sensor_data"]["d435"], wanted["sensor_data"]["d435"]
@@ -151,7 +151,7 @@ def test_the_agent_alone_moves_looks_and_refuses() -> None:
 
 
 def test_other_control_modes_are_refused(simulation: Any) -> None:
-    sim = gym.make("TomatoViewpointGuided-v1", obs_mode="state", control_mode="pd_ee_delta_pose")
+    sim: Any = gym.make("TomatoViewpointGuided-v1", obs_mode="state", control_mode="pd_ee_delta_pose")
     with pytest.raises(ProfileError, match="pd_viewpoint or pd_look_at"):
         TomatoSim2RealEnv(sim, agent())
 
