@@ -17,9 +17,7 @@ import sys
 
 class Blocked:
     def find_spec(self, name, path=None, target=None):
-        if name.split(".")[0] in ("mani_skill", "sapien") or name in (
-            "maniskill_tomato.learning", "pyrealsense2", "torchvision", "ultralytics"
-        ):
+        if name.split(".")[0] in ("mani_skill", "sapien", "pyrealsense2", "torchvision", "ultralytics"):
             raise ImportError(f"{name} is not installed here")
 
 sys.meta_path.insert(0, Blocked())
@@ -30,7 +28,7 @@ finally:
     loaded = sorted(
         name for name in sys.modules
         if name.split(".")[0] in ("mani_skill", "sapien") or name.startswith(
-            ("maniskill_tomato.learning", "maniskill_tomato.tasks.")
+            ("maniskill_tomato.learning.agent", "maniskill_tomato.learning.trainer", "maniskill_tomato.tasks.")
         )
     )
     print("LOADED", loaded)

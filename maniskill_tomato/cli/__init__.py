@@ -9,6 +9,7 @@ Examples:
     maniskill-tomato demo
     maniskill-tomato export --policy runs/demo/training/policy.pt --out exported
     maniskill-tomato deploy run --profile mock --out runs/deploy
+    maniskill-tomato detect photos --out detections.json
 """
 
 import logging
@@ -22,6 +23,7 @@ import tyro
 from maniskill_tomato.cli.benchmark import Benchmark
 from maniskill_tomato.cli.demo import Demo
 from maniskill_tomato.cli.deploy import Deploy
+from maniskill_tomato.cli.detect import Detect
 from maniskill_tomato.cli.evaluate import Eval
 from maniskill_tomato.cli.export import Export
 from maniskill_tomato.cli.options import PlantOptions, merge_options
@@ -32,6 +34,7 @@ __all__ = [
     "Benchmark",
     "Demo",
     "Deploy",
+    "Detect",
     "Eval",
     "Export",
     "PlantOptions",
@@ -41,10 +44,12 @@ __all__ = [
     "parse",
 ]
 
+Command = Train | Eval | Benchmark | Demo | Export | Detect | Deploy
+
 # PyTorch and ManiSkill take seconds to import, so that every command imports what it needs when it runs.
 
 
-def parse(argv: Sequence[str]) -> Train | Eval | Benchmark | Demo | Export | Deploy:
+def parse(argv: Sequence[str]) -> Command:
     """The command that the arguments describe.
 
     The options of `train` default to those of the run that it continues or of its `--config` file, and these to
@@ -60,9 +65,10 @@ def parse(argv: Sequence[str]) -> Train | Eval | Benchmark | Demo | Export | Dep
         | Annotated[Benchmark, tyro.conf.subcommand("benchmark")]
         | Annotated[Demo, tyro.conf.subcommand("demo")]
         | Annotated[Export, tyro.conf.subcommand("export")]
+        | Annotated[Detect, tyro.conf.subcommand("detect")]
         | Annotated[Deploy, tyro.conf.subcommand("deploy")]
     )
-    command: Train | Eval | Benchmark | Demo | Export | Deploy = tyro.cli(
+    command: Command = tyro.cli(
         commands,
         prog="maniskill-tomato",
         description="Active perception for tomato harvesting: train, evaluate, compare, demonstrate, export, deploy.",

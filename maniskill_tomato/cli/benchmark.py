@@ -13,7 +13,9 @@ from maniskill_tomato.errors import InvalidInputError
 
 EpisodeList = Literal["held_out", "validation"]
 
-DEFAULT_POLICIES = "random_viewpoint,fixed_sweep,3dmts,gradient_nbv,nbv_direction,nbv,greedy_truth,oracle"
+DEFAULT_POLICIES = (
+    "random_viewpoint,fixed_sweep,3dmts,gradient_nbv,nbv_direction,nbv,view_quality,greedy_truth,oracle"
+)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -63,6 +63,24 @@ class ViewQuality(Planner):
         self.facts = facts or {}
         self.tried = Candidates()
 
+    @classmethod
+    def shipped(cls, device: str | torch.device = "cpu") -> "ViewQuality":
+        """The policy that ships with the package.
+
+        Raises:
+            InvalidInputError: None ships with this version.
+        """
+        from maniskill_tomato.assets import asset_path
+
+        try:
+            path = asset_path("policies/TomatoViewpoint-v1.pt")
+        except FileNotFoundError as error:
+            raise InvalidInputError(
+                "no view-quality policy ships with this version; train one with scripts/train_view_quality.py and give "
+                "its file"
+            ) from error
+        return load_view_quality(path, device)
+
     def begin(self, situation: Situation, env_idx: Tensor) -> None:
         self.tried.begin(situation, env_idx)
 
