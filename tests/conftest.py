@@ -19,6 +19,10 @@ PROBE_SECONDS = 300
 # ManiSkill asks on the terminal before it downloads an asset; a test must not wait for an answer.
 os.environ.setdefault("MS_SKIP_ASSET_DOWNLOAD_PROMPT", "1")
 
+# Two threads that wait for each other on cores that have other work are many times slower than one; the networks and
+# batches of tests are small. Set before PyTorch is imported, and handed on to the processes that tests start.
+os.environ.setdefault("OMP_NUM_THREADS", "1")
+
 
 @functools.cache
 def rendering_problem() -> str | None:

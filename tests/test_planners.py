@@ -1,7 +1,7 @@
 """The planners in a small world: real plants, a camera that flies freely in a box in front of them, no robot."""
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from types import SimpleNamespace
 from typing import Any
 
@@ -29,6 +29,7 @@ from maniskill_tomato.planners.deep_move_to_see import (
 from maniskill_tomato.planners.gradient_view import GradientView, expected_visible_share
 from maniskill_tomato.planners.greedy_truth import GreedyTruth, greedy_directions
 from maniskill_tomato.planners.move_to_see import MoveToSee, MoveToSeeOnMemory, camera_array, size_gradient
+from maniskill_tomato.planners.moves import Candidates
 from maniskill_tomato.planners.next_best_view import NextBestDirection, NextBestView, NextBestViewConfig
 from maniskill_tomato.planners.oracle import Oracle, OracleSearch
 from maniskill_tomato.planners.reach import CameraReach
@@ -552,3 +553,40 @@ def test_names_and_the_truth_are_checked() -> None:
         make_planner("best")
     with pytest.raises(InvalidInputError, match="knows the truth"):
         make_planner("oracle")
+
+
+def test_a_view_that_was_taken_is_not_taken_again(world: FreeWorld) -> None:
+    world.reset(seed=4)
+    situation = world.situation
+    tried = Candidates()
+    tried.begin(situation, torch.tensor([0]))
+    here = situation.camera_position[:, None]
+    positions = torch.cat(
+        [here + torch.tensor([0.0, 0.02, 0.0]), here + torch.tensor([0.0, 0.05, 0.0])], dim=1
+    )
+    tried.refused = torch.zeros(1, 2, dtype=torch.bool)
+    tried.move_to_best(situation, positions, torch.tensor([[9.0, 1.0]]), torch.ones(1, 2, dtype=torch.bool))
+    assert int(tried.chosen[0]) == 1  # 2 cm away the camera sees what it sees here, 5 cm away it does not.
+
+
+def test_after_a_refusal_the_directions_round_it_wait_until_the_camera_has_moved(world: FreeWorld) -> None:
+    world.reset(seed=4)
+    situation = world.situation
+    tried = Candidates()
+    tried.begin(situation, torch.tensor([0]))
+    tried.refused = torch.zeros(1, 4, dtype=torch.bool)
+    directions = [math.radians(degrees) for degrees in (0.0, 20.0, 40.0, 180.0)]
+    steps = torch.tensor([[math.cos(a), math.sin(a), 0.0] for a in directions])
+    positions = situation.camera_position[:, None] + 0.3 * steps[None]
+    worth, allowed = torch.tensor([[4.0, 3.0, 2.0, 1.0]]), torch.ones(1, 4, dtype=torch.bool)
+
+    def choose() -> int:
+        tried.move_to_best(situation, positions, worth, allowed)
+        return int(tried.chosen[0])
+
+    assert choose() == 0
+    tried.note_refusals(situation)  # The camera is where it was.
+    assert choose() == 2  # 20 degrees is within 30 of the refused one.
+    moved = replace(situation, camera_position=situation.camera_position + 0.05)
+    tried.note_refusals(moved)
+    assert choose() == 1  # Only the refused candidate itself is given up for good.
