@@ -13,10 +13,13 @@ from typing import Any
 
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from maniskill_tomato.deploy.clock import MonotonicClock
-from maniskill_tomato.deploy.drivers import DriverContext, make_arm
+from maniskill_tomato.deploy.drivers import DriverContext, make_arm, make_camera
 from maniskill_tomato.deploy.errors import (
+    DeployError,
     DeviceTimeoutError,
     FaultError,
     NotConnectedError,
@@ -25,6 +28,7 @@ from maniskill_tomato.deploy.errors import (
     RefusedError,
 )
 from maniskill_tomato.deploy.interface import Arm, JointMove
+from maniskill_tomato.deploy.profile import load_profile
 from maniskill_tomato.deploy.sunrise.client import SunriseClient
 from maniskill_tomato.deploy.sunrise.line_connection import MAX_LINE_BYTES, LineConnection
 from maniskill_tomato.deploy.sunrise.loopback import LoopbackController
@@ -303,6 +307,7 @@ def test_joint_angles_beyond_the_limits_are_a_fault() -> None:
         b"0.1_0.2_0.3_0.4_0.5_0.6_1e5_\n",
         b"0.1_0.2_0.3_0.4_0.5_0.6_Infinity_\n",
         b"0.1_0.2_0.3_0.4_0.5_0.6_NaN_\n",
+        b"0.1_0.2_0.3_0.4_0.5_0.6_1.0E999_\n",
         b"0.1_0.2_0.3_0.4_0.5_0.6_0x1p3_\n",
         b"0.1_0.2_0.3_0.4_0.5_0.6_1_000.0_\n",
         "0.1_0.2_0.3_0.4_0.5_0.6_٠.٧_\n".encode(),
@@ -316,6 +321,36 @@ def test_only_seven_finite_numbers_are_joint_angles(line: bytes) -> None:
         with pytest.raises(ProtocolError):
             client.joint_positions()
         assert not client.is_open
+
+
+@settings(max_examples=60, deadline=None)
+@given(
+    st.one_of(
+        st.binary(min_size=1, max_size=200),
+        st.lists(st.floats(allow_nan=True, allow_infinity=True), min_size=5, max_size=9).map(
+            lambda values: "".join(f"{v}_" for v in values).encode()
+        ),
+        st.text(alphabet="0123456789.-_ENaIfinty \r", max_size=80).map(str.encode),
+    )
+)
+def test_whatever_comes_is_seven_finite_numbers_or_an_error_of_ours(content: bytes) -> None:
+    with scripted(lambda connection, _: connection.sendall(content + b"\n")) as client:
+        try:
+            joints = client.joint_positions()
+        except DeployError:
+            assert not client.is_open
+        else:
+            assert joints.shape == (7,) and np.isfinite(joints).all()
+
+
+def test_the_shipped_profile_makes_both_drivers_without_touching_a_device() -> None:
+    profile = load_profile("iiwa14_d435")
+    context = DriverContext(clock=MonotonicClock())
+    arm = make_arm(profile.arm_driver, profile.arm_options, context)
+    camera = make_camera(profile.camera_driver, profile.camera_options, context)
+    assert (arm.name, camera.name) == ("sunrise", "realsense")
+    assert not arm.is_connected and not camera.is_connected
+    assert not arm.simulated and not arm.can_stop and not camera.simulated
 
 
 def test_numbers_are_read_as_java_prints_them() -> None:

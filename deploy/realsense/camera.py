@@ -162,7 +162,7 @@ class RealSenseCamera(Camera):
             "color_focal_px": [round(color.fx, 2), round(color.fy, 2)],
             "depth_size": [self._depth_intrinsics.width, self._depth_intrinsics.height],
             "nearest_depth_m": round(min_depth(self._depth_intrinsics), 3),
-            "depth_units_m": self._depth_units,
+            "depth_units_m": round(self._depth_units, 9),
             "color_from_depth_mm": [round(1000.0 * float(v), 2) for v in self._T_color_depth[:3, 3]],
         }
 

@@ -9,10 +9,9 @@ import math
 import time
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
-from typing import Any, Final, NamedTuple
+from typing import Any, Final
 
 import numpy as np
-import torch
 
 from maniskill_tomato.deploy.clock import Clock
 from maniskill_tomato.deploy.drivers import DriverContext
@@ -29,22 +28,13 @@ from maniskill_tomato.deploy.interface import Arm, ArmState, Float64, JointMove
 from maniskill_tomato.deploy.sunrise.client import SunriseClient
 from maniskill_tomato.deploy.sunrise.config import SunriseConfig
 from maniskill_tomato.deploy.sunrise.line_connection import LineConnection
+from maniskill_tomato.deploy.sunrise.pose_agreement import pose_difference
+from maniskill_tomato.deploy.sunrise.readings import Reading, why_impossible
 from maniskill_tomato.robot import iiwa14
-from maniskill_tomato.robot.kinematics import forward_kinematics
-from maniskill_tomato.robot.rotations import rotation_angle_between, rpy_to_matrix
 
 logger = logging.getLogger(__name__)
 
 ONLY_SMARTPAD: Final = "only the smartPAD or the emergency stop halts it"
-
-LIMIT_SLACK: Final = math.radians(1.0)
-"""How far beyond a joint limit a reading may be before it counts as impossible, in [rad]."""
-
-SPEED_SLACK: Final = 1.2
-"""Joints may seem this much faster than they can be: time stamps are not exact."""
-
-READING_SLACK: Final = 0.005
-"""How far two readings may differ beyond that, in [rad]."""
 
 POLL_S: Final = 0.1
 """Between two looks at the joints in a move, in [s]."""
@@ -67,8 +57,8 @@ class SunriseArm(Arm):
         self._config = config
         self._clock = clock
         self._client: SunriseClient | None = None
-        self._last: _Reading | None = None
-        self._previous: _Reading | None = None
+        self._last: Reading | None = None
+        self._previous: Reading | None = None
         self._pieces: list[Float64] = []
         self._speed = 0.0
         self._piece: Float64 | None = None
@@ -100,7 +90,8 @@ class SunriseArm(Arm):
         try:
             if config.tool_xyzabc is not None:
                 self._client.mount_tool(config.tool_xyzabc)
-            self._pose_error = self._check_pose()
+            told = self._client.tool_pose()
+            self._pose_error = pose_difference(told, self._measure().positions, config)
         except DeployError:
             self.disconnect()
             raise
@@ -226,53 +217,16 @@ class SunriseArm(Arm):
             self._pieces = rest
             self._next_piece(client)
 
-    def _measure(self) -> "_Reading":
+    def _measure(self) -> Reading:
         """Joint angles that can be true."""
         client = self._connected()
         positions = client.joint_positions()
-        reading = _Reading(client.asked_at, time.monotonic(), self._clock.now(), positions)
-        if np.any(np.abs(positions) > iiwa14.JOINT_UPPER + LIMIT_SLACK):
-            raise self._impossible(f"joints at {np.degrees(positions).round(2)} degrees, beyond their limits")
-        if self._last is not None:
-            change = np.abs(positions - self._last.positions)
-            allowed = np.full(iiwa14.NUM_JOINTS, self._config.rest_tolerance)
-            if self._piece is not None:
-                elapsed = reading.answered - self._last.asked
-                allowed = SPEED_SLACK * iiwa14.VELOCITY_LIMITS * elapsed + READING_SLACK
-            if np.any(change > allowed):
-                joint = int(np.argmax(change - allowed))
-                how = "without a move" if self._piece is None else "faster than it can"
-                raise self._impossible(
-                    f"that joint {joint + 1} turned by {math.degrees(change[joint]):.2f} degrees {how}"
-                )
+        reading = Reading(client.asked_at, time.monotonic(), self._clock.now(), positions)
+        what = why_impossible(reading, self._last, self._piece is not None, self._config.rest_tolerance)
+        if what is not None:
+            raise self._impossible(what)
         self._previous, self._last = self._last, reading
         return reading
-
-    def _check_pose(self) -> tuple[float, float]:
-        """How far the controller's tool is from ours, in [m] and [rad].
-
-        Raises:
-            FaultError: Farther than the tolerance.
-        """
-        client, config = self._connected(), self._config
-        told = client.tool_pose()
-        qpos = torch.from_numpy(np.array(self._measure().positions))
-        offset = _transform(config.flange_xyz, config.flange_rpy)
-        expected = forward_kinematics(qpos) @ offset
-        if config.tool_xyzabc is not None:
-            x, y, z, a, b, c = config.tool_xyzabc
-            expected = expected @ _transform((x, y, z), (c, b, a))
-        actual = _transform((told[0], told[1], told[2]), (told[5], told[4], told[3]))
-        distance = float(torch.linalg.vector_norm(expected[:3, 3] - actual[:3, 3]))
-        angle = float(rotation_angle_between(expected[:3, :3], actual[:3, :3]))
-        if distance > config.pose_tolerance_m or angle > config.pose_tolerance_rad:
-            apart = (torch.linalg.inv(expected) @ actual)[:3, 3]
-            raise FaultError(
-                f"the controller's flange is {1000 * distance:.1f} mm and {math.degrees(angle):.2f} degrees from where "
-                f"our kinematics put it (off by {[round(1000 * float(v), 1) for v in apart]} mm in its frame); set "
-                "arm.flange_xyz and arm.flange_rpy to the mounted flange, and arm.tool_xyzabc to the tool"
-            )
-        return distance, angle
 
     @contextmanager
     def _telling_of_a_move(self) -> Iterator[None]:
@@ -300,24 +254,6 @@ class SunriseArm(Arm):
         self._pieces = []
         if self._client is not None:
             self._client.close(why)
-
-
-class _Reading(NamedTuple):
-    asked: float
-    """When it was asked for, by `time.monotonic`, in [s]."""
-    answered: float
-    """When the answer was there, by `time.monotonic`, in [s]."""
-    stamp: float
-    """When the answer was there, by the driver's clock, in [s]."""
-    positions: Float64
-    """In [rad]. Shape (7,)."""
-
-
-def _transform(xyz: tuple[float, float, float], rpy: tuple[float, float, float]) -> torch.Tensor:
-    pose = torch.eye(4, dtype=torch.float64)
-    pose[:3, :3] = rpy_to_matrix(torch.tensor(rpy, dtype=torch.float64))
-    pose[:3, 3] = torch.tensor(xyz, dtype=torch.float64)
-    return pose
 
 
 def make_arm(options: Mapping[str, Any], context: DriverContext) -> SunriseArm:

@@ -34,7 +34,7 @@ PAUSE_S: Final = 0.05
 """Between an answer of the main loop and the next command, in [s]."""
 
 NUMBER: Final = re.compile(r"-?[0-9]{1,17}\.[0-9]{1,20}(E-?[0-9]{1,3})?")
-"""A finite number as Java prints it."""
+"""A number as Java prints it."""
 
 MotionEnd = Literal["done", "interrupted", "nak"]
 """How a move ended: there, stopped by a torque outside its window, or by an exception on the controller."""
@@ -234,11 +234,13 @@ class SunriseClient:
             self._mount_again()
             raise FaultError(f"the controller failed at {word} (`nak`); look at the smartPAD")
         texts = line.split("_")
-        if texts[-1:] != [""] or len(texts) != count + 1 or not all(NUMBER.fullmatch(t) for t in texts[:-1]):
-            raise self._connection.fail(
-                ProtocolError, f"it answered {word} with {line[:80]!r} instead of {count} finite numbers"
-            )
-        return np.array([float(t) for t in texts[:-1]])
+        if texts[-1:] == [""] and len(texts) == count + 1 and all(NUMBER.fullmatch(t) for t in texts[:-1]):
+            values = np.array([float(t) for t in texts[:-1]])
+            if np.isfinite(values).all():  # 1.0E999 is not.
+                return values
+        raise self._connection.fail(
+            ProtocolError, f"it answered {word} with {line[:80]!r} instead of {count} finite numbers"
+        )
 
     def _send(self, command: str, during_move: bool = False) -> None:
         if self._moving and not during_move:
