@@ -40,3 +40,16 @@ class TrainingDivergedError(TomatoError):
 
 class SeedsFailedError(TomatoError):
     """Some of several training runs failed; the others are complete."""
+
+
+class MissingPackageError(TomatoError):
+    """Something needs a package that is not installed."""
+
+    @classmethod
+    def extra(cls, package: str, extra: str) -> "MissingPackageError":
+        """The error for a package that an extra of this one installs."""
+        return cls(f'{package} is not installed; install it with `pip install "maniskill-tomato[{extra}]"`')
+
+
+class MissingWeightsError(TomatoError):
+    """Weights that would have to be downloaded cannot be."""

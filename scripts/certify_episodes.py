@@ -1,7 +1,7 @@
 """Certifies the fixed lists of episodes: asks the oracle in how many moves each target can be seen.
 
-Without a list, one is drawn first as the task draws its episodes from a split. Only episodes that were not asked about
-are; the list is written after every block, so that a run that was stopped goes on where it was.
+A list that is shorter than --count is made longer first, with episodes as the task draws them from a split. Only
+episodes that were not asked about are; the list is written after every block, so that a run that was stopped goes on.
 
 Usage:
     python scripts/certify_episodes.py --list held_out --count 1000 --jobs 2
@@ -28,8 +28,8 @@ from maniskill_tomato.errors import InvalidInputError, TomatoError
 from maniskill_tomato.learning.envs import make_env
 from maniskill_tomato.planners.env_truth import EnvironmentTruth
 from maniskill_tomato.planners.oracle import OracleSearch
-from maniskill_tomato.tasks.episode_draw import draw_episodes
-from maniskill_tomato.tasks.episode_list import EPISODE_LISTS, Episode, read_episodes, write_episodes
+from maniskill_tomato.plants.episode_list import EPISODE_LISTS, Episode, read_episodes, write_episodes
+from maniskill_tomato.tasks.episode_draw import extend_episodes
 
 logger = logging.getLogger("certify_episodes")
 
@@ -44,7 +44,7 @@ class Args:
     list: str
     """validation or held_out."""
     count: int
-    """How many episodes to draw where there is no list yet."""
+    """How many episodes the list is to hold at least."""
     out: Path | None = None
     """File of the list; by default that of the package."""
     jobs: int = 1
@@ -98,11 +98,6 @@ def describe(episodes: list[Episode]) -> str:
     return f"{text}, mean moves {moves.mean():.3f} ({shares})"
 
 
-def _tell_drawn(count: int) -> None:
-    if count % 50 == 0:
-        logger.info("%d drawn", count)
-
-
 def _start_process() -> None:
     os.environ["OMP_NUM_THREADS"] = "1"
     torch.set_num_threads(1)
@@ -115,11 +110,13 @@ def main(args: Args) -> None:
     if args.count < 1 or args.jobs < 1:
         raise InvalidInputError(f"--count and --jobs must be 1 or more, got {args.count} and {args.jobs}")
     out = args.out or ASSETS_DIR / "episodes" / f"{args.list}.json"
-    if out.is_file():
-        episodes = list(read_episodes(out))
-    else:
-        episodes = draw_episodes(args.list, args.count, on_episode=_tell_drawn)
-        write_episodes(out, episodes)
+    episodes = list(read_episodes(out)) if out.is_file() else []
+
+    def keep(longer: list[Episode]) -> None:
+        write_episodes(out, longer)
+        logger.info("%d of %d drawn", len(longer), args.count)
+
+    episodes = extend_episodes(args.list, episodes, args.count, keep)
     started = time.monotonic()
     for known in certify_all(episodes, args):
         write_episodes(out, known)

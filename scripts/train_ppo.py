@@ -1,12 +1,14 @@
 """Trains PPO (Stable-Baselines3) on a task as the on-policy comparison and evaluates it like every other policy.
 
-Actions, observations and reward are those of the `td3` preset, so that only the algorithm differs. Every seed gets a
+Actions, observations and reward are those of the `td3` preset, for the general tasks of `general-td3`, so that only the
+algorithm differs. Every seed gets a
 run folder with config.json, episodes.csv, history.npz, tensorboard/, ppo.pt, eval/metrics.json, and the policy as
 policy.onnx and policy.json, which `maniskill-tomato eval` takes.
 
 Examples:
     python scripts/train_ppo.py TomatoViewpointGuided-v1 --seeds 0 1 2 --out runs/ppo-guided
     python scripts/train_ppo.py TomatoViewpointSparse-v1 --config.total-timesteps 60000 --out runs/ppo-sparse
+    python scripts/train_ppo.py TomatoViewpoint-v1 --out runs/ppo-general
 """
 
 import dataclasses
@@ -44,7 +46,7 @@ from maniskill_tomato.learning.interrupt import stop_on_signals
 from maniskill_tomato.learning.networks import ObservationNormalizer
 from maniskill_tomato.learning.presets import OBSERVATION_CENTRE, OBSERVATION_HALF_RANGE, get_preset
 from maniskill_tomato.learning.run_folder import check_run_dir
-from maniskill_tomato.tasks import THESIS_IDS
+from maniskill_tomato.tasks import GENERAL_IDS, TASK_IDS
 
 SPS_EVERY = 100
 """Environment steps between two points of charts/SPS."""
@@ -87,6 +89,21 @@ class PPOConfig:
     def to_dict(self) -> dict[str, Any]:
         """The fields, ready for JSON."""
         return {k: list(v) if isinstance(v, tuple) else v for k, v in dataclasses.asdict(self).items()}
+
+
+GENERAL_TD3 = get_preset("general-td3")
+
+GENERAL = PPOConfig(
+    total_timesteps=60_000,
+    reward=GENERAL_TD3.reward,
+    gamma=GENERAL_TD3.gamma,
+    n_steps=1000,
+    batch_size=250,
+    log_std_init=-0.7,
+    hidden=GENERAL_TD3.actor_hidden,
+    action_scale=GENERAL_TD3.action_scale,
+)
+"""For the general tasks: longer rollouts over many plants, and a first standard deviation of 0.5."""
 
 
 class Recorder(gym.Wrapper[Array, Array, Array, Array]):
@@ -142,7 +159,7 @@ class PPOPolicy:
         self._scale = torch.tensor(action_scale)
 
     def act(self, observations: Tensor) -> Tensor:
-        """The most likely actions. Shape (B, 6)."""
+        """The most likely actions. Shape (B, action_dim)."""
         actions, _ = self._policy.predict(normalize_observation(observations.numpy()), deterministic=True)
         return torch.from_numpy(actions) * self._scale
 
@@ -209,16 +226,20 @@ def dense_actor(
 ) -> DenseActor:
     """The parts of a policy for its export; `run` is the content of config.json."""
     layers = [layer for layer in policy.mlp_extractor.policy_net if isinstance(layer, nn.Linear)]
+    general = run["env_id"] in GENERAL_IDS
+    actions = len(run["config"]["action_scale"])
     return DenseActor(
         act=acting.act,
-        normalizer=ObservationNormalizer(OBSERVATION_CENTRE, OBSERVATION_HALF_RANGE),
-        normalizer_kind="fixed",
+        normalizer=ObservationNormalizer.identity(layers[0].in_features)
+        if general
+        else ObservationNormalizer(OBSERVATION_CENTRE, OBSERVATION_HALF_RANGE),
+        normalizer_kind="none" if general else "fixed",
         layers=[*layers, policy.action_net],
         activation="Tanh",
         output="Clip",
         action_scale=torch.tensor(run["config"]["action_scale"]),
-        action_low=-torch.ones(6),
-        action_high=torch.ones(6),
+        action_low=-torch.ones(actions),
+        action_high=torch.ones(actions),
         env_id=run["env_id"],
         env_options={},
         package_version=run["package_version"],
@@ -266,7 +287,7 @@ class Args:
     """Train PPO with one or more seeds, one after the other, and evaluate each."""
 
     env_id: Annotated[
-        str, tyro.conf.Positional, tyro.conf.arg(metavar="ENV_ID", help=f"One of {', '.join(THESIS_IDS)}.")
+        str, tyro.conf.Positional, tyro.conf.arg(metavar="ENV_ID", help=f"One of {', '.join(TASK_IDS)}.")
     ]
     """Id of the task."""
     out: Path
@@ -297,7 +318,11 @@ def main(args: Args) -> None:
 if __name__ == "__main__":
     logging.basicConfig(level=logging.WARNING, format="%(message)s")
     try:
-        main(tyro.cli(Args))
+        asked_general = any(word in GENERAL_IDS for word in sys.argv)
+        default = Args(
+            env_id=tyro.MISSING, out=tyro.MISSING, config=GENERAL if asked_general else PPOConfig()
+        )
+        main(tyro.cli(Args, default=default))
     except TomatoError as error:
         print(f"error: {error}", file=sys.stderr)
         raise SystemExit(2) from None

@@ -8,8 +8,8 @@ from typing import Literal
 
 from torch import Tensor
 
+from maniskill_tomato.plants.choice import PlantChoice, PlantPose
 from maniskill_tomato.tasks import rewards
-from maniskill_tomato.tasks.plant_choice import PlantChoice, PlantPose
 
 Range = tuple[float, float]
 VisualReward = Callable[[Tensor, Tensor, Tensor, Tensor], Tensor]

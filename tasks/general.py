@@ -10,17 +10,17 @@ from mani_skill.utils.registration import register
 from torch import Tensor
 
 from maniskill_tomato.errors import InvalidInputError
+from maniskill_tomato.plants.choice import PlantChoice
+from maniskill_tomato.plants.episode_list import EPISODE_LISTS, Episode, load_episodes
 from maniskill_tomato.plants.row import Row
 from maniskill_tomato.robot.kinematics import link_transforms
 from maniskill_tomato.robot.look_at import camera_to_viewpoint
 from maniskill_tomato.tasks import MAX_GENERAL_STEPS, options
 from maniskill_tomato.tasks.camera_perception import CameraPerception, Perception
-from maniskill_tomato.tasks.episode_list import EPISODE_LISTS, Episode, load_episodes
 from maniskill_tomato.tasks.general_config import GeneralTaskConfig
 from maniskill_tomato.tasks.general_rewards import view_gain_reward
 from maniskill_tomato.tasks.ground_truth import GroundTruth
 from maniskill_tomato.tasks.hard_starts import HardStarts, Start
-from maniskill_tomato.tasks.plant_choice import PlantChoice
 from maniskill_tomato.tasks.sensor_noise import SensorErrors, SensorNoise
 from maniskill_tomato.tasks.tomato_env import TomatoEnv
 from maniskill_tomato.visibility.cast_views import CastViews

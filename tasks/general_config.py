@@ -1,10 +1,10 @@
 """What tells the general tasks apart: plants never seen before, hard starts, a reward that does not pay for waiting."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from maniskill_tomato.errors import InvalidInputError
+from maniskill_tomato.plants.choice import ROW_PLANT, PlantChoice, PlantPose
 from maniskill_tomato.tasks import MAX_GENERAL_STEPS
-from maniskill_tomato.tasks.plant_choice import PlantChoice, PlantPose
 
 Range = tuple[float, float]
 
@@ -13,7 +13,7 @@ Range = tuple[float, float]
 class GeneralTaskConfig:
     """One general task."""
 
-    plant: PlantChoice = PlantChoice(preset="full", seed="train", pool=100, leaf_density=(0.8, 1.8), row=True)
+    plant: PlantChoice = replace(ROW_PLANT, seed="train", pool=100)
     """The plants that the task draws from unless it is given others."""
     plant_pose: PlantPose = PlantPose(x=0.9, y=0.0)
     """Where the middle plant stands."""

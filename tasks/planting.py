@@ -13,10 +13,10 @@ from mani_skill.utils.structs.pose import Pose
 from torch import Tensor
 from torch.nn.functional import pad
 
+from maniskill_tomato.plants.choice import PlantChoice
 from maniskill_tomato.plants.organs import Plant, SemanticClass
 from maniskill_tomato.plants.rendering import build_plant_actors
 from maniskill_tomato.tasks import scene_mask
-from maniskill_tomato.tasks.plant_choice import PlantChoice
 
 GROWN_PLANTS = 128
 """How many plants are kept, of 1 MB or less each (a row: 3 MB), for environments that show them again."""

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from maniskill_tomato.errors import InvalidInputError, RenderingUnavailableError
+from maniskill_tomato.plants.choice import PlantChoice, PlantPose
 from maniskill_tomato.plants.organs import SemanticClass
 from maniskill_tomato.robot.agent import Iiwa14D435
 from maniskill_tomato.robot.d435 import CameraIntrinsics, T_flange_camera_color_optical
@@ -27,7 +28,6 @@ from maniskill_tomato.robot.viewpoint_controller import ViewpointController
 from maniskill_tomato.tasks import options, scene_mask, scenery
 from maniskill_tomato.tasks.flat_state import checked_rows, unflatten
 from maniskill_tomato.tasks.motion import drive_to
-from maniskill_tomato.tasks.plant_choice import PlantChoice, PlantPose
 from maniskill_tomato.tasks.planting import GROWN_PLANTS, Planting
 from maniskill_tomato.visibility.caster import VisibilityCaster
 

@@ -7,6 +7,7 @@ import torch
 
 from maniskill_tomato.errors import InvalidInputError
 from maniskill_tomato.learning.exploration import (
+    CorrelatedNoise,
     DecayingGaussian,
     EpsilonGreedy,
     LookAtGoals,
@@ -224,7 +225,7 @@ def test_noise_levels_are_uniform_each_environments_own_and_last_for_an_episode(
     assert (later[some] != levels[some]).float().mean() > 0.99
 
 
-@pytest.mark.parametrize("kind", ["decaying-gaussian", "look-at-goals"])
+@pytest.mark.parametrize("kind", ["decaying-gaussian", "look-at-goals", "correlated"])
 def test_every_environment_explores_with_its_own_noise(kind: Any) -> None:
     """Over one long episode the spread of each environment's actions is its level, and it differs between them."""
     config = replace(
@@ -234,6 +235,7 @@ def test_every_environment_explores_with_its_own_noise(kind: Any) -> None:
         exploration_noise_end=0.02,
         exploration_noise_per_env=True,
         exploration_goal_share=0.0,
+        exploration_correlation=0.0,
         exploration_steps=1,
         learning_starts=0,
     )
@@ -250,3 +252,26 @@ def test_every_environment_explores_with_its_own_noise(kind: Any) -> None:
 def test_noise_levels_need_noise() -> None:
     with pytest.raises(InvalidInputError, match="needs an exploration with noise"):
         replace(get_preset("thesis-guided"), exploration_noise_per_env=True)
+
+
+def test_correlated_noise_keeps_its_spread_and_forgets_at_its_rate() -> None:
+    noise = CorrelatedNoise(1000, 0.2, 0.1, 0.8, generator())
+    policy = torch.zeros(4000, 3)
+    tried = torch.stack([noise.explore(policy, SEEN, 0, NEVER) for _ in range(4)])
+    torch.testing.assert_close(tried.std(dim=(1, 2)), torch.full((4,), 0.2), rtol=0.02, atol=0.0)
+    for lag, wanted in ((1, 0.8), (2, 0.64)):
+        pair = torch.stack([tried[0].flatten(), tried[lag].flatten()])
+        assert float(torch.corrcoef(pair)[0, 1]) == pytest.approx(wanted, abs=0.02)
+    assert [noise.amount(step) for step in (0, 500, 1000, 5000)] == pytest.approx([0.2, 0.15, 0.1, 0.1])
+
+
+def test_correlated_noise_begins_anew_with_an_episode() -> None:
+    noise = CorrelatedNoise(1000, 0.2, 0.2, 0.99, generator())
+    starts = torch.arange(4000) < 2000
+    first = noise.explore(torch.zeros(4000, 3), SEEN, 0, NEVER)
+    second = noise.explore(torch.zeros(4000, 3), SEEN, 0, starts)
+
+    def correlation(rows: slice) -> float:
+        return float(torch.corrcoef(torch.stack([first[rows].flatten(), second[rows].flatten()]))[0, 1])
+
+    assert abs(correlation(slice(0, 2000))) < 0.05 and correlation(slice(2000, 4000)) > 0.97

@@ -15,11 +15,11 @@ import pytest
 import torch
 from torch import Tensor
 
-from maniskill_tomato.errors import InvalidInputError, TrainingDivergedError
+from maniskill_tomato.errors import CheckpointError, InvalidInputError, TrainingDivergedError
 from maniskill_tomato.learning.checkpoint import load_checkpoint
 from maniskill_tomato.learning.history import TrainingHistory, load_history
 from maniskill_tomato.learning.policy import load_policy
-from maniskill_tomato.learning.presets import TrainConfig, get_preset
+from maniskill_tomato.learning.presets import PRESETS, TrainConfig, default_preset, get_preset
 from maniskill_tomato.learning.rewards import potential_reward
 from maniskill_tomato.learning.trainer import Trainer
 
@@ -365,3 +365,34 @@ def test_the_potential_reward_passes_penalties_on() -> None:
         step_cost=0.0,
     )
     torch.testing.assert_close(still, torch.tensor([0.0, -2.0]))
+
+
+def test_a_run_begins_with_a_given_actor_which_waits_for_the_critics(tmp_path: Path) -> None:
+    first = train(ReachTask(), small_config(total_timesteps=60), tmp_path / "first")
+    config = small_config(
+        total_timesteps=60, initial_policy=str(first.policy_path), actor_starts=10_000, learning_starts=10
+    )
+    second = train(ReachTask(), config, tmp_path / "second", seed=1)
+    assert second.updates > 20
+    before, after = load_policy(first.policy_path), load_policy(second.policy_path)
+    for a, b in zip(before.actor.parameters(), after.actor.parameters(), strict=True):
+        torch.testing.assert_close(a, b, rtol=0.0, atol=0.0)
+    moving = replace(config, actor_starts=0)
+    third = load_policy(train(ReachTask(), moving, tmp_path / "third", seed=1).policy_path)
+    assert not torch.equal(next(third.actor.parameters()), next(before.actor.parameters()))
+
+
+def test_a_given_actor_of_another_shape_is_refused_before_anything_is_written(tmp_path: Path) -> None:
+    first = train(ReachTask(), small_config(total_timesteps=60), tmp_path / "first")
+    config = small_config(actor_hidden=(7,), initial_policy=str(first.policy_path))
+    with pytest.raises(CheckpointError, match="actor_hidden"):
+        train(ReachTask(), config, tmp_path / "second")
+    assert not (tmp_path / "second").exists()
+
+
+def test_every_task_has_a_preset_that_fits_its_actions() -> None:
+    assert default_preset("TomatoViewpointGuided-v1") == "td3" and default_preset(None) == "td3"
+    for env_id in ("TomatoViewpoint-v1", "TomatoViewpointRow-v1"):
+        assert default_preset(env_id) == "general-td3"
+    for name, config in PRESETS.items():
+        assert len(config.action_scale) == (3 if name.startswith("general-") else 6)

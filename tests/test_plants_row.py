@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 
 from maniskill_tomato.errors import InvalidInputError
+from maniskill_tomato.plants.choice import ROW_NEIGHBOURS, SEED_SPLITS, PlantChoice
 from maniskill_tomato.plants.generator import generate_plant
 from maniskill_tomato.plants.row import ROW_SPACING, generate_row, leaf_density_of, neighbour_seeds
-from maniskill_tomato.tasks.plant_choice import ROW_NEIGHBOURS, SEED_SPLITS, PlantChoice
 
 
 def test_the_middle_of_a_row_is_the_plant_of_its_seed() -> None:

@@ -12,19 +12,19 @@ import torch
 
 import maniskill_tomato  # noqa: F401
 from maniskill_tomato.errors import InvalidInputError
-from maniskill_tomato.robot.iiwa14 import NUM_JOINTS
-from maniskill_tomato.robot.kinematics import forward_kinematics
-from maniskill_tomato.robot.look_at import flange_to_camera
-from maniskill_tomato.tasks.episode_draw import draw_episodes
-from maniskill_tomato.tasks.episode_list import (
+from maniskill_tomato.plants.choice import SEED_SPLITS
+from maniskill_tomato.plants.episode_list import (
     EPISODE_LISTS,
     Episode,
     load_episodes,
     read_episodes,
     write_episodes,
 )
+from maniskill_tomato.robot.iiwa14 import NUM_JOINTS
+from maniskill_tomato.robot.kinematics import forward_kinematics
+from maniskill_tomato.robot.look_at import flange_to_camera
+from maniskill_tomato.tasks.episode_draw import draw_episodes, extend_episodes
 from maniskill_tomato.tasks.general_rewards import view_gain_reward
-from maniskill_tomato.tasks.plant_choice import SEED_SPLITS
 from maniskill_tomato.visibility.caster import VisibilityCaster
 from maniskill_tomato.visibility.observation import ObservationLayout
 
@@ -265,6 +265,13 @@ def test_episodes_of_a_list_come_by_seed_and_by_index(tmp_path: Path) -> None:
         pose = torch.cat([base.planting.position_w[0, :2], base.planting.yaw])
         torch.testing.assert_close(pose, torch.tensor(episode.plant_pose), atol=1e-5, rtol=0)
     env.close()
+
+
+def test_a_list_grows_by_the_same_episodes_whether_at_once_or_in_parts() -> None:
+    at_once = extend_episodes("validation", [], 3)
+    in_parts = extend_episodes("validation", extend_episodes("validation", [], 2), 3)
+    assert at_once == in_parts
+    assert len({episode.plant_seed for episode in at_once}) == 3
 
 
 @pytest.mark.parametrize("name", EPISODE_LISTS)

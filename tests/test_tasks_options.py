@@ -13,7 +13,7 @@ import torch
 
 import maniskill_tomato  # noqa: F401
 from maniskill_tomato.errors import InvalidInputError
-from maniskill_tomato.tasks.plant_choice import SEED_SPLITS, PlantChoice, PlantPose
+from maniskill_tomato.plants.choice import SEED_SPLITS, PlantChoice, PlantPose
 
 GUIDED = "TomatoViewpointGuided-v1"
 

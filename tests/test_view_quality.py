@@ -309,7 +309,17 @@ def test_eval_runs_the_same_episodes_as_the_benchmark(
     assert metrics["plant_contact_step_share"] == pytest.approx(contacts)
 
 
-def test_without_a_policy_eval_says_how_to_get_one(capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_shipped_policy_finds_tomatoes_on_plants_never_seen_before(tmp_path: Path) -> None:
+    options = ["--episodes", "20", "--no-video", "--no-baseline", "--episode-list", "held_out"]
+    main(["eval", "TomatoViewpoint-v1", *options, "--out", str(tmp_path)])
+    metrics = json.loads((tmp_path / "metrics.json").read_text())
+    assert metrics["success_rate"] >= 0.9 and metrics["mean_steps"] <= 6.0
+
+
+def test_without_a_policy_eval_says_how_to_get_one(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    monkeypatch.setattr("maniskill_tomato.assets.ASSETS_DIR", tmp_path)
     with pytest.raises(SystemExit) as stopped:
         main(["eval", "TomatoViewpoint-v1"])
     told = capsys.readouterr().err

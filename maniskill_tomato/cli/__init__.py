@@ -1,4 +1,4 @@
-"""The command `maniskill-tomato`: train, evaluate, compare, demonstrate, export, render data sets.
+"""The command `maniskill-tomato`: train, evaluate, compare, demonstrate, export, deploy.
 
 Examples:
     maniskill-tomato train TomatoViewpointGuided-v1
@@ -8,7 +8,9 @@ Examples:
     maniskill-tomato benchmark --policies nbv,oracle,runs/general/policy.pt --episodes 500
     maniskill-tomato demo
     maniskill-tomato export --policy runs/demo/training/policy.pt --out exported
+    maniskill-tomato deploy run --profile mock --out runs/deploy
     maniskill-tomato dataset --count 1000 --split train --out runs/dataset
+    maniskill-tomato detect photos --out detections.json
 """
 
 import logging
@@ -22,6 +24,8 @@ import tyro
 from maniskill_tomato.cli.benchmark import Benchmark
 from maniskill_tomato.cli.dataset import Dataset
 from maniskill_tomato.cli.demo import Demo
+from maniskill_tomato.cli.deploy import Deploy
+from maniskill_tomato.cli.detect import Detect
 from maniskill_tomato.cli.evaluate import Eval
 from maniskill_tomato.cli.export import Export
 from maniskill_tomato.cli.options import PlantOptions, merge_options
@@ -32,6 +36,8 @@ __all__ = [
     "Benchmark",
     "Dataset",
     "Demo",
+    "Deploy",
+    "Detect",
     "Eval",
     "Export",
     "PlantOptions",
@@ -41,10 +47,12 @@ __all__ = [
     "parse",
 ]
 
+Command = Train | Eval | Benchmark | Demo | Export | Dataset | Detect | Deploy
+
 # PyTorch and ManiSkill take seconds to import, so that every command imports what it needs when it runs.
 
 
-def parse(argv: Sequence[str]) -> Train | Eval | Benchmark | Demo | Export | Dataset:
+def parse(argv: Sequence[str]) -> Command:
     """The command that the arguments describe.
 
     The options of `train` default to those of the run that it continues or of its `--config` file, and these to
@@ -61,11 +69,13 @@ def parse(argv: Sequence[str]) -> Train | Eval | Benchmark | Demo | Export | Dat
         | Annotated[Demo, tyro.conf.subcommand("demo")]
         | Annotated[Export, tyro.conf.subcommand("export")]
         | Annotated[Dataset, tyro.conf.subcommand("dataset")]
+        | Annotated[Detect, tyro.conf.subcommand("detect")]
+        | Annotated[Deploy, tyro.conf.subcommand("deploy")]
     )
-    command: Train | Eval | Benchmark | Demo | Export | Dataset = tyro.cli(
+    command: Command = tyro.cli(
         commands,
         prog="maniskill-tomato",
-        description="Active perception for tomato harvesting: train, evaluate, compare, demonstrate, export, render.",
+        description="Active perception for tomato harvesting: train, evaluate, compare, demonstrate, export, deploy.",
         args=list(argv),
         config=(tyro.conf.OmitArgPrefixes,),
     )

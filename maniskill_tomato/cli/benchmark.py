@@ -13,7 +13,9 @@ from maniskill_tomato.errors import InvalidInputError
 
 EpisodeList = Literal["held_out", "validation"]
 
-DEFAULT_POLICIES = "random_viewpoint,fixed_sweep,3dmts,gradient_nbv,nbv_direction,nbv,greedy_truth,oracle"
+DEFAULT_POLICIES = (
+    "random_viewpoint,fixed_sweep,3dmts,gradient_nbv,nbv_direction,nbv,view_quality,greedy_truth,oracle"
+)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -57,7 +59,7 @@ class Benchmark:
         )
         from maniskill_tomato.evaluation.benchmark_store import EpisodeStore
         from maniskill_tomato.planners.registry import PRIVILEGED
-        from maniskill_tomato.tasks.episode_list import load_episodes
+        from maniskill_tomato.plants.episode_list import load_episodes
         from maniskill_tomato.tasks.general_config import GeneralTaskConfig
 
         specs = parse_policies(self.policies)

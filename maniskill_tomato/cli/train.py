@@ -11,7 +11,13 @@ import tyro
 from maniskill_tomato.cli.options import PlantOptions, merge_options
 from maniskill_tomato.errors import InvalidInputError, SeedsFailedError
 from maniskill_tomato.learning.config_file import RunFile, parse_seeds, read_run_config, read_run_file
-from maniskill_tomato.learning.presets import MAY_CHANGE, PRESETS, PresetName, TrainConfig
+from maniskill_tomato.learning.presets import (
+    MAY_CHANGE,
+    PRESETS,
+    PresetName,
+    TrainConfig,
+    default_preset,
+)
 from maniskill_tomato.tasks import TASK_IDS
 
 
@@ -26,7 +32,8 @@ class Train:
     ] = None
     """Id of the task."""
     preset: PresetName = "td3"
-    """Named configuration: a good default, or the thesis's Table 5-1 or 5-2."""
+    """Named configuration: a good default (td3, or general-td3 for the general tasks), or the thesis's Table 5-1 or
+    5-2."""
     config_file: Annotated[Path | None, tyro.conf.arg(name="config", metavar="FILE")] = None
     """Options from a .toml file or from the config.json of a run; flags replace them."""
     resume: Annotated[Path | None, tyro.conf.arg(metavar="DIR")] = None
@@ -93,7 +100,7 @@ class Train:
             name
             for name, given, begun in (
                 ("the task", self.env_id, run_file.env_id),
-                ("--preset", self.preset, run_file.preset or "td3"),
+                ("--preset", self.preset, run_file.preset or default_preset(run_file.env_id)),
                 ("--seed", self.seed, run_file.seed or 0),
                 ("--seeds", self.seeds, tuple(map(str, run_file.seeds))),
                 ("--out", self.out, None),
@@ -102,7 +109,10 @@ class Train:
             )
             if given not in (begun, None)
         ]
-        begun_config, config = run_file.train_config("td3").to_dict(), self.config.to_dict()
+        begun_config, config = (
+            run_file.train_config(default_preset(run_file.env_id)).to_dict(),
+            self.config.to_dict(),
+        )
         changed += [
             f"--{name.replace('_', '-')}"
             for name, value in config.items()
@@ -162,7 +172,8 @@ def train_default(argv: Sequence[str]) -> Train:
         run_file = read_run_file(Path(file))
     else:
         run_file = RunFile()
-    preset = run_file.preset or "td3"
+    env_id = run_file.env_id or next((word for word in argv if word in TASK_IDS), None)
+    preset = run_file.preset or default_preset(env_id)
     asked = _asked(argv, "--preset")
     for name in PRESETS:
         if asked == name:

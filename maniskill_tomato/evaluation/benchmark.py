@@ -205,7 +205,7 @@ def _known_moves(episode_list: str | None) -> Any:
     """The oracle's moves by episode number."""
     if episode_list is None:
         return lambda number: None
-    from maniskill_tomato.tasks.episode_list import load_episodes
+    from maniskill_tomato.plants.episode_list import load_episodes
 
     episodes = load_episodes(episode_list)
     return lambda number: episodes[number % len(episodes)].oracle_moves

@@ -24,7 +24,7 @@ class ExportedPolicy:
         return self._policy.description
 
     def act(self, observations: Tensor) -> Tensor:
-        """Actions of shape (B, 6) for observations of shape (B, 9), both in [m] and [rad]."""
+        """Actions of shape (B, A) for observations of shape (B, D), in the task's units."""
         actions = self._policy.act(observations.detach().cpu().numpy())
         return torch.from_numpy(actions).to(observations.device)
 

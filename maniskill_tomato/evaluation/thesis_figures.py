@@ -21,9 +21,9 @@ from maniskill_tomato.evaluation.plots import INK, MUTED, STYLE, TOMATO, moving_
 from maniskill_tomato.evaluation.reproduction import Reproduction, load_episodes, success_threshold
 from maniskill_tomato.evaluation.rollout import Episode
 from maniskill_tomato.learning.history import TrainingCurves, load_history
+from maniskill_tomato.plants.choice import PlantChoice, PlantPose
 from maniskill_tomato.plants.organs import SemanticClass
 from maniskill_tomato.tasks.config import ViewpointTaskConfig, guided_task, sparse_task
-from maniskill_tomato.tasks.plant_choice import PlantChoice, PlantPose
 from maniskill_tomato.tasks.planting import grow
 
 SEED_COLOURS = ("#3b6ea5", "#d9a441", "#3f7d4e", "#8a5aa5", "#c8402c", "#4aa3a2", "#7a5230", "#5b6770")

@@ -13,27 +13,33 @@ from maniskill_tomato.files import read_tensors
 from maniskill_tomato.planners.base import Planner
 from maniskill_tomato.planners.env_truth import EnvironmentTruth
 from maniskill_tomato.planners.learned import LearnedPolicy
+from maniskill_tomato.planners.recurrent import is_recurrent, load_recurrent
 from maniskill_tomato.planners.registry import make_planner
 from maniskill_tomato.planners.view_quality import is_view_quality, load_view_quality
 from maniskill_tomato.tasks import GENERAL_IDS
 
 
 def open_viewpoint_policy(path: Path, env_id: str | None = None) -> Planner:
-    """Reads a policy for the general tasks: a view-quality policy, or one of observations (.pt or .onnx).
+    """Reads a policy for the general tasks: a view-quality or a recurrent one, or one of observations (.pt or .onnx).
 
     Args:
         path: The file.
-        env_id: The task that it must fit; None accepts any. A view-quality policy fits all general tasks.
+        env_id: The task that it must fit; None accepts any. View-quality and recurrent policies fit all
+            general tasks.
 
     Raises:
         CheckpointError: It is missing, damaged or made for another task.
         PolicyError: The same of an exported one.
     """
-    if path.suffix.lower() != ".onnx" and is_view_quality(read_tensors(path)):
-        if env_id is not None and env_id not in GENERAL_IDS:
-            raise CheckpointError(f"{path} is a policy for {', '.join(GENERAL_IDS)}, not for {env_id}")
-        return load_view_quality(path)
-    return LearnedPolicy(open_policy(path, env_id))
+    content = None if path.suffix.lower() == ".onnx" else read_tensors(path)
+    loader = (
+        load_view_quality if is_view_quality(content) else load_recurrent if is_recurrent(content) else None
+    )
+    if loader is None:
+        return LearnedPolicy(open_policy(path, env_id))
+    if env_id is not None and env_id not in GENERAL_IDS:
+        raise CheckpointError(f"{path} is a policy for {', '.join(GENERAL_IDS)}, not for {env_id}")
+    return loader(path)
 
 
 class SituationPolicy:

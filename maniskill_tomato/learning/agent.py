@@ -230,15 +230,16 @@ def update(
         agent: The agent, changed in place.
         batch: Transitions from the replay buffer.
         index: How many updates came before; the actor and the targets move on every `policy_frequency`-th
-            only.
+            only, the actor after `actor_starts` of them.
         generator: Source of the target noise.
 
     Returns:
         The logs of `update_critic` and, where it ran, `update_actor`.
     """
     logs = update_critic(agent, batch, generator)
-    if index % agent.config.policy_frequency == 0:
+    if index >= agent.config.actor_starts and index % agent.config.policy_frequency == 0:
         logs |= update_actor(agent, batch.observations)
+    if index % agent.config.policy_frequency == 0:
         update_targets(agent)
     return logs
 

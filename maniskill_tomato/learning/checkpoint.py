@@ -12,7 +12,7 @@ import maniskill_tomato
 from maniskill_tomato.errors import CheckpointError
 from maniskill_tomato.files import read_tensors, write_atomically
 from maniskill_tomato.learning.agent import Agent
-from maniskill_tomato.learning.presets import ACTION_NAMES, OBSERVATION_NAMES
+from maniskill_tomato.policy.layout import layout_of
 
 FORMAT = 1
 """Version of the layout that `make_checkpoint` documents."""
@@ -66,23 +66,24 @@ def make_checkpoint(
     low, high = action_bounds
     scale = torch.tensor(agent.config.action_scale)
     observation_dim = len(agent.normalizer.centre)
+    layout = layout_of(env_id)
     data: dict[str, Any] = {
         "format": FORMAT,
         "package_version": maniskill_tomato.__version__,
         "env_id": env_id,
         "config": agent.config.to_dict(),
         "observation": {
-            "names": _names(OBSERVATION_NAMES, observation_dim),
+            "names": _names(layout.observation_names, observation_dim),
             "shape": [observation_dim],
-            "frame": "world = robot base",
-            "units": "m, rad",
+            "frame": layout.frame,
+            "units": _units(layout.observation_units),
         },
         "action": {
-            "names": _names(ACTION_NAMES, len(scale)),
+            "names": _names(layout.action_names, len(scale)),
             "low": low.cpu(),
             "high": high.cpu(),
             "scale": scale,
-            "units": "m, rad",
+            "units": _units(layout.action_units),
         },
         "normalizer": agent.normalizer.state_dict(),
         "actor": agent.actor.state_dict(),
@@ -136,3 +137,7 @@ def load_checkpoint(path: Path | str, device: torch.device | str = "cpu") -> dic
 def _names(names: tuple[str, ...], count: int) -> list[str]:
     """The documented names, or numbered ones for spaces of another size."""
     return list(names) if len(names) == count else [f"value_{i}" for i in range(count)]
+
+
+def _units(units: tuple[str, ...]) -> str:
+    return ", ".join(dict.fromkeys(units))

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from maniskill_tomato.errors import InvalidInputError
-from maniskill_tomato.learning.presets import PRESETS, PresetName, TrainConfig, get_preset
+from maniskill_tomato.learning.presets import PRESETS, PresetName, TrainConfig, default_preset, get_preset
 
 KEYS = ("env_id", "preset", "seed", "seeds", "env_options", "config", "package_version")
 
@@ -74,7 +74,7 @@ def read_run_file(path: Path) -> RunFile:
         options=values.get("config", {}),
     )
     try:
-        run_file.train_config(run_file.preset or "td3")
+        run_file.train_config(run_file.preset or default_preset(env_id))
     except (InvalidInputError, TypeError) as error:
         raise InvalidInputError(f"{path}: {error}") from error
     return run_file

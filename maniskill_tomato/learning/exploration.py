@@ -1,4 +1,4 @@
-"""Exploration: the thesis's two schemes and look-at goals, each with its own sample for every environment."""
+"""Exploration: the thesis's two schemes, look-at goals and correlated noise, sampled for every environment."""
 
 from collections.abc import Sequence
 from typing import Protocol
@@ -152,6 +152,56 @@ class DecayingGaussian:
         return (policy_actions + self.amount(step) * self._noise * noise).clamp_(-1.0, 1.0)
 
 
+class CorrelatedNoise:
+    """The policy's action plus noise that remembers the step before, so that a wrong way is kept for some steps.
+
+    The noise is a stationary autoregressive process, n' = c n + sqrt(1 - c^2) sigma e with e ~ N(0, 1), begun anew with
+    every episode; sigma falls linearly from `noise` to `noise_end`, or is each environment's own level. It does what
+    the Ornstein-Uhlenbeck noise of DDPG does (Lillicrap et al., 2016), with a spread that does not depend on c.
+    """
+
+    def __init__(
+        self,
+        exploration_steps: int,
+        noise: float,
+        noise_end: float,
+        correlation: float,
+        generator: torch.Generator | None = None,
+        noise_per_env: bool = False,
+    ) -> None:
+        self._exploration_steps = exploration_steps
+        self._noise = noise
+        self._noise_end = noise_end
+        self._correlation = correlation
+        self._noise_per_env = noise_per_env
+        self._generator = generator
+        self._levels: Tensor | None = None
+        self._state: Tensor | None = None
+
+    def amount(self, step: int) -> float:
+        if self._noise_per_env:
+            return 0.5 * (self._noise + self._noise_end)
+        remaining = decaying_schedule(step, self._exploration_steps)
+        return self._noise_end + remaining * (self._noise - self._noise_end)
+
+    def explore(
+        self, policy_actions: Tensor, observations: Tensor, step: int, episode_starts: Tensor
+    ) -> Tensor:
+        fresh = torch.randn(policy_actions.shape, generator=self._generator, device=policy_actions.device)
+        if self._state is None or self._state.shape != fresh.shape:
+            self._state = fresh
+        else:
+            c = self._correlation
+            kept = c * self._state + (1.0 - c * c) ** 0.5 * fresh
+            self._state = torch.where(episode_starts[:, None], fresh, kept)
+        amount: float | Tensor = self.amount(step)
+        if self._noise_per_env:
+            self._levels = amount = draw_noise_levels(
+                self._levels, episode_starts, self._noise_end, self._noise, self._generator
+            )
+        return (policy_actions + amount * self._state).clamp_(-1.0, 1.0)
+
+
 class LookAtGoals:
     """Some episodes walk between random viewpoints that look at the target; the others follow the policy with
     noise.
@@ -271,6 +321,15 @@ def make_exploration(
             config.exploration_noise,
             generator,
             config.exploration_noise_end,
+            config.exploration_noise_per_env,
+        )
+    if config.exploration == "correlated":
+        return CorrelatedNoise(
+            config.exploration_steps,
+            config.exploration_noise,
+            config.exploration_noise_end,
+            config.exploration_correlation,
+            generator,
             config.exploration_noise_per_env,
         )
     return LookAtGoals(

@@ -32,8 +32,9 @@ from maniskill_tomato.policy.description import (
     ActionComponent,
     Component,
     PolicyDescription,
+    shortened,
 )
-from maniskill_tomato.policy.layout import ACTION_NAMES, ACTION_UNITS, OBSERVATION_NAMES, OBSERVATION_UNITS
+from maniskill_tomato.policy.layout import layout_of
 from maniskill_tomato.policy.onnx_policy import OnnxPolicy, description_path
 from maniskill_tomato.tasks import THESIS_IDS
 from maniskill_tomato.tasks.config import ViewpointTaskConfig, guided_task, sparse_task
@@ -57,7 +58,7 @@ class DenseActor:
     """A policy in the parts that its graph is written from; this package's own and those of other learners."""
 
     act: Callable[[torch.Tensor], torch.Tensor]
-    """What the export is compared with: actions of shape (B, 6) for observations of shape (B, 9), [m] and [rad]."""
+    """What the export is compared with: actions of shape (B, A) for observations of shape (B, D)."""
     normalizer: ObservationNormalizer
     normalizer_kind: str
     """Where the normaliser comes from, see `PolicyDescription`."""
@@ -68,11 +69,11 @@ class DenseActor:
     output: Literal["Tanh", "Clip"]
     """What brings the output of the last into [-1, 1]."""
     action_scale: torch.Tensor
-    """The action that an output of 1 stands for, in [m] and [rad]. Shape (6,)."""
+    """The action that an output of 1 stands for, in the task's units. Shape (A,)."""
     action_low: torch.Tensor
-    """The task's bounds. Shape (6,)."""
+    """The task's bounds. Shape (A,)."""
     action_high: torch.Tensor
-    """Shape (6,)."""
+    """Shape (A,)."""
     env_id: str
     """The task that it was trained on."""
     env_options: dict[str, Any] | None
@@ -207,6 +208,16 @@ def describe_policy(actor: DenseActor, model: bytes) -> PolicyDescription:
     make_task = _TASKS.get(actor.env_id)
     task = make_task() if make_task else None
     config = json.dumps(actor.config, sort_keys=True)
+    layout = layout_of(actor.env_id)
+    for what, given, wanted in (
+        ("observes", len(actor.normalizer.centre), len(layout.observation_names)),
+        ("does", len(actor.action_scale), len(layout.action_names)),
+    ):
+        if given != wanted:
+            raise PolicyError(
+                f"a policy of {actor.env_id} that {what} {given} values cannot be exported; descriptions are of "
+                f"{wanted}, those of the task as it is"
+            )
     bounds = (_shortest(actor.action_low), _shortest(actor.action_high), _shortest(actor.action_scale))
     return PolicyDescription(
         package_version=actor.package_version,
@@ -216,14 +227,16 @@ def describe_policy(actor: DenseActor, model: bytes) -> PolicyDescription:
         trained_with=actor.env_options,
         observation=tuple(
             Component(name=name, unit=unit, low=None, high=None)
-            for name, unit in zip(OBSERVATION_NAMES, OBSERVATION_UNITS, strict=True)
+            for name, unit in zip(layout.observation_names, layout.observation_units, strict=True)
         ),
         normalizer_centre=_shortest(actor.normalizer.centre),
         normalizer_half_range=_shortest(actor.normalizer.half_range),
         normalizer_kind=actor.normalizer_kind,
         action=tuple(
             ActionComponent(name=name, unit=unit, low=low, high=high, scale=scale)
-            for name, unit, low, high, scale in zip(ACTION_NAMES, ACTION_UNITS, *bounds, strict=True)
+            for name, unit, low, high, scale in zip(
+                layout.action_names, layout.action_units, *bounds, strict=True
+            )
         ),
         training={
             "algorithm": actor.algorithm,
@@ -239,7 +252,7 @@ def parity_observations(actor: DenseActor, count: int = 1000, seed: int = 0) -> 
 
     Returns:
         Zeros, the normaliser's centre, every value alone at and far beyond both ends of its range, all values
-        there together, and `count` random ones around the range. Shape (B, 9).
+        there together, and `count` random ones around the range. Shape (B, D).
     """
     centre = actor.normalizer.centre.cpu().numpy()
     half_range = actor.normalizer.half_range.cpu().numpy()
@@ -260,11 +273,12 @@ def largest_difference(actor: DenseActor, exported: OnnxPolicy) -> float:
 def _check_layout(path: Path) -> None:
     """Refuses a policy that observes or does something else than the descriptions say."""
     data = load_checkpoint(path)
-    for what, names in (("observation", OBSERVATION_NAMES), ("action", ACTION_NAMES)):
+    layout = layout_of(data["env_id"])
+    for what, names in (("observation", layout.observation_names), ("action", layout.action_names)):
         if list(data[what]["names"]) != list(names):
             raise PolicyError(
-                f"{path} cannot be exported: its {what} is {', '.join(data[what]['names'])}; this version's is "
-                f"{', '.join(names)}"
+                f"{path} cannot be exported: its {what} is {shortened(list(data[what]['names']))}; this version's is "
+                f"{shortened(list(names))}"
             )
 
 

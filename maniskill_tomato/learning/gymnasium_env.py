@@ -42,8 +42,8 @@ class LearnableTask(gym.Wrapper[Array, Array, Array, Array]):
         """Wraps `env`.
 
         Args:
-            env: One environment with arrays of shape (9,) and (6,), such as ManiSkill's CPUGymWrapper makes.
-            action_scale: The action that 1 stands for, in [m] and [rad]. Shape (6,).
+            env: One environment with arrays of shape (D,) and (A,), such as ManiSkill's CPUGymWrapper makes.
+            action_scale: The action that 1 stands for, in the task's units. Shape (A,).
             reward: The task's, or success with V_f as a potential (`learning.rewards.potential_reward`).
             gamma: Discount factor of the learner; only the potential reward uses it.
             step_cost: What each step costs with the potential reward.
@@ -99,7 +99,12 @@ class LearnableTask(gym.Wrapper[Array, Array, Array, Array]):
 
 
 def normalize_observation(observation: Array) -> Array:
-    """The observation in the fixed ranges of the `td3` preset, about -1 to 1. Shape (..., 9)."""
+    """The thesis's nine numbers in the fixed ranges of the `td3` preset, about -1 to 1; others as they are.
+
+    The general tasks' observation is scaled already. Shape (..., D), as given.
+    """
+    if observation.shape[-1] != len(CENTRE):
+        return observation
     normalized: Array = (observation - CENTRE) / HALF_RANGE
     return normalized
 

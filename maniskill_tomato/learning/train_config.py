@@ -6,7 +6,7 @@ from typing import Any, Literal
 
 from maniskill_tomato.errors import InvalidInputError
 
-ExplorationName = Literal["epsilon-greedy", "decaying-gaussian", "look-at-goals"]
+ExplorationName = Literal["epsilon-greedy", "decaying-gaussian", "look-at-goals", "correlated"]
 
 MAY_CHANGE = (
     "total_episodes",
@@ -32,6 +32,7 @@ _AT_LEAST_ONE = (
     "torch_threads",
 )
 _NOT_NEGATIVE = (
+    "actor_starts",
     "hindsight_targets",
     "aux_distance_weight",
     "aux_visibility_weight",
@@ -101,6 +102,10 @@ class TrainConfig:
     """Standard deviation of the noise on target actions, in units of the action scale (TD3: 0.2)."""
     target_noise_clip: float = 0.5
     """Bound of that noise, in units of the action scale."""
+    actor_starts: int = 0
+    """Critic updates before the first update of the actor; a given actor waits for critics that know it."""
+    initial_policy: str | None = None
+    """File of a policy whose actor and normaliser the run begins with, for instance an imitated one."""
     pre_tanh_penalty: float = 0.0
     """Weight of the mean squared actor output before tanh, against saturation."""
     aux_distance_weight: float = 0.0
@@ -140,9 +145,11 @@ class TrainConfig:
     exploration_noise: float = 0.1
     """Standard deviation of the noise at the start, in units of the action scale."""
     exploration_noise_end: float = 0.0
-    """Standard deviation at the end of the schedule (look-at goals), in units of the action scale."""
+    """Standard deviation at the end of the schedule (look-at goals, correlated), in units of the action scale."""
     exploration_goal_share: float = 0.0
     """Share of episodes led through look-at goals at the end of the schedule (look-at goals only)."""
+    exploration_correlation: float = 0.8
+    """Correlation of the noise of one step with that of the step before (correlated only)."""
     exploration_noise_per_env: bool = False
     """Every environment draws its own noise level with each episode, uniformly between exploration_noise_end and
     exploration_noise, instead of the schedule's (FastTD3)."""
@@ -168,7 +175,7 @@ class TrainConfig:
                 raise InvalidInputError(f"{name} must be above 0, got {value}")
         if self.total_episodes is None and self.total_timesteps is None and self.max_minutes is None:
             raise InvalidInputError("set at least one of total_episodes, total_timesteps and max_minutes")
-        for name in ("gamma", "exploration_goal_share"):
+        for name in ("gamma", "exploration_goal_share", "exploration_correlation"):
             if not 0.0 <= getattr(self, name) < 1.0:
                 raise InvalidInputError(f"{name} must be in [0, 1), got {getattr(self, name)}")
         if self.success_threshold_start is not None:
@@ -221,8 +228,8 @@ class TrainConfig:
                 raise InvalidInputError.choice(name, getattr(self, name), allowed)
         if self.exploration_noise_per_env and self.exploration == "epsilon-greedy":
             raise InvalidInputError(
-                "exploration_noise_per_env needs an exploration with noise, decaying-gaussian or look-at-goals; "
-                "epsilon-greedy has none"
+                "exploration_noise_per_env needs an exploration with noise: decaying-gaussian, look-at-goals or "
+                "correlated; epsilon-greedy has none"
             )
 
     @property

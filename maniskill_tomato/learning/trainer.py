@@ -18,7 +18,9 @@ from maniskill_tomato.learning.agent import update
 from maniskill_tomato.learning.checkpoint import make_checkpoint, save_checkpoint
 from maniskill_tomato.learning.env_state import seed_action_spaces
 from maniskill_tomato.learning.envs import LearnerEnv
+from maniskill_tomato.learning.initial_policy import begin_with, check_fits
 from maniskill_tomato.learning.interrupt import StopRequest, stop_on_signals
+from maniskill_tomato.learning.policy import Policy, load_policy
 from maniskill_tomato.learning.presets import TrainConfig
 from maniskill_tomato.learning.progress import Progress, TrainingLog
 from maniskill_tomato.learning.random_state import seed_global_random_state
@@ -100,10 +102,15 @@ class Trainer:
         (action_dim,) = action_space.shape
         if len(config.action_scale) != action_dim:
             raise InvalidInputError(
-                f"action_scale must have {action_dim} values, one per action, got {len(config.action_scale)}"
+                f"action_scale must have {action_dim} values, one per action of {env_id}, got "
+                f"{len(config.action_scale)}; the presets called general-... are for the general tasks"
             )
         if config.wandb_project is not None:
             import_wandb(config.wandb_project)
+        self._given: Policy | None = None
+        if config.initial_policy is not None and not resume:
+            self._given = load_policy(config.initial_policy, env_id=env_id)
+            check_fits(self._given, config, observation_space.shape[0])
         if not resume:
             check_run_dir(run_dir)
         elif not (run_dir / "config.json").is_file():
@@ -157,6 +164,8 @@ class Trainer:
         write_config(self._run_dir, self._env_id, self._seed, self._env_options, self._config.to_dict())
         self._scale = torch.tensor(self._config.action_scale, device=observations.device)
         self._start = self._checkpoint_time = time.perf_counter()
+        if self._given is not None:
+            begin_with(state.agent, self._given)
         if saved is not None:
             state.restore(saved)
             self._checkpoint_step = state.step

@@ -12,6 +12,12 @@ from maniskill_tomato.visibility.situation import Situation
 NEAR_ENOUGH = 0.01
 """A goal within this distance is reached, in [m]."""
 
+TAKEN = 0.25 * MAX_MOVE
+"""Cameras this near to each other, in [m], have the same view."""
+
+REFUSED_ANGLE = math.radians(30.0)
+"""Moves from one place within this angle of a refused one are taken to be refused too."""
+
 
 def move_towards(position: Tensor, target: Tensor, goal: Tensor) -> Tensor:
     """The action that moves the camera straight to a goal, or a full move of the way there.
@@ -98,9 +104,11 @@ class Goals:
 
 
 class Candidates:
-    """Which candidate of the lattice each environment goes to, and which ones the arm refused in the episode.
+    """Which candidate of the lattice each environment goes to, and which ones are not tried any more.
 
-    A candidate towards which the camera moved less than a tenth of a move is not tried again.
+    A view that was taken, or one within `TAKEN` of it, is not taken again: it was not enough. A candidate towards which
+    the camera moved less than a tenth of a move is not tried again in the episode. Nor is, until the camera has moved,
+    any other one that lies within `REFUSED_ANGLE` of that direction: the arm would refuse nearly the same move.
     """
 
     def __init__(self) -> None:
@@ -109,6 +117,8 @@ class Candidates:
         self.chosen = torch.zeros(0, dtype=torch.int64)
         """Shape (B,)."""
         self._before = torch.zeros(0, 3)
+        self._direction = torch.zeros(0, 3)
+        self._refused_directions: list[list[Tensor]] = []
 
     def begin(self, situation: Situation, env_idx: Tensor) -> None:
         """Forgets the episodes of some environments."""
@@ -116,17 +126,25 @@ class Candidates:
             self.refused = torch.zeros_like(situation.reachable)
             self.chosen = torch.zeros_like(situation.reachable[:, 0], dtype=torch.int64)
             self._before = torch.full_like(situation.camera_position, math.nan)
+            self._direction = torch.zeros_like(situation.camera_position)
+            self._refused_directions = [[] for _ in range(len(self.chosen))]
         self.refused[env_idx] = False
         self._before[env_idx] = math.nan
+        for i in env_idx.tolist():
+            self._refused_directions[i].clear()
 
     def note_refusals(self, situation: Situation) -> None:
         """Looks whether the last moves were made; to be called before the next choice."""
         stuck = (situation.camera_position - self._before).norm(dim=-1) < 0.1 * MAX_MOVE
-        rows = torch.nonzero(stuck)[:, 0]
-        self.refused[rows, self.chosen[rows]] = True
+        for i, stayed in enumerate(stuck.tolist()):
+            if stayed:
+                self.refused[i, self.chosen[i]] = True
+                self._refused_directions[i].append(self._direction[i].clone())
+            else:
+                self._refused_directions[i].clear()
 
     def move_to_best(self, situation: Situation, positions: Tensor, worth: Tensor, allowed: Tensor) -> Tensor:
-        """The moves towards the best candidates that are allowed and were not refused.
+        """The moves towards the best candidates that are allowed, were not taken and not refused.
 
         Args:
             situation: What is known.
@@ -138,7 +156,19 @@ class Candidates:
             Shape (B, 3).
         """
         position = situation.camera_position
-        self.chosen = torch.where(allowed & ~self.refused, worth, -math.inf).argmax(dim=1)
+        directions = torch.nn.functional.normalize(positions - position[:, None], dim=-1)
+        # A missing view is NaN.
+        most = max(int(situation.memory.visits.max()), 1)
+        gap = torch.cdist(positions, situation.memory.visited[:, :most]).nan_to_num(1.0e3).amin(dim=-1)
+        allowed = allowed & ~self.refused & (gap > TAKEN)
+        for i, refused in enumerate(self._refused_directions):
+            if refused:
+                near = (directions[i] @ torch.stack(refused).mT).amax(dim=-1) > math.cos(REFUSED_ANGLE)
+                # Where all directions were refused, those of the other candidates are tried after all.
+                if bool((allowed[i] & ~near).any()):
+                    allowed[i] &= ~near
+        self.chosen = torch.where(allowed, worth, -math.inf).argmax(dim=1)
         self._before = position.clone()
         rows = torch.arange(len(position), device=position.device)
+        self._direction = directions[rows, self.chosen]
         return move_towards(position, situation.target_position, positions[rows, self.chosen])

@@ -10,9 +10,11 @@ from maniskill_tomato.planners.baselines import FixedSweep, LookAtServoing, Rand
 from maniskill_tomato.planners.deep_move_to_see import DeepMoveToSee
 from maniskill_tomato.planners.gradient_view import GradientView
 from maniskill_tomato.planners.greedy_truth import GreedyTruth
+from maniskill_tomato.planners.lattice_oracle import LatticeOracle
 from maniskill_tomato.planners.move_to_see import MoveToSee, MoveToSeeOnMemory
 from maniskill_tomato.planners.next_best_view import NextBestDirection, NextBestView
 from maniskill_tomato.planners.oracle import AcceptWay, Oracle, OracleSearch
+from maniskill_tomato.planners.view_quality import ViewQuality
 
 
 class _Setting:
@@ -52,15 +54,17 @@ _MAKERS: dict[str, Callable[[_Setting], Planner]] = {
     GradientView.name: lambda s: GradientView(s.device),
     NextBestDirection.name: lambda s: NextBestDirection(s.device),
     NextBestView.name: lambda s: NextBestView(s.device),
+    ViewQuality.name: lambda s: ViewQuality.shipped(s.device),
     MoveToSee.name: lambda s: MoveToSee(s.truth, s.device),
     GreedyTruth.name: lambda s: GreedyTruth(s.truth, s.device),
+    LatticeOracle.name: lambda s: LatticeOracle(s.truth, s.threshold),
     Oracle.name: lambda s: Oracle(OracleSearch(s.truth, s.threshold, s.device, accept=s.accept_way)),
 }
 
 PLANNERS = tuple(_MAKERS)
 """All names."""
 
-PRIVILEGED = (MoveToSee.name, GreedyTruth.name, Oracle.name)
+PRIVILEGED = (MoveToSee.name, GreedyTruth.name, LatticeOracle.name, Oracle.name)
 """Those that know the truth."""
 
 

@@ -21,7 +21,6 @@ from maniskill_tomato.planners.base import Planner
 from maniskill_tomato.planners.moves import Candidates, moves_needed
 from maniskill_tomato.planners.quality_features import MAP_CHANNELS, SCALARS, quality_features
 from maniskill_tomato.planners.quality_network import ViewQualityNetwork
-from maniskill_tomato.robot.look_at_move import MAX_MOVE
 from maniskill_tomato.visibility.situation import Situation
 from maniskill_tomato.visibility.view_lattice import DISTANCES
 
@@ -63,6 +62,24 @@ class ViewQuality(Planner):
         self.facts = facts or {}
         self.tried = Candidates()
 
+    @classmethod
+    def shipped(cls, device: str | torch.device = "cpu") -> "ViewQuality":
+        """The policy that ships with the package.
+
+        Raises:
+            InvalidInputError: None ships with this version.
+        """
+        from maniskill_tomato.assets import asset_path
+
+        try:
+            path = asset_path("policies/TomatoViewpoint-v1.pt")
+        except FileNotFoundError as error:
+            raise InvalidInputError(
+                "no view-quality policy ships with this version; train one with scripts/train_view_quality.py and give "
+                "its file"
+            ) from error
+        return load_view_quality(path, device)
+
     def begin(self, situation: Situation, env_idx: Tensor) -> None:
         self.tried.begin(situation, env_idx)
 
@@ -80,9 +97,7 @@ class ViewQuality(Planner):
         candidates = situation.lattice.positions(target)
         way = (candidates - position[:, None]).norm(dim=-1)
         worth = self.config.patience * self.success_probability(situation) - moves_needed(way)
-        # A view from here has been taken.
-        allowed = situation.reachable & (way > 0.25 * MAX_MOVE)
-        return self.tried.move_to_best(situation, candidates, worth, allowed)
+        return self.tried.move_to_best(situation, candidates, worth, situation.reachable)
 
 
 def save_view_quality(path: Path, policy: ViewQuality) -> None:

@@ -7,14 +7,13 @@ from typing import Any
 
 import maniskill_tomato
 from maniskill_tomato.errors import PolicyError
-from maniskill_tomato.policy.layout import ACTION_NAMES, ACTION_UNITS, OBSERVATION_NAMES, OBSERVATION_UNITS
+from maniskill_tomato.policy.layout import layout_of
 
 FORMAT = 1
 """Version of the layout that `PolicyDescription.to_json` writes."""
 
 INPUT_NAME = "observation"
 OUTPUT_NAME = "action"
-FRAME = "world = robot base, z up, x towards the plant; fixed-axis R = Rz(yaw) Ry(pitch) Rx(roll)"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -23,7 +22,7 @@ class Component:
 
     name: str
     unit: str
-    """m or rad."""
+    """Such as m or rad."""
     low: float | None
     """Smallest value; None if the task sets none."""
     high: float | None
@@ -52,7 +51,7 @@ class PolicyDescription:
     default_plant: dict[str, Any] | None
     """The task's own plant and where it stands, or None; `trained_with` says whether another was used."""
     observation: tuple[Component, ...]
-    """The input, in order; world frame."""
+    """The input, in order; in the frame of `PolicyLayout`."""
     normalizer_centre: tuple[float, ...]
     """What the normaliser, which is part of the graph, maps to 0."""
     normalizer_half_range: tuple[float, ...]
@@ -61,7 +60,7 @@ class PolicyDescription:
     """Where both come from: `none` (the identity), `fixed` ranges, or the `running` mean and standard deviation of
     the training's observations; `unknown` in files that do not say."""
     action: tuple[ActionComponent, ...]
-    """The output, in order: increments of the end-effector pose."""
+    """The output, in order; `PolicyLayout.action_meaning` says what it does."""
     training: dict[str, Any]
     """Algorithm, seed, steps and episodes of its training, and the SHA-256 of its configuration."""
     onnx_sha256: str
@@ -72,6 +71,7 @@ class PolicyDescription:
 
     def to_json(self) -> str:
         """The file's text."""
+        layout = layout_of(self.env_id)
         content = {
             "format": FORMAT,
             "package_version": self.package_version,
@@ -85,7 +85,7 @@ class PolicyDescription:
                 "input": INPUT_NAME,
                 "dtype": "float32",
                 "shape": ["batch", len(self.observation)],
-                "frame": FRAME,
+                "frame": layout.frame,
                 "components": [asdict(c) for c in self.observation],
             },
             "normalizer": {
@@ -99,7 +99,7 @@ class PolicyDescription:
                 "output": OUTPUT_NAME,
                 "dtype": "float32",
                 "shape": ["batch", len(self.action)],
-                "meaning": "added to the end-effector's x, y, z, roll, pitch, yaw",
+                "meaning": layout.action_meaning,
                 "scale_and_bounds_part_of_the_graph": True,
                 "components": [asdict(c) for c in self.action],
             },
@@ -160,19 +160,25 @@ class PolicyDescription:
         Raises:
             PolicyError: Names, units or their order differ, or the normaliser has another length.
         """
+        layout = layout_of(self.env_id)
         for what, components, names, units in (
-            ("observation", self.observation, OBSERVATION_NAMES, OBSERVATION_UNITS),
-            ("action", self.action, ACTION_NAMES, ACTION_UNITS),
+            ("observation", self.observation, layout.observation_names, layout.observation_units),
+            ("action", self.action, layout.action_names, layout.action_units),
         ):
             given = [f"{c.name} [{c.unit}]" for c in components]
             wanted = [f"{name} [{unit}]" for name, unit in zip(names, units, strict=True)]
             if given != wanted:
                 raise PolicyError(
-                    f"its {what} is {', '.join(given)}; this version's is {', '.join(wanted)}: "
+                    f"its {what} is {shortened(given)}; this version's is {shortened(wanted)}: "
                     "export the policy with this version"
                 )
         if not len(self.normalizer_centre) == len(self.normalizer_half_range) == len(self.observation):
             raise PolicyError(f"its normaliser must have {len(self.observation)} centres and half ranges")
+
+
+def shortened(names: list[str]) -> str:
+    """A list for a message; of a long one the beginning."""
+    return ", ".join(names) if len(names) <= 9 else f"{', '.join(names[:3])}, ... ({len(names)} values)"
 
 
 def _component(entry: dict[str, Any]) -> dict[str, Any]:

@@ -18,6 +18,8 @@ from mani_skill.sensors.camera import CameraConfig
 from maniskill_tomato.errors import InvalidInputError
 from maniskill_tomato.robot import d435, iiwa14, urdf
 from maniskill_tomato.robot.description import urdf_path
+from maniskill_tomato.robot.iiwa14 import READY_QPOS as READY_QPOS
+from maniskill_tomato.robot.iiwa14 import REST_QPOS as REST_QPOS
 from maniskill_tomato.robot.look_at_controller import LookAtControllerConfig
 from maniskill_tomato.robot.viewpoint_controller import ViewpointControllerConfig
 
@@ -38,12 +40,6 @@ ROTATION_STEP = 0.1
 
 MAX_REACH = 1.306
 """Bound on each coordinate of a `pd_ee_pose` action, in [m]: the height of the stretched arm."""
-
-READY_QPOS = np.deg2rad([0.0, -49.93516285858080, 0.0, -97.54595928557242, 0.0, 42.38920357300838, 0.0])
-"""The flange at (0.1, 0, 0.9) m, looking along +x with the picture upright and the elbow behind, in [rad]."""
-
-REST_QPOS = np.deg2rad([0.0, -30.0, 0.0, -115.0, 0.0, 95.0, 0.0])
-"""Folded over the base, looking down, in [rad]."""
 
 
 @dataclass

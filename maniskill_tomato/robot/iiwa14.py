@@ -104,3 +104,11 @@ MODIFIED_DH: Final = _constant(
 
 HOME_QPOS: Final = _constant(np.zeros(7))
 """Home configuration: the arm stands straight up, flange at z = 1.306 m, in [rad]. Shape (7,)."""
+
+READY_QPOS: Final = _constant(
+    np.deg2rad([0.0, -49.93516285858080, 0.0, -97.54595928557242, 0.0, 42.38920357300838, 0.0])
+)
+"""The flange at (0.1, 0, 0.9) m, looking along +x with the picture upright and the elbow behind, in [rad]."""
+
+REST_QPOS: Final = _constant(np.deg2rad([0.0, -30.0, 0.0, -115.0, 0.0, 95.0, 0.0]))
+"""Folded over the base, looking down, in [rad]."""

@@ -14,6 +14,7 @@ from functools import lru_cache
 from typing import Any, Final
 
 import numpy as np
+import numpy.typing as npt
 import torch
 import warp as wp
 from torch import Tensor
@@ -26,7 +27,6 @@ from maniskill_tomato.robot.inverse_kinematics import InverseKinematics, Reach
 from maniskill_tomato.robot.kinematics import RecordedLaunch
 from maniskill_tomato.robot.look_at import (
     CAMERA_ROLLS,
-    camera_to_flange,
     look_at_pose,
     look_frame,
 )
@@ -93,18 +93,25 @@ def keeps_clear(T_world_flange: Tensor) -> Tensor:
 class LookAtMover:
     """Solves moves on one device; not for use from several threads at once."""
 
-    def __init__(self, device: str | torch.device = "cpu") -> None:
+    def __init__(
+        self,
+        device: str | torch.device = "cpu",
+        T_flange_camera: npt.NDArray[np.float64] = T_flange_camera_color_optical,
+    ) -> None:
         """Prepares the inverse kinematics.
 
         Args:
             device: Where tensors live.
+            T_flange_camera: The camera's optical frame in `link_ee`, such as a calibration found it. Shape (4, 4).
         """
         self._inverse_kinematics = InverseKinematics(device=device)
         device = self._inverse_kinematics.device
+        inverse = np.asarray(np.linalg.inv(T_flange_camera), dtype=np.float64)
+        self._T_camera_flange = torch.as_tensor(inverse, dtype=torch.float64, device=device)
         self._rolls = torch.tensor(CAMERA_ROLLS, dtype=torch.float64, device=device)
         # Upright first, then 30 degrees to either side, 60, ...; between the two sides the joints decide.
         self._rank = (self._rolls.abs() * (180.0 / torch.pi / 30.0)).round()
-        self._kept_launch = lru_cache(maxsize=16)(lambda batch: _UprightLaunch(batch, device))
+        self._kept_launch = lru_cache(maxsize=16)(lambda batch: _UprightLaunch(batch, device, inverse))
         self._shares = torch.tensor(MOVE_SHARES, dtype=torch.float64, device=device)
 
     def move(self, qpos: Tensor, position: Tensor, target: Tensor, action: Tensor) -> LookAtMove:
@@ -171,7 +178,7 @@ class LookAtMover:
         rolls = len(CAMERA_ROLLS) if rolls is None else rolls
         b = len(qpos)
         T_world_camera = look_at_pose(position[:, None], target[:, None], self._rolls[:rolls])
-        T_world_flange = camera_to_flange(T_world_camera).reshape(-1, 4, 4)
+        T_world_flange = (T_world_camera @ self._T_camera_flange).reshape(-1, 4, 4)
         reference = qpos.double()[:, None].expand(b, rolls, NUM_JOINTS)
         solution = self._inverse_kinematics.solve(
             T_world_flange, reference.reshape(-1, NUM_JOINTS), neighbour=False
@@ -194,7 +201,7 @@ class LookAtMover:
 class _UprightLaunch:
     """The kernel of full moves with the picture upright for one batch size, with its tensors."""
 
-    def __init__(self, batch: int, device: torch.device) -> None:
+    def __init__(self, batch: int, device: torch.device, T_camera_flange: npt.NDArray[np.float64]) -> None:
         def zeros(*shape: int) -> Tensor:
             return torch.zeros(batch, *shape, dtype=torch.float64, device=device)
 
@@ -202,7 +209,7 @@ class _UprightLaunch:
         self._poses = [zeros(4, 4) for _ in range(2)]
         vectors: list[Any] = [wp.from_torch(tensor, dtype=wp.vec3d) for tensor in self._inputs]
         poses: list[Any] = [wp.from_torch(tensor, dtype=wp.mat44d) for tensor in self._poses]
-        mount: Any = wp.mat44d(*np.linalg.inv(T_flange_camera_color_optical).ravel())
+        mount: Any = wp.mat44d(*T_camera_flange.ravel())
         # The launch keeps addresses: what they point to must stay alive with it.
         self._arguments = [*vectors, wp.float64(MAX_MOVE), wp.float64(MIN_DISTANCE), mount, *poses]
         self._launch = RecordedLaunch(look_at_kernels.upright_move, batch, device, self._arguments)

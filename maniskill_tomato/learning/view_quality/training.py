@@ -1,21 +1,19 @@
 """From nothing to a view-quality policy: rounds of episodes and fits, kept in a folder and continued from there."""
 
-import io
 import json
 import logging
-import multiprocessing
 import time
 from collections.abc import Callable
-from concurrent.futures import Future, ProcessPoolExecutor, as_completed
 from dataclasses import asdict, dataclass, field, fields
 from pathlib import Path
 from typing import Any
 
-import torch
+from torch import Tensor
 
 import maniskill_tomato
 from maniskill_tomato.errors import CheckpointError, InvalidInputError
-from maniskill_tomato.files import read_tensors, write_atomically
+from maniskill_tomato.files import write_atomically
+from maniskill_tomato.learning.blocks import Block, run_blocks
 from maniskill_tomato.learning.envs import make_env
 from maniskill_tomato.learning.view_quality.collect import QualityData, collect_episodes
 from maniskill_tomato.learning.view_quality.fit import FitConfig, fit
@@ -94,25 +92,31 @@ def train_view_quality(
     options = env_options or {}
     count = -(-config.validation_episodes // config.block)
     validation_plan = [
-        _Block(
-            out / f"validation-{b}.pt", VALIDATION_SEED + b * config.block, config.block, "validation", None
+        _block(
+            out / f"validation-{b}.pt",
+            VALIDATION_SEED + b * config.block,
+            config.block,
+            "validation",
+            None,
+            options,
         )
         for b in range(count)
     ]
     network: ViewQualityNetwork | None = None
-    plan: list[_Block] = []
+    plan: list[Block] = []
     for number, episodes in enumerate(config.rounds):
         policy_path = out / f"round-{number}.pt"
         before = None if number == 0 else out / f"round-{number - 1}.pt"
         first = (config.seed * len(config.rounds) + number) * max(config.rounds)
         plan += [
-            _Block(
+            _block(
                 out / f"train-{number}-{b}.pt",
                 first + b * config.block,
                 config.block,
                 "train",
                 # A quarter of the blocks meets new plants only.
                 None if b % 4 == 3 else config.pool,
+                options,
                 before,
             )
             for b in range(-(-episodes // config.block))
@@ -120,7 +124,7 @@ def train_view_quality(
         if policy_path.is_file():
             network = load_view_quality(policy_path).network
             continue
-        _run_blocks([*validation_plan, *plan], options, jobs, report)
+        run_blocks([*validation_plan, *plan], jobs, report)
         data, validation = _load(plan), _load(validation_plan)
         report(f"round {number}: {len(data.scalars)} looks in {len(data.reachable)} episodes")
         network = fit(
@@ -147,49 +151,37 @@ def train_view_quality(
     return path
 
 
-@dataclass(frozen=True)
-class _Block:
-    path: Path
-    first: int
-    episodes: int
-    split: str
-    pool: int | None
-    policy: Path | None = None
+def _block(
+    path: Path,
+    first: int,
+    episodes: int,
+    split: str,
+    pool: int | None,
+    options: dict[str, Any],
+    policy: Path | None = None,
+) -> Block:
+    return Block(path=path, make=_collect, arguments=(first, episodes, split, pool, options, policy))
 
 
-def _run_blocks(
-    blocks: list[_Block], options: dict[str, Any], jobs: int, report: Callable[[str], None]
-) -> None:
-    missing = [block for block in blocks if not block.path.is_file()]
-    # ManiSkill and Warp start once in each process, which must not be a fork of one that has them.
-    with ProcessPoolExecutor(jobs, mp_context=multiprocessing.get_context("spawn")) as pool:
-        futures: dict[Future[int], _Block] = {
-            pool.submit(_run_block, block, options): block for block in missing
-        }
-        for done, future in enumerate(as_completed(futures), start=1):
-            report(f"{futures[future].path.name}: {future.result()} looks ({done} of {len(missing)} blocks)")
-
-
-def _run_block(block: _Block, options: dict[str, Any]) -> int:
-    torch.set_num_threads(1)
-    network = None if block.policy is None else load_view_quality(block.policy).network
-    plant = {"seed": block.split, "pool": block.pool, **dict(options.get("plant", {}))}
+def _collect(
+    first: int, episodes: int, split: str, pool: int | None, options: dict[str, Any], policy: Path | None
+) -> dict[str, Tensor]:
+    """Episodes of seeds from `first` on, in whatever process this is."""
+    network = None if policy is None else load_view_quality(policy).network
+    plant = {"seed": split, "pool": pool, **dict(options.get("plant", {}))}
     env = make_env(ENV_ID, **{**options, "plant": plant})
     try:
-        data = collect_episodes(env, range(block.first, block.first + block.episodes), network)
+        data = collect_episodes(env, range(first, first + episodes), network)
     finally:
         env.close()
-    buffer = io.BytesIO()
-    torch.save({f.name: getattr(data, f.name) for f in fields(QualityData)}, buffer)
-    write_atomically(block.path, buffer.getvalue())
-    return len(data.scalars)
+    return {f.name: getattr(data, f.name) for f in fields(QualityData)}
 
 
-def _load(blocks: list[_Block]) -> QualityData:
+def _load(blocks: list[Block]) -> QualityData:
     parts = []
     for block in blocks:
         try:
-            parts.append(QualityData(**read_tensors(block.path)))
+            parts.append(QualityData(**block.read()))
         except TypeError as error:
             raise CheckpointError(f"{block.path} holds no looks: {error}; delete it and go on") from error
     return QualityData.join(parts)

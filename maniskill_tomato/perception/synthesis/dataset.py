@@ -21,9 +21,9 @@ from maniskill_tomato.files import write_atomically
 from maniskill_tomato.perception.annotations import AnnotatedImage, AnnotatedImages, CameraView, joined
 from maniskill_tomato.perception.coco import read_coco, write_coco
 from maniskill_tomato.perception.voc import write_voc
+from maniskill_tomato.plants.choice import SEED_SPLITS
 from maniskill_tomato.rendering import NO_RENDERING_HINT, rendering_available
 from maniskill_tomato.robot.d435 import color_intrinsics
-from maniskill_tomato.tasks.plant_choice import SEED_SPLITS
 
 logger = logging.getLogger(__name__)
 

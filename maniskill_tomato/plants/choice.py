@@ -188,3 +188,7 @@ class PlantPose:
     def as_array(self) -> NDArray[np.float64]:
         """(x, y, yaw). Shape (3,)."""
         return np.array([self.x, self.y, self.yaw])
+
+
+ROW_PLANT = PlantChoice(preset="full", leaf_density=(0.8, 1.8), row=True)
+"""The kind of plant of the general tasks and their lists of episodes; a seed or a split says which."""

@@ -1,0 +1,123 @@
+"""A calibration in one picture: where corners are off, by view, and where each view alone puts the board."""
+
+import io
+from pathlib import Path
+from typing import Any
+
+import matplotlib
+import numpy as np
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+
+from maniskill_tomato.deploy.calibration.hand_eye import HandEyeResult
+from maniskill_tomato.deploy.calibration.rigid import difference
+from maniskill_tomato.files import write_atomically
+from maniskill_tomato.robot.d435 import CameraIntrinsics, T_flange_camera_color_optical
+
+ARROW_LENGTH = 12.0
+"""So long is the arrow of a residual of the root mean square, in [px]."""
+
+
+def draw_calibration(path: Path, result: HandEyeResult, intrinsics: CameraIntrinsics) -> None:
+    """Writes the picture as PNG.
+
+    Args:
+        path: The file.
+        result: What is drawn.
+        intrinsics: Of the colour pictures.
+
+    Raises:
+        CheckpointError: It cannot be written.
+    """
+    figure = Figure(figsize=(14, 8.4), layout="constrained")
+    FigureCanvasAgg(figure)
+    grid: Any = figure.add_gridspec(2, 3, height_ratios=(1.5, 1.0))
+    colors = matplotlib.colormaps["turbo"](np.linspace(0.05, 0.95, len(result.views)))
+    _arrows(figure.add_subplot(grid[0, :2]), result, intrinsics, colors)
+    _cloud(figure.add_subplot(grid[0, 2]), result, colors)
+    _bars(figure.add_subplot(grid[1, 0]), result, colors)
+    _boards(figure.add_subplot(grid[1, 1]), result, colors)
+    _words(figure.add_subplot(grid[1, 2]), result)
+    content = io.BytesIO()
+    figure.savefig(content, format="png", dpi=90)
+    write_atomically(path, content.getvalue())
+
+
+def _arrows(axes: Any, result: HandEyeResult, intrinsics: CameraIntrinsics, colors: Any) -> None:
+    # A round number, so that the title tells it.
+    wanted = ARROW_LENGTH / max(result.rms_px, 1e-6)
+    times = min((1, 2, 5, 10, 20, 50, 100, 200, 500, 1000), key=lambda t: abs(np.log(t / wanted)))
+    for view, residuals, color in zip(result.views, result.residuals_px, colors, strict=True):
+        u, v = view.corners_px.T
+        axes.quiver(
+            u,
+            v,
+            residuals[:, 0],
+            residuals[:, 1],
+            color=color,
+            angles="xy",
+            scale_units="xy",
+            scale=1.0 / times,
+            width=0.002,
+        )
+    axes.set(
+        xlim=(0, intrinsics.width),
+        ylim=(intrinsics.height, 0),
+        aspect="equal",
+        xlabel="column (px)",
+        ylabel="row (px)",
+        title=f"Seen less predicted corners, {times} times as long; one colour a view",
+    )
+
+
+def _cloud(axes: Any, result: HandEyeResult, colors: Any) -> None:
+    for residuals, color in zip(result.residuals_px, colors, strict=True):
+        axes.plot(*residuals.T, ".", color=color, markersize=3)
+    reach = 1.1 * max(float(np.abs(np.concatenate(result.residuals_px)).max()), 0.05)
+    axes.axhline(0, color="0.8", zorder=0)
+    axes.axvline(0, color="0.8", zorder=0)
+    axes.set(
+        xlim=(-reach, reach),
+        ylim=(reach, -reach),
+        aspect="equal",
+        xlabel="column (px)",
+        ylabel="row (px)",
+        title="Residuals of all corners",
+    )
+
+
+def _bars(axes: Any, result: HandEyeResult, colors: Any) -> None:
+    rms = [float(np.sqrt(np.mean(np.sum(r**2, axis=1)))) for r in result.residuals_px]
+    axes.bar(np.arange(len(rms)), rms, color=colors)
+    axes.axhline(result.rms_px, color="black", linewidth=0.8, linestyle="--")
+    axes.set(xlabel="view", ylabel="RMS (px)", title="Each view; dashed: all")
+
+
+def _boards(axes: Any, result: HandEyeResult, colors: Any) -> None:
+    offsets = 1000.0 * result.board_offsets
+    numbers = np.arange(len(offsets))
+    for k, (name, marker) in enumerate(zip("xyz", "osD", strict=True)):
+        axes.plot(numbers, offsets[:, k], marker, label=f"{name} (mm)", markersize=4)
+    axes.plot(numbers, 10.0 * np.degrees(result.board_turns), "k+", label="turn (0.1 degrees)")
+    axes.axhline(0, color="0.8", zorder=0)
+    axes.legend(ncols=4, fontsize=7, loc="upper center")
+    axes.margins(y=0.35)
+    axes.set(xlabel="view", title="The board by each view alone, less that by all")
+
+
+def _words(axes: Any, result: HandEyeResult) -> None:
+    distance, angle = difference(T_flange_camera_color_optical, result.T_flange_camera)
+    x, y, z = 1000.0 * result.T_flange_camera[:3, 3]
+    lines = [
+        f"{len(result.views)} views, {sum(len(r) for r in result.residuals_px)} corners, RMS {result.rms_px:.3f} px",
+        "",
+        "camera in link_ee (optical frame)",
+        f"  x {x:.2f}   y {y:.2f}   z {z:.2f} mm",
+        f"  standard deviation {1000 * result.position_std:.3f} mm, {np.degrees(result.rotation_std):.4f} deg",
+        f"  from the drawing {1000 * distance:.1f} mm, {np.degrees(angle):.2f} deg",
+        "",
+        f"left out: {len(result.left_out)}",
+        *(f"  {text}" for text in result.left_out[:5]),
+    ]
+    axes.axis("off")
+    axes.text(0.0, 0.98, "\n".join(lines), va="top", family="monospace", fontsize=9)

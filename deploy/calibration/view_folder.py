@@ -1,0 +1,134 @@
+"""A folder of views: pictures of the board, `views.json` with the joint angles and the camera's intrinsics."""
+
+import json
+import math
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any, Final
+
+import cv2
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from maniskill_tomato.deploy.calibration.board import CharucoBoard
+from maniskill_tomato.deploy.calibration.hand_eye import BoardView, CalibrationError
+from maniskill_tomato.deploy.interface import Float64
+from maniskill_tomato.errors import InvalidInputError
+from maniskill_tomato.files import write_atomically
+from maniskill_tomato.robot.d435 import CameraIntrinsics
+from maniskill_tomato.robot.iiwa14 import JOINT_UPPER, NUM_JOINTS
+from maniskill_tomato.robot.kinematics import forward_kinematics
+
+INDEX_NAME: Final = "views.json"
+
+LARGEST_INDEX_BYTES: Final = 1_000_000
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class RecordedView:
+    """One picture and where the arm was."""
+
+    name: str
+    """File name of the picture."""
+    color: NDArray[np.uint8]
+    """RGB. Shape (H, W, 3)."""
+    joint_positions: Float64
+    """In [rad]. Shape (7,)."""
+
+
+def flange_pose(joint_positions: Float64) -> Float64:
+    """`link_ee` in the base frame at joint angles in [rad]. Shape (7,) to (4, 4)."""
+    return np.asarray(forward_kinematics(torch.from_numpy(np.array(joint_positions))).numpy(), np.float64)
+
+
+def board_view(board: CharucoBoard, view: RecordedView) -> BoardView:
+    """What a picture shows of the board."""
+    ids, pixels = board.find(view.color)
+    return BoardView(
+        name=view.name,
+        T_base_flange=flange_pose(view.joint_positions),
+        corner_ids=ids,
+        corners_px=pixels,
+    )
+
+
+def write_views(
+    folder: Path, views: Sequence[RecordedView], intrinsics: CameraIntrinsics, serial: str = ""
+) -> None:
+    """Writes pictures and index; called again with one view more, it writes what is new.
+
+    Raises:
+        CheckpointError: The folder cannot be written.
+    """
+    for view in views:
+        path = folder / view.name
+        if not path.exists():
+            _, png = cv2.imencode(".png", cv2.cvtColor(view.color, cv2.COLOR_RGB2BGR))
+            write_atomically(path, png.tobytes())
+    index = {
+        "serial": serial,
+        "intrinsics": asdict(intrinsics),
+        "views": [{"image": v.name, "joint_positions": v.joint_positions.tolist()} for v in views],
+    }
+    write_atomically(folder / INDEX_NAME, json.dumps(index, indent=1).encode())
+
+
+def read_views(folder: Path) -> tuple[list[RecordedView], CameraIntrinsics, str]:
+    """Views, intrinsics and the camera's serial number.
+
+    Raises:
+        CalibrationError: A file is missing or broken; the message names it and its key.
+    """
+    path = folder / INDEX_NAME
+    try:
+        if path.stat().st_size > LARGEST_INDEX_BYTES:
+            raise CalibrationError(f"{path} is larger than {LARGEST_INDEX_BYTES} bytes")
+        index = json.loads(path.read_text())
+    except FileNotFoundError as error:
+        raise CalibrationError(
+            f"no {INDEX_NAME} in {folder}; it holds intrinsics and, for each picture, image and joint_positions"
+        ) from error
+    except (OSError, ValueError, RecursionError) as error:
+        raise CalibrationError(f"{path} cannot be read: {error}") from error
+    if not isinstance(index, dict) or not isinstance(index.get("views"), list):
+        raise CalibrationError(f"{path} must hold a table with a list `views`")
+    try:
+        intrinsics = CameraIntrinsics(**index["intrinsics"])
+        if not all(math.isfinite(v) for v in (intrinsics.cx, intrinsics.cy)):
+            raise InvalidInputError("cx and cy must be finite")
+    except (KeyError, TypeError, InvalidInputError) as error:
+        raise CalibrationError(
+            f"{path}: intrinsics must have width, height, fx, fy, cx, cy ({error})"
+        ) from error
+    views = [_read_view(folder, entry, k, intrinsics) for k, entry in enumerate(index["views"])]
+    return views, intrinsics, str(index.get("serial", ""))
+
+
+def _read_view(folder: Path, entry: Any, k: int, intrinsics: CameraIntrinsics) -> RecordedView:
+    where = f"{folder / INDEX_NAME}: views[{k}]"
+    if not isinstance(entry, dict) or not isinstance(entry.get("image"), str):
+        raise CalibrationError(f"{where} must have a string `image` and `joint_positions`")
+    try:
+        joints = np.array(entry["joint_positions"], dtype=np.float64)
+    except (KeyError, TypeError, ValueError) as error:
+        raise CalibrationError(f"{where}.joint_positions must be {NUM_JOINTS} numbers") from error
+    if joints.shape != (NUM_JOINTS,) or not np.all(np.abs(joints) <= JOINT_UPPER + 0.02):
+        raise CalibrationError(
+            f"{where}.joint_positions must be {NUM_JOINTS} angles within the joint limits, in radians; got "
+            f"{entry['joint_positions']}"
+        )
+    name = entry["image"]
+    if Path(name).name != name:
+        raise CalibrationError(f"{where}.image must be a file of this folder, got {name!r}")
+    picture = cv2.imread(str(folder / name), cv2.IMREAD_COLOR)
+    if picture is None:
+        raise CalibrationError(f"{where}.image: {folder / name} is no readable picture")
+    if picture.shape[:2] != (intrinsics.height, intrinsics.width):
+        raise CalibrationError(
+            f"{where}.image is {picture.shape[1]} x {picture.shape[0]} px, the intrinsics are of "
+            f"{intrinsics.width} x {intrinsics.height}"
+        )
+    color = np.asarray(cv2.cvtColor(picture, cv2.COLOR_BGR2RGB), dtype=np.uint8)
+    return RecordedView(name=name, color=color, joint_positions=joints)

@@ -1,0 +1,153 @@
+"""What `deploy check` looks at before a first run: profile, devices, limits, policy, one picture."""
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+
+from maniskill_tomato.deploy.capture import Capture
+from maniskill_tomato.deploy.errors import DeployError, RecordingError
+from maniskill_tomato.deploy.interface import JointMove
+from maniskill_tomato.deploy.observing import Observing
+from maniskill_tomato.deploy.policies import decide, default_policy, open_policy
+from maniskill_tomato.deploy.profile import Profile
+from maniskill_tomato.deploy.station import make_station
+from maniskill_tomato.errors import TomatoError
+from maniskill_tomato.files import write_atomically
+from maniskill_tomato.visibility.view_rays import NEAREST_DEPTH
+
+
+@dataclass(frozen=True, kw_only=True)
+class Finding:
+    """One line of the check."""
+
+    what: str
+    good: bool
+    detail: str
+
+    def __str__(self) -> str:
+        return f"{'ok  ' if self.good else 'FAIL'}  {self.what:<12}  {self.detail}"
+
+
+def check(profile: Profile, policy: str | None, seed: int, out: Path | None) -> Iterator[Finding]:
+    """Looks at one thing after the other; nothing moves.
+
+    Args:
+        profile: Which devices.
+        policy: As for `run`.
+        seed: As for `run`.
+        out: Folder for the picture; None to keep none.
+
+    Yields:
+        A finding each; after a device that cannot be used no more of it.
+    """
+    yield Finding(what="profile", good=True, detail=f"{profile.name}: {profile.description}")
+    name = policy or default_policy()
+    opened: Any = None
+    try:
+        opened = open_policy(name, seed)
+        yield Finding(what="policy", good=True, detail=f"{name} ({opened.name})")
+    except TomatoError as error:
+        yield Finding(what="policy", good=False, detail=str(error))
+    try:
+        station = make_station(profile, seed)
+    except TomatoError as error:
+        yield Finding(what="drivers", good=False, detail=str(error))
+        return
+    calibrated = profile.calibrated or station.simulated
+    where = np.round(profile.T_flange_camera[:3, 3] * 1e3, 1).tolist()
+    detail = (
+        f"camera at {where} mm from the flange, {'measured' if profile.calibrated else 'from the drawings'}"
+    )
+    if not calibrated:
+        detail += "; run `maniskill-tomato deploy calibrate`, without it only dry runs are allowed"
+    yield Finding(what="calibration", good=calibrated, detail=detail)
+    joints: Any = None
+    try:
+        with station.arm:
+            yield Finding(what="arm", good=True, detail=_facts(station.arm.describe()))
+            joints = station.guarded_arm.read().joint_positions
+            degrees = ", ".join(f"{v:.1f}" for v in np.rad2deg(joints))
+            yield Finding(what="state", good=True, detail=f"joints at ({degrees}) deg")
+            stay = JointMove(joint_positions=joints, speed_fraction=profile.safety.speed_fraction)
+            refusal = station.guarded_arm.safety.check(stay, station.guarded_arm.read(), station.clock.now())
+            yield Finding(
+                what="limits",
+                good=refusal is None,
+                detail="the arm stands inside the envelope" if refusal is None else str(refusal),
+            )
+            can_stop = station.guarded_arm.can_stop
+            detail = "can be stopped" if can_stop else "only the smartPAD or the emergency stop halts a move"
+            yield Finding(what="stop", good=True, detail=detail)
+            with station.camera:
+                yield from _look(station, profile, joints, opened, out)
+    except DeployError as error:
+        yield Finding(what="device", good=False, detail=str(error))
+
+
+def _look(station: Any, profile: Profile, joints: Any, opened: Any, out: Path | None) -> Iterator[Finding]:
+    yield Finding(what="camera", good=True, detail=_facts(station.camera.describe()))
+    frame = Capture(station.camera, profile.capture, station.clock).take(-np.inf)
+    share = float((frame.depth > 0.0).mean())
+    near = float((frame.depth[frame.depth > 0.0] < 2.0 * NEAREST_DEPTH).mean()) if share else 0.0
+    yield Finding(
+        what="picture",
+        good=True,
+        detail=f"{frame.intrinsics.width} x {frame.intrinsics.height} px, {share:.0%} with depth, {near:.0%} of it "
+        f"nearer than {2.0 * NEAREST_DEPTH:.1f} m",
+    )
+    if out is not None:
+        path = out / "check.png"
+        ok, content = cv2.imencode(".png", frame.color[..., ::-1])
+        try:
+            if ok:
+                write_atomically(path, content.tobytes())
+        except TomatoError as error:
+            raise RecordingError(f"cannot write {path}: {error.__cause__ or error}") from error
+        yield Finding(what="saved", good=True, detail=str(path))
+    observing = Observing(profile.T_flange_camera, profile.loop.max_moves)
+    T_world_camera = observing.camera_pose(joints)
+    target = station.target_position()
+    if target is None:
+        target = station.perception.find_target(frame, T_world_camera)
+    if target is None:
+        yield Finding(
+            what="target", good=False, detail="no ripe fruit in the picture; point the camera at one"
+        )
+        return
+    view = station.perception.look(frame, T_world_camera, target)
+    yield Finding(
+        what="target",
+        good=True,
+        detail=f"at {np.round(target, 3).tolist()} m, V_f {view.visible_fraction:.2f}, {view.fruits_seen} ripe fruits "
+        "in the picture",
+    )
+    if opened is None:
+        return
+    observing.begin(target)
+    situation = observing.observe(joints, view, profile.loop.max_moves)
+    try:
+        import torch
+
+        opened.begin(situation, torch.zeros(1, dtype=torch.int64))
+        action = decide(opened, situation)
+        detail = f"answers {np.round(action, 3).tolist()} (right, up, forward; 1 is 0.12 m)"
+        yield Finding(what="decision", good=True, detail=detail)
+    except TomatoError as error:
+        yield Finding(what="decision", good=False, detail=str(error))
+
+
+def _facts(facts: dict[str, Any]) -> str:
+    return ", ".join(f"{key} {value}" for key, value in facts.items())
+
+
+def print_findings(findings: Iterator[Finding], tell: Callable[[str], object] = print) -> bool:
+    """Tells every finding as it comes; whether all are good."""
+    good = True
+    for finding in findings:
+        tell(str(finding))
+        good &= finding.good
+    return good

@@ -1,0 +1,159 @@
+"""The only way to an arm: every command goes through `Safety`, every state is looked at before it is believed."""
+
+import logging
+from typing import Final
+
+import numpy as np
+
+from maniskill_tomato.deploy.clock import Clock
+from maniskill_tomato.deploy.errors import DeviceTimeoutError, FaultError, RefusedError
+from maniskill_tomato.deploy.interface import Arm, ArmState, Float64, JointMove
+from maniskill_tomato.deploy.safety import Safety
+from maniskill_tomato.robot.iiwa14 import JOINT_LOWER, JOINT_NAMES, JOINT_UPPER, VELOCITY_LIMITS
+
+_logger = logging.getLogger(__name__)
+
+LIMIT_SLACK: Final = np.deg2rad(1.0)
+"""Measured joints may be this far beyond their limits, in [rad]."""
+
+JUMP_SLACK: Final = 0.02
+"""A joint may seem to turn this much beyond what its largest speed allows between two states, in [rad]."""
+
+MOVE_TIME_FACTOR: Final = 3.0
+"""A move may take this many times as long as its speed says, and `MOVE_TIME_EXTRA` more."""
+
+MOVE_TIME_EXTRA: Final = 5.0
+"""In [s]."""
+
+
+class GuardedArm:
+    """An arm that refuses what is not safe. Nothing else in `deploy` calls `Arm.command`."""
+
+    def __init__(self, arm: Arm, safety: Safety, clock: Clock) -> None:
+        """Wraps an arm.
+
+        Args:
+            arm: Connected by the caller.
+            safety: The envelope.
+            clock: The one that the arm's time stamps come from.
+        """
+        self._arm = arm
+        self.safety = safety
+        self._clock = clock
+        self._last: ArmState | None = None
+        self._under_way: JointMove | None = None
+        self._deadline = 0.0
+
+    @property
+    def simulated(self) -> bool:
+        """Whether nothing real moves."""
+        return self._arm.simulated
+
+    @property
+    def can_stop(self) -> bool:
+        """Whether `stop` halts a move under way."""
+        return self._arm.can_stop
+
+    def read(self) -> ArmState:
+        """The newest state.
+
+        Raises:
+            FaultError: It cannot be true: not finite, outside the joints' limits, or a jump.
+            DeployError: The arm does not give one.
+        """
+        state = self._arm.read(self.safety.config.max_state_age)
+        for name, values in (("positions", state.joint_positions), ("velocities", state.joint_velocities)):
+            if not np.isfinite(values).all():
+                raise FaultError(f"the arm reports joint {name} that are not finite: {values.tolist()}")
+        joints = state.joint_positions
+        beyond = np.maximum(JOINT_LOWER - joints, joints - JOINT_UPPER)
+        if (beyond > LIMIT_SLACK).any():
+            k = int(beyond.argmax())
+            raise FaultError(
+                f"the arm reports {JOINT_NAMES[k]} at {np.rad2deg(joints[k]):.1f} deg, outside its limits; check which "
+                "unit it sends"
+            )
+        if self._last is not None:
+            self._check_jump(self._last, state)
+        self._last = state
+        return state
+
+    def _check_jump(self, before: ArmState, after: ArmState) -> None:
+        elapsed = after.stamp - before.stamp
+        if elapsed < 0.0:
+            raise FaultError(f"the arm's time stamps went back by {-elapsed:.3f} s")
+        allowed = VELOCITY_LIMITS * elapsed + JUMP_SLACK
+        turned = np.abs(after.joint_positions - before.joint_positions)
+        if (turned > allowed).any():
+            k = int((turned - allowed).argmax())
+            raise FaultError(
+                f"{JOINT_NAMES[k]} jumped by {turned[k]:.3f} rad in {elapsed:.3f} s, more than it can turn"
+            )
+
+    def command(
+        self, move: JointMove, frame_stamp: float | None = None, points_w: Float64 | None = None
+    ) -> JointMove:
+        """Sends a move that all checks let through, and returns at once.
+
+        Args:
+            move: Where to and how fast.
+            frame_stamp: When the picture was taken that the decision rests on, in [s].
+            points_w: What was seen of the plant, base frame, in [m]. Shape (P, 3).
+
+        Returns:
+            What was really sent.
+
+        Raises:
+            RefusedError: It is not safe, with the reason; nothing was sent.
+            FaultError: The driver says it sent something else than was checked.
+        """
+        state = self.read()
+        refusal = self.safety.check(move, state, self._clock.now(), frame_stamp, points_w)
+        if refusal is not None:
+            raise RefusedError(str(refusal))
+        if self._under_way is not None:
+            raise RefusedError("busy: the last move has not ended")
+        sent = self._arm.command(move)
+        self._under_way = sent
+        turn = np.abs(sent.joint_positions - state.joint_positions)
+        expected = float((turn / (VELOCITY_LIMITS * move.speed_fraction)).max())
+        self._deadline = self._clock.now() + MOVE_TIME_FACTOR * expected + MOVE_TIME_EXTRA
+        if not np.abs(sent.joint_positions - move.joint_positions).max() <= 1e-3:
+            self.stop()
+            raise FaultError("the driver sent other joint positions than the checked ones")
+        return sent
+
+    def wait(self, timeout_s: float) -> bool:
+        """Waits for the end of the move under way; True if the arm stands where it was sent.
+
+        Raises:
+            DeviceTimeoutError: It should have arrived long ago.
+            FaultError: It stands elsewhere.
+        """
+        if not self._arm.wait(timeout_s):
+            if self._clock.now() > self._deadline:
+                self.stop()
+                raise DeviceTimeoutError(
+                    "the move takes far longer than its speed says; the arm may be blocked"
+                )
+            return False
+        if self._under_way is not None:
+            sent, self._under_way = self._under_way, None
+            off = np.abs(self.read().joint_positions - sent.joint_positions)
+            if off.max() > self.safety.config.arrival_tolerance:
+                k = int(off.argmax())
+                raise FaultError(
+                    f"the arm stands {off[k]:.3f} rad from where {JOINT_NAMES[k]} was sent; something holds it back"
+                )
+        return True
+
+    def stop(self) -> bool:
+        """Does what can be done to end the move under way; whether the arm stands by it. Never raises."""
+        stopped = self._arm.stop()
+        if stopped:
+            self._under_way = None
+        elif self._under_way is not None:
+            _logger.warning(
+                "the move under way goes on to its end: only the smartPAD or the emergency stop halts it"
+            )
+        return stopped

@@ -1,0 +1,109 @@
+"""Which plant the twin stands before: an episode of the simulated task's lists, the same in every number."""
+
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import Final, Literal
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from maniskill_tomato.deploy.collision import CollisionChecker
+from maniskill_tomato.deploy.errors import ProfileError
+from maniskill_tomato.deploy.interface import Float64
+from maniskill_tomato.deploy.postures import Postures
+from maniskill_tomato.plants.choice import ROW_PLANT
+from maniskill_tomato.plants.episode_list import Episode, load_episodes
+from maniskill_tomato.plants.organs import Plant
+from maniskill_tomato.robot.d435 import T_flange_camera_color_optical
+from maniskill_tomato.robot.iiwa14 import JOINT_LOWER, JOINT_UPPER, READY_QPOS
+from maniskill_tomato.robot.inverse_kinematics import Reach
+from maniskill_tomato.robot.look_at_move import LookAtMover
+
+EpisodeListName = Literal["held_out", "validation"]
+
+START_MARGIN: Final = 0.05
+"""How far the start's joints stay from their limits where they can, in [rad]."""
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class TwinEpisode:
+    """A plant, the fruit to look for, and where the arm begins."""
+
+    plant: Plant
+    T_world_plant: Tensor
+    """Shape (4, 4), float32."""
+    target: int
+    """Index in `Plant.fruits`."""
+    target_position: Tensor
+    """Centre of the target, world frame, in [m]. Shape (3,), float32."""
+    start_joints: Float64
+    """Joint positions of the first view, in [rad]. Shape (7,)."""
+
+
+@lru_cache(maxsize=4)
+def load_episode(name: EpisodeListName, index: int) -> TwinEpisode:
+    """The episode that `TomatoViewpoint-v1` with `episodes=name` begins at `reset(seed=index)`.
+
+    Args:
+        name: One of the fixed lists.
+        index: Which, modulo the list's length.
+
+    Raises:
+        ProfileError: The index is negative.
+    """
+    if index < 0:
+        raise ProfileError(f"the seed must be 0 or more, got {index}")
+    episodes = load_episodes(name)
+    return make_episode(episodes[index % len(episodes)])
+
+
+def make_episode(episode: Episode) -> TwinEpisode:
+    """Grows the plant and works out the start.
+
+    Raises:
+        ProfileError: The arm cannot look at the target from the episode's start.
+    """
+    plant = ROW_PLANT.grow(episode.plant_seed)
+    T_world_plant = _plant_pose(episode.plant_pose)
+    centre = torch.as_tensor(np.asarray(plant.fruits[episode.target].centre, dtype=np.float32))
+    # Single precision and in this order, as in the simulated task, so that both start from the same bits.
+    target_position = (T_world_plant[:3, :3] @ centre[:, None])[:, 0] + T_world_plant[:3, 3]
+    looked_at = (centre[None] @ T_world_plant[:3, :3].T + T_world_plant[:3, 3]).double()
+    ready = torch.tensor(READY_QPOS, dtype=torch.float64)[None]
+    position = torch.tensor([episode.camera_position], dtype=torch.float64)
+    look = LookAtMover().look_from(ready, position, looked_at, largest_joint_step=10.0)
+    if int(look.reach[0]) != Reach.REACHABLE:
+        raise ProfileError(f"the arm cannot look at the target from {episode.camera_position} [m]")
+    start = look.qpos[0].float().double().numpy()
+    return TwinEpisode(
+        plant=plant,
+        T_world_plant=T_world_plant,
+        target=episode.target,
+        target_position=target_position,
+        start_joints=_clear_start(start, position[0].numpy(), looked_at[0].numpy()),
+    )
+
+
+def _clear_start(start: Float64, position: Float64, target: Float64) -> Float64:
+    """The task's start posture, or if that touches the table or itself, the nearest other one that does not.
+
+    The task moves joints without collisions; an operator would not leave a real arm there.
+    """
+    checker = CollisionChecker()
+    inside = (start > JOINT_LOWER + START_MARGIN).all() and (start < JOINT_UPPER - START_MARGIN).all()
+    if inside and checker.nearest(start[None]) is None:
+        return start
+    for posture in Postures(T_flange_camera_color_optical, START_MARGIN).at(position, target, start):
+        if checker.nearest(posture[None]) is None:
+            return posture
+    return start
+
+
+def _plant_pose(pose: tuple[float, float, float]) -> Tensor:
+    x, y, yaw = torch.as_tensor(np.array(pose), dtype=torch.float32)
+    c, s = yaw.cos(), yaw.sin()
+    T = torch.eye(4)
+    T[0, 0], T[0, 1], T[1, 0], T[1, 1] = c, -s, s, c
+    T[:3, 3] = torch.stack([x, y, torch.zeros_like(x)])
+    return T

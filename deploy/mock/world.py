@@ -1,0 +1,108 @@
+"""The twin's world: one arm before one plant, and what its camera would see."""
+
+from typing import Final
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from maniskill_tomato.deploy.clock import Clock
+from maniskill_tomato.deploy.interface import Float64, FrameTruth
+from maniskill_tomato.deploy.mock.dynamics import ArmDynamics
+from maniskill_tomato.deploy.mock.episode import TwinEpisode
+from maniskill_tomato.plants.organs import SemanticClass
+from maniskill_tomato.robot.d435 import CameraIntrinsics, T_flange_camera_color_optical
+from maniskill_tomato.robot.description import link_meshes
+from maniskill_tomato.robot.kinematics import link_transforms
+from maniskill_tomato.visibility.caster import VisibilityCaster
+from maniskill_tomato.visibility.picture_caster import FIRST_ORGAN_LABEL, Picture, PictureCaster
+from maniskill_tomato.visibility.view_rays import ViewRayCaster
+
+COLORS: Final = {
+    SemanticClass.BACKGROUND: (178, 196, 204),
+    SemanticClass.STEM: (112, 142, 70),
+    SemanticClass.LEAF: (62, 112, 44),
+    SemanticClass.FRUIT_RIPE: (204, 42, 28),
+    SemanticClass.FRUIT_TURNING: (214, 138, 52),
+    SemanticClass.FRUIT_GREEN: (148, 176, 88),
+    SemanticClass.ROBOT: (206, 206, 208),
+}
+"""Flat colours, sRGB."""
+
+
+class TwinWorld:
+    """Arm, plant and time. The arm moves when somebody asks for the time."""
+
+    def __init__(self, episode: TwinEpisode, intrinsics: CameraIntrinsics, clock: Clock) -> None:
+        """Puts everything in place.
+
+        Args:
+            episode: Which plant and start.
+            intrinsics: The camera's.
+            clock: Drives the arm.
+        """
+        self.episode = episode
+        self.intrinsics = intrinsics
+        self.clock = clock
+        self.arm = ArmDynamics(episode.start_joints)
+        self._began = clock.now()
+        self._caster = VisibilityCaster(
+            plants=[episode.plant], intrinsics=intrinsics, robot_meshes=link_meshes()
+        )
+        self._rays = ViewRayCaster(self._caster)
+        self._pictures = PictureCaster(self._caster, intrinsics)
+        self._mount = torch.tensor(T_flange_camera_color_optical, dtype=torch.float32)
+        organs = [organ.semantic_class for organ in episode.plant.organs]
+        classes = [SemanticClass.BACKGROUND, SemanticClass.ROBOT, *organs]
+        self._palette = np.array([COLORS[c] for c in classes], dtype=np.float64)
+        fruits = episode.plant.fruits
+        self._target_label = FIRST_ORGAN_LABEL + fruits[episode.target].organ_index
+        self._ripe_labels = tuple(
+            FIRST_ORGAN_LABEL + fruit.organ_index for fruit in fruits if fruit.ripeness == "ripe"
+        )
+
+    def advance(self) -> float:
+        """Moves the arm on to the present; that time, in [s]."""
+        now = self.clock.now()
+        self.arm.advance(now - self._began)
+        return now
+
+    def camera_pose(self) -> Float64:
+        """Pose of the optical frame now. Shape (4, 4)."""
+        pose: Float64 = self._poses(self.arm.joint_positions)[0][0].double().numpy()
+        return pose
+
+    def picture(self) -> Picture:
+        """What the camera sees now, exactly."""
+        camera, links = self._poses(self.arm.joint_positions)
+        return self._pictures.draw(camera[0], self.episode.T_world_plant, links[0])
+
+    def color(self, picture: Picture) -> NDArray[np.uint8]:
+        """The picture in flat colours, darker where one looks along a surface. Shape (H, W, 3)."""
+        shade = np.where(picture.labels == 0, 1.0, 0.45 + 0.55 * picture.facing)[..., None]
+        return np.asarray((self._palette[picture.labels] * shade).round(), dtype=np.uint8)
+
+    def truth(self, picture: Picture) -> FrameTruth:
+        """What is in the picture, and what the simulated task would say about it."""
+        camera, links = self._poses(self.arm.joint_positions)
+        target = torch.tensor([self.episode.target])
+        plant = self.episode.T_world_plant[None]
+        seen = self._caster.cast(camera, target, plant, links)
+        known = self.episode.target_position
+        rays = self._rays.cast(camera, target, known[None], plant, links)
+        labels = picture.labels.copy()
+        labels.setflags(write=False)
+        return FrameTruth(
+            labels=labels,
+            target_label=self._target_label,
+            target_position=known.double().numpy(),
+            visible_fraction=float(seen.visible_fraction[0]),
+            ripe_labels=self._ripe_labels,
+            rays=rays,
+        )
+
+    def _poses(self, joints: Float64) -> tuple[Tensor, Tensor]:
+        """Poses of the optical frame and of the links, in single precision as in the simulated task."""
+        links = link_transforms(torch.as_tensor(joints[None], dtype=torch.float32))
+        return links[:, -1] @ self._mount, links

@@ -1,0 +1,113 @@
+"""What the camera saw of the plant, as points to keep clear of."""
+
+from typing import Final
+
+import numpy as np
+import torch
+
+from maniskill_tomato.deploy.interface import Float64, Frame
+from maniskill_tomato.robot.kinematics import link_transforms
+from maniskill_tomato.robot.spheres import sphere_table
+
+CELL: Final = 0.015
+"""Points are kept one to a cube of this size, in [m]."""
+
+STRIDE: Final = 2
+"""Every second row and column of the depth image is taken."""
+
+REACH: Final = 0.9
+"""What is farther from the camera is left for a later view, in [m]: depth noise grows with the square."""
+
+NEAREST: Final = 0.12
+"""What is nearer is left out, in [m]: at the edge of what the D435 measures there are false points."""
+
+SELF_MARGIN: Final = 0.03
+"""Points within this distance of the arm's own spheres are the arm, in [m]."""
+
+JUMP_SHARE: Final = 0.03
+"""Where neighbouring depths differ by more than this share, the pixels between them are of neither surface."""
+
+
+class PlantPoints:
+    """A cloud of occupied cells in the base frame that grows with every view."""
+
+    def __init__(self, cell: float = CELL) -> None:
+        self._cell = cell
+        self._cells: dict[tuple[int, int, int], int] = {}
+        self._points: Float64 | None = np.zeros((0, 3))
+
+    def __len__(self) -> int:
+        return len(self._cells)
+
+    @property
+    def points_w(self) -> Float64:
+        """Centres of the occupied cells, in [m]. Shape (N, 3)."""
+        if self._points is None:
+            cells = np.array([c for c, seen in self._cells.items() if seen], dtype=np.float64).reshape(-1, 3)
+            self._points = (cells + 0.5) * self._cell
+        return self._points
+
+    def add(self, frame: Frame, T_world_camera: Float64, joint_positions: Float64) -> int:
+        """Takes in a view.
+
+        Args:
+            frame: Its depth is used.
+            T_world_camera: Pose of the optical frame. Shape (4, 4).
+            joint_positions: The arm's, in [rad], to leave its own links out. Shape (7,).
+
+        Returns:
+            How many points are new.
+        """
+        points = depth_points(frame, T_world_camera)
+        if len(points):
+            points = points[sphere_distances(joint_positions[None], points)[0] > SELF_MARGIN]
+        before = len(self._cells)
+        for cell in np.unique(np.floor(points / self._cell).astype(np.int64), axis=0):
+            key = (int(cell[0]), int(cell[1]), int(cell[2]))
+            self._cells[key] = self._cells.get(key, 0) + 1
+        self._points = None
+        return len(self._cells) - before
+
+
+def depth_points(frame: Frame, T_world_camera: Float64) -> Float64:
+    """The points of a depth image in the base frame, those at edges between surfaces left out. Shape (N, 3)."""
+    depth = frame.depth.astype(np.float64)
+    smooth = np.ones(depth.shape, dtype=np.bool_)
+    for axis in (0, 1):
+        jump = np.abs(np.diff(depth, axis=axis)) > JUMP_SHARE * depth.max(initial=0.0, where=depth < REACH)
+        first = [slice(None), slice(None)]
+        second = [slice(None), slice(None)]
+        first[axis], second[axis] = slice(0, -1), slice(1, None)
+        smooth[tuple(first)] &= ~jump
+        smooth[tuple(second)] &= ~jump
+    taken = (depth > NEAREST) & (depth < REACH) & np.isfinite(depth) & smooth
+    chosen = np.zeros_like(taken)
+    chosen[::STRIDE, ::STRIDE] = taken[::STRIDE, ::STRIDE]
+    rows, columns = np.nonzero(chosen)
+    pixels = np.stack([columns + 0.5, rows + 0.5], axis=-1)
+    points_c = frame.intrinsics.ray_directions(pixels) * depth[rows, columns, None]
+    points: Float64 = points_c @ T_world_camera[:3, :3].T + T_world_camera[:3, 3]
+    return points
+
+
+def sphere_distances(joint_positions: Float64, points_w: Float64) -> Float64:
+    """Distances between points and the nearest of the arm's spheres (`robot.spheres`).
+
+    Args:
+        joint_positions: In [rad]. Shape (N, 7).
+        points_w: In the base frame, in [m]. Shape (P, 3).
+
+    Returns:
+        In [m], negative inside a sphere. Shape (N, P).
+    """
+    links, spheres = sphere_table()
+    T = link_transforms(torch.as_tensor(np.array(joint_positions), dtype=torch.float64)).numpy()
+    centres_l = np.concatenate([spheres[:, :3], np.ones((len(spheres), 1))], axis=1).astype(np.float64)
+    centres = np.einsum("nsij,sj->nsi", T[:, links], centres_l)[..., :3]
+    distances = np.full((len(joint_positions), len(points_w)), np.inf)
+    squares = (points_w**2).sum(-1)
+    for k, radius in enumerate(spheres[:, 3].astype(np.float64)):
+        c = centres[:, k]
+        square = (c**2).sum(-1)[:, None] + squares[None] - 2.0 * c @ points_w.T
+        np.minimum(distances, np.sqrt(np.maximum(square, 0.0)) - radius, out=distances)
+    return distances

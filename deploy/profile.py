@@ -1,0 +1,227 @@
+"""A profile: which devices, where the camera sits, what is safe, when to end. TOML; errors name the key."""
+
+import json
+import tomllib
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Final, Literal
+
+import numpy as np
+
+from maniskill_tomato.deploy.capture import CaptureConfig
+from maniskill_tomato.deploy.errors import ProfileError
+from maniskill_tomato.deploy.fields import parse_table
+from maniskill_tomato.deploy.fruits import TruthFinder
+from maniskill_tomato.deploy.interface import Float64
+from maniskill_tomato.deploy.loop import LoopConfig
+from maniskill_tomato.deploy.perceive import Sight
+from maniskill_tomato.deploy.safety_config import SafetyConfig
+from maniskill_tomato.errors import InvalidInputError
+from maniskill_tomato.robot.d435 import T_flange_camera_color_optical
+
+PROFILES: Final = Path(__file__).resolve().parent / "profiles"
+"""Where ours are."""
+
+TABLES: Final = (
+    "description",
+    "arm",
+    "camera",
+    "twin",
+    "calibration",
+    "perception",
+    "target",
+    "safety",
+    "loop",
+    "capture",
+    "stop",
+)
+"""What a profile may have."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class PerceptionConfig:
+    """What turns pictures into views."""
+
+    segmenter: str = "light"
+    """`ground_truth` (simulated cameras only), or a segmenter of `maniskill_tomato.perception`, or its weights."""
+    sight: Sight = "images"
+    """`images`: masks and depth, as on a robot; `rays`: the twin's exact rays, as in the simulated task."""
+
+    def __post_init__(self) -> None:
+        if self.sight == "rays" and self.segmenter != TruthFinder.name:
+            raise InvalidInputError(
+                f"sight = 'rays' goes with segmenter = '{TruthFinder.name}' only, got {self.segmenter!r}"
+            )
+
+
+@dataclass(frozen=True, kw_only=True)
+class TargetConfig:
+    """Which fruit to look for."""
+
+    source: Literal["seen", "given", "twin"] = "seen"
+    """The largest ripe fruit of the first picture; `position`; or that of the twin's episode."""
+    position: tuple[float, float, float] | None = None
+    """With `given`: its centre in the base frame, in [m]."""
+
+    def __post_init__(self) -> None:
+        if (self.source == "given") != (self.position is not None):
+            raise InvalidInputError("position goes with source = 'given', and only with it")
+
+
+@dataclass(frozen=True, kw_only=True)
+class StopConfig:
+    """Ways to stop beside Ctrl-C and SIGTERM."""
+
+    file: str = "STOP"
+    """A run stops when this file appears in its output folder."""
+    heartbeat: float = 60.0
+    """The arm is stopped when the loop stands still for so long, in [s]."""
+
+    def __post_init__(self) -> None:
+        if not 1.0 <= self.heartbeat <= 3600.0:
+            raise InvalidInputError(f"heartbeat must be from 1 to 3600 s, got {self.heartbeat}")
+        if Path(self.file).name != self.file or not self.file:
+            raise InvalidInputError(f"file must be a plain file name, got {self.file!r}")
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Profile:
+    """A checked profile."""
+
+    name: str
+    """Its file's name without the ending."""
+    text: str
+    """Its content, for the recording."""
+    description: str
+    """One line."""
+    arm_driver: str
+    arm_options: dict[str, Any]
+    """Options of the arm's driver."""
+    camera_driver: str
+    camera_options: dict[str, Any]
+    """Options of the camera's driver."""
+    T_flange_camera: Float64
+    """The colour camera's optical frame in `link_ee`. Shape (4, 4)."""
+    calibrated: bool
+    """Whether that was measured, not taken from drawings."""
+    perception: PerceptionConfig = field(default_factory=PerceptionConfig)
+    target: TargetConfig = field(default_factory=TargetConfig)
+    safety: SafetyConfig = field(default_factory=SafetyConfig)
+    loop: LoopConfig = field(default_factory=LoopConfig)
+    capture: CaptureConfig = field(default_factory=CaptureConfig)
+    stop: StopConfig = field(default_factory=StopConfig)
+
+
+def profile_names() -> tuple[str, ...]:
+    """The profiles of the package."""
+    return tuple(sorted(path.stem for path in PROFILES.glob("*.toml")))
+
+
+def load_profile(name_or_file: str) -> Profile:
+    """Reads and checks a profile.
+
+    Args:
+        name_or_file: One of `profile_names`, or the path of a TOML file.
+
+    Raises:
+        ProfileError: There is none, or something in it is wrong.
+    """
+    path = PROFILES / f"{name_or_file}.toml" if name_or_file in profile_names() else Path(name_or_file)
+    try:
+        text = path.read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError) as error:
+        raise ProfileError(
+            f"no profile {name_or_file!r}: give the path of a TOML file or one of {', '.join(profile_names())}"
+        ) from error
+    return parse_profile(text, path)
+
+
+def parse_profile(text: str, path: Path) -> Profile:
+    """The profile that a text describes; `path` names it and is where relative paths in it begin.
+
+    Raises:
+        ProfileError: Something in it is wrong.
+    """
+    try:
+        data = tomllib.loads(text)
+    except tomllib.TOMLDecodeError as error:
+        raise ProfileError(f"{path} is no TOML: {error}") from error
+    for key in data:
+        if key not in TABLES:
+            raise ProfileError(f"{path}: {key} is unknown; a profile may have {', '.join(TABLES)}")
+    where = path.name
+    twin = _table(data, "twin", where)
+    arm, camera = _table(data, "arm", where), _table(data, "camera", where)
+    drivers = []
+    for key, table in (("arm", arm), ("camera", camera)):
+        driver = table.pop("driver", None)
+        if not isinstance(driver, str):
+            raise ProfileError(f"{where}: {key}.driver is missing; name a driver, such as mock")
+        drivers.append(driver)
+    T_flange_camera, calibrated = _calibration(_table(data, "calibration", where), path)
+
+    def read(key: str, kind: Any) -> Any:
+        return parse_table(kind, _table(data, key, where), f"{where}: {key}")
+
+    return Profile(
+        name=path.stem,
+        text=text,
+        description=str(data.get("description", "")),
+        arm_driver=drivers[0],
+        arm_options=twin if drivers[0] == "mock" else arm,
+        camera_driver=drivers[1],
+        camera_options=twin if drivers[1] == "mock" else camera,
+        T_flange_camera=T_flange_camera,
+        calibrated=calibrated,
+        perception=read("perception", PerceptionConfig),
+        target=read("target", TargetConfig),
+        safety=read("safety", SafetyConfig),
+        loop=read("loop", LoopConfig),
+        capture=read("capture", CaptureConfig),
+        stop=read("stop", StopConfig),
+    )
+
+
+def _table(data: Mapping[str, Any], key: str, where: str) -> dict[str, Any]:
+    table = data.get(key, {})
+    if not isinstance(table, Mapping):
+        raise ProfileError(f"{where}: {key} must be a table, got {table!r}")
+    return dict(table)
+
+
+def _calibration(table: Mapping[str, Any], path: Path) -> tuple[Float64, bool]:
+    """T_flange_camera from the table itself, from the file it names, or from the drawings."""
+    for key in table:
+        if key not in ("T_flange_camera", "file"):
+            raise ProfileError(
+                f"{path.name}: calibration.{key} is unknown; allowed are T_flange_camera and file"
+            )
+    where, values = f"{path.name}: calibration.T_flange_camera", table.get("T_flange_camera")
+    if "file" in table:
+        if values is not None:
+            raise ProfileError(f"{path.name}: calibration must have T_flange_camera or file, not both")
+        file = path.parent / str(table["file"])
+        where = f"T_flange_camera in {file}"
+        try:
+            values = json.loads(file.read_text(encoding="utf-8"))["T_flange_camera"]
+        except (OSError, ValueError, KeyError, TypeError) as error:
+            raise ProfileError(
+                f"{path.name}: calibration.file {file} cannot be used ({error}); `maniskill-tomato deploy calibrate` "
+                "writes it"
+            ) from error
+    if values is None:
+        return T_flange_camera_color_optical, False
+    try:
+        T = np.array(values, dtype=np.float64)
+    except (TypeError, ValueError):
+        T = np.zeros(0)
+    if T.shape != (4, 4) or not np.isfinite(T).all() or not np.allclose(T[3], [0, 0, 0, 1]):
+        raise ProfileError(f"{where} must be a 4 x 4 transform, got {values!r}")
+    R = T[:3, :3]
+    if not np.allclose(R @ R.T, np.eye(3), atol=1e-3) or np.linalg.det(R) < 0.0:
+        raise ProfileError(f"{where} has no rotation in its upper left 3 x 3 entries")
+    if np.linalg.norm(T[:3, 3]) > 0.5:
+        raise ProfileError(f"{where} puts the camera more than 0.5 m from the flange; metres are expected")
+    T.setflags(write=False)
+    return T, True

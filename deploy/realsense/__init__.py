@@ -1,0 +1,1 @@
+"""The Intel RealSense D435 through librealsense, live or from a recording."""

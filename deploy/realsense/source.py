@@ -1,0 +1,122 @@
+"""Where framesets come from: a camera found by its serial number, or a recording; one pipeline for both."""
+
+import time
+from pathlib import Path
+from typing import Any
+
+from maniskill_tomato.deploy.errors import DeviceTimeoutError, NotConnectedError
+from maniskill_tomato.deploy.realsense.config import RealSenseConfig
+
+
+class FrameSource:
+    """A running pipeline of the SDK."""
+
+    def __init__(self, sdk: Any, config: RealSenseConfig) -> None:
+        """Starts the streams; fails at once where there is no camera, which the pipeline itself takes 15 s for.
+
+        Args:
+            sdk: The module `pyrealsense2`.
+            config: Which camera or recording, which streams.
+
+        Raises:
+            NotConnectedError: There is no such camera or file, or it cannot send what is asked for.
+        """
+        self._sdk = sdk
+        self._config = config
+        self.serial: str | None = None
+        settings = sdk.config()
+        self._context = sdk.context()
+        if config.recording is None:
+            self.serial = self._find_camera()
+            settings.enable_device(self.serial)
+            width, height = config.color_size
+            settings.enable_stream(sdk.stream.color, width, height, sdk.format.rgb8, config.fps)
+            width, height = config.depth_size
+            settings.enable_stream(sdk.stream.depth, width, height, sdk.format.z16, config.fps)
+        else:
+            path = Path(config.recording)
+            if not path.is_file():
+                raise NotConnectedError(
+                    f"no recording at {path}; give camera.recording a .db3 file of the SDK"
+                )
+            settings.enable_device_from_file(str(path), repeat_playback=config.repeat)
+        self._pipeline = sdk.pipeline(self._context)
+        try:
+            self.profile = self._pipeline.start(settings)
+        except RuntimeError as error:
+            what = f"camera {self.serial}" if config.recording is None else f"recording {config.recording}"
+            raise NotConnectedError(
+                f"the {what} cannot be started: {error}; is another program using it, is it on a USB 3 port, and does "
+                "it have these sizes and this rate?"
+            ) from error
+        self._playback = None
+        if config.recording is not None:
+            self._playback = self.profile.get_device().as_playback()
+            self._playback.set_real_time(False)
+
+    @property
+    def is_recording(self) -> bool:
+        """Whether a file is played."""
+        return self._playback is not None
+
+    def depth_sensor(self) -> Any:
+        """The SDK's depth sensor."""
+        return self.profile.get_device().first_depth_sensor()
+
+    def next(self, timeout_s: float) -> Any:
+        """The next frameset.
+
+        Args:
+            timeout_s: The longest wait, in [s].
+
+        Raises:
+            NotConnectedError: The camera is gone, or the recording is over.
+            DeviceTimeoutError: It sends nothing.
+        """
+        deadline = time.monotonic() + timeout_s
+        while True:
+            # A recording's end stops the pipeline without a word: look for it often.
+            step = min(0.1, max(0.001, deadline - time.monotonic())) if self.is_recording else timeout_s
+            try:
+                there, frames = self._pipeline.try_wait_for_frames(int(1000 * step))
+            except RuntimeError as error:
+                raise NotConnectedError(f"the camera sends no more: {error}; look at its cable") from error
+            if there:
+                return frames
+            if self._playback is not None:
+                if self._playback.current_status() == self._sdk.playback_status.stopped:
+                    raise NotConnectedError(
+                        "the recording is over; set camera.repeat = true to play it again"
+                    )
+            elif self.serial not in self._serials():
+                raise NotConnectedError(f"camera {self.serial} is gone; look at its cable and connect again")
+            if time.monotonic() >= deadline:
+                raise DeviceTimeoutError(
+                    f"no picture within {timeout_s:g} s; the camera is there but sends nothing"
+                )
+
+    def close(self) -> None:
+        """Stops the streams. Never raises."""
+        try:
+            self._pipeline.stop()
+        except RuntimeError:
+            pass  # The device went first.
+
+    def _serials(self) -> list[str]:
+        info = self._sdk.camera_info.serial_number
+        return [str(d.get_info(info)) for d in self._context.query_devices() if d.supports(info)]
+
+    def _find_camera(self) -> str:
+        serials = self._serials()
+        listed = ", ".join(serials) if serials else "none"
+        wanted = self._config.serial
+        if not serials:
+            raise NotConnectedError(
+                "no RealSense camera found; look at its cable (USB 3), its power and the udev rules, or play a "
+                "file with camera.recording"
+            )
+        if wanted is None and len(serials) > 1:
+            raise NotConnectedError(f"several cameras: {listed}; say which with camera.serial")
+        if wanted is not None and wanted not in serials:
+            raise NotConnectedError(f"no camera with the serial number {wanted}; found: {listed}")
+        return wanted or serials[0]

@@ -1,0 +1,133 @@
+"""One run from a profile to its report."""
+
+import logging
+from collections.abc import Callable
+from contextlib import ExitStack
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+from maniskill_tomato import __version__
+from maniskill_tomato.deploy.clock import Clock
+from maniskill_tomato.deploy.errors import ProfileError, RecordingError
+from maniskill_tomato.deploy.loop import Mode, Proposal
+from maniskill_tomato.deploy.policies import default_policy, open_policy
+from maniskill_tomato.deploy.profile import Profile
+from maniskill_tomato.deploy.recording import McapRecorder
+from maniskill_tomato.deploy.run_report import Contact, write_report
+from maniskill_tomato.deploy.station import make_station, stop_file
+from maniskill_tomato.deploy.steps import Recorder, RunResult, Step
+from maniskill_tomato.deploy.stops import Stops
+
+RECORDING = "run.mcap"
+"""Name of the recording in the output folder."""
+
+_logger = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class RunConfig:
+    """What to run."""
+
+    profile: Profile
+    out: Path
+    """Folder of result, recording and report."""
+    policy: str | None = None
+    """A planner's name or a policy's file; None for the one that ships."""
+    seed: int = 0
+    """Of the twin's episode and of planners that draw."""
+    mode: Mode | None = None
+    """None: unattended on the twin, dry run on hardware."""
+    record: bool = True
+    """Whether to write an MCAP file."""
+
+
+class _Several:
+    """Passes steps on to several recorders."""
+
+    def __init__(self, recorders: list[Recorder]) -> None:
+        self._recorders = recorders
+
+    def step(self, step: Step) -> None:
+        for recorder in self._recorders:
+            recorder.step(step)
+
+    def event(self, stamp: float, text: str) -> None:
+        for recorder in self._recorders:
+            recorder.event(stamp, text)
+
+
+def run(
+    config: RunConfig,
+    confirm: Callable[[Proposal], bool] = lambda proposal: False,
+    clock: Clock | None = None,
+    keyboard: bool = False,
+) -> RunResult:
+    """Connects, runs, disconnects, and writes `result.json`, `report.png` and `run.mcap`.
+
+    Args:
+        config: What to run.
+        confirm: Asked before every move in the mode `confirm`.
+        clock: Another clock than the profile's.
+        keyboard: Whether keys in a terminal stop the run.
+
+    Returns:
+        How it ended; faults during the run are told there.
+
+    Raises:
+        DeployError: It could not begin: a profile, a device or a folder cannot be used.
+        PolicyError: The policy cannot be used.
+        RecordingError: The folder or the recording cannot be begun.
+    """
+    profile = config.profile
+    name = config.policy or default_policy()
+    policy = open_policy(name, config.seed)
+    station = make_station(profile, config.seed, clock)
+    mode: Mode = config.mode or ("unattended" if station.simulated else "dry_run")
+    if not station.simulated and not profile.calibrated:
+        if mode != "dry_run":
+            raise ProfileError(
+                "the camera's place on the flange is not calibrated: run `maniskill-tomato deploy calibrate` and name "
+                "its file in calibration.file; without it only a dry run is allowed"
+            )
+        _logger.warning("not calibrated: the camera's place on the flange is that of the drawings")
+    facts: dict[str, Any] = {
+        "profile": profile.name,
+        "policy": name,
+        "policy_name": policy.name,
+        "perception": station.perception.name,
+        "seed": config.seed,
+        "mode": mode,
+        "simulated": station.simulated,
+        "version": __version__,
+    }
+    try:
+        config.out.mkdir(parents=True, exist_ok=True)
+        stop_file(profile, config.out).unlink(missing_ok=True)
+    except OSError as error:
+        raise RecordingError(f"cannot use the folder {config.out}: {error.strerror or error}") from error
+    contact = Contact()
+    with ExitStack() as stack:
+        arm = stack.enter_context(station.arm)
+        camera = stack.enter_context(station.camera)
+        devices = {"arm": arm.describe(), "camera": camera.describe()}
+        recorders: list[Recorder] = [contact]
+        if config.record:
+            info = {**facts, "profile_text": profile.text, "devices": devices}
+            recorders.append(stack.enter_context(McapRecorder(config.out / RECORDING, info)))
+        stops = stack.enter_context(
+            Stops(
+                stop_file=stop_file(profile, config.out),
+                keyboard=keyboard,
+                heartbeat_s=profile.stop.heartbeat,
+                on_lost_heartbeat=station.guarded_arm.stop,
+            )
+        )
+        result = station.loop(policy, stops, mode, _Several(recorders), confirm).run()
+    try:
+        write_report(config.out, result, {**facts, "devices": devices}, contact)
+    except RecordingError as error:
+        _logger.error("%s", error)
+        if not result.is_fault:
+            result = replace(result, reason=error.reason, detail=str(error), is_fault=True)
+    return result

@@ -1,0 +1,226 @@
+"""Whether a command may go to the arm: pure checks that refuse with a reason and change nothing.
+
+    safety = Safety(config)
+    refusal = safety.check(move, state, now, frame_stamp, points_w)
+
+A command passes whole or not at all. Checks run from cheap to dear: numbers, limits, steps, ages, the way of the
+flange, then collisions along the straight line in joint space, which is what a PTP move follows.
+"""
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from maniskill_tomato.deploy.collision import CollisionChecker
+from maniskill_tomato.deploy.interface import ArmState, Float64, JointMove
+from maniskill_tomato.deploy.plant_points import sphere_distances
+from maniskill_tomato.deploy.safety_config import Box, SafetyConfig
+from maniskill_tomato.robot.d435 import T_flange_camera_color_optical
+from maniskill_tomato.robot.iiwa14 import JOINT_LOWER, JOINT_NAMES, JOINT_UPPER
+from maniskill_tomato.robot.kinematics import forward_kinematics
+
+Reason = Literal[
+    "not_finite",
+    "speed",
+    "joint_limit",
+    "joint_step",
+    "stale_state",
+    "stale_frame",
+    "workspace",
+    "forbidden_zone",
+    "flange_step",
+    "self_collision",
+    "table",
+    "obstacle",
+    "plant",
+]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Refusal:
+    """Why a command does not go out."""
+
+    reason: Reason
+    """Which check speaks against it."""
+    detail: str
+    """With numbers, for people."""
+
+    def __str__(self) -> str:
+        return f"{self.reason}: {self.detail}"
+
+
+class Safety:
+    """The checks of one envelope."""
+
+    def __init__(self, config: SafetyConfig | None = None) -> None:
+        self.config = config or SafetyConfig()
+        c = self.config
+        self._collisions = CollisionChecker(
+            table_height=c.table_height,
+            table_clearance=c.table_clearance,
+            self_clearance=c.self_clearance,
+            obstacles=c.obstacles,
+            obstacle_clearance=c.obstacle_clearance,
+        )
+
+    def check(
+        self,
+        move: JointMove,
+        state: ArmState,
+        now: float,
+        frame_stamp: float | None = None,
+        points_w: Float64 | None = None,
+    ) -> Refusal | None:
+        """Judges a command.
+
+        Args:
+            move: What shall be sent.
+            state: Where the arm is.
+            now: The time, in [s].
+            frame_stamp: When the picture was taken that the command rests on, in [s]; None if it rests on none.
+            points_w: What was seen of the plant, base frame, in [m]; None for no such check. Shape (P, 3).
+
+        Returns:
+            None if it may go out.
+        """
+        refusal = (
+            self._numbers(move, state, now, frame_stamp)
+            or self._limits(move, state)
+            or self._ages(state, now, frame_stamp)
+        )
+        if refusal is not None:
+            return refusal
+        path = joint_path(state.joint_positions, move.joint_positions, self.config.path_step)
+        return self._way(path) or self._contacts(path) or self._plant(path, points_w)
+
+    def _numbers(
+        self, move: JointMove, state: ArmState, now: float, frame_stamp: float | None
+    ) -> Refusal | None:
+        for name, values in (
+            ("the commanded joint positions", move.joint_positions),
+            ("the measured joint positions", state.joint_positions),
+            ("the measured joint velocities", state.joint_velocities),
+            ("the speed fraction", np.array(move.speed_fraction, dtype=np.float64)),
+            ("the time stamps", np.array([state.stamp, now, now if frame_stamp is None else frame_stamp])),
+        ):
+            if not np.isfinite(values).all():
+                return Refusal(reason="not_finite", detail=f"{name} are not finite: {values.tolist()}")
+        return None
+
+    def _limits(self, move: JointMove, state: ArmState) -> Refusal | None:
+        c, joints = self.config, move.joint_positions
+        if not 0.0 < move.speed_fraction <= c.max_speed_fraction:
+            detail = f"the speed fraction must be above 0 and at most {c.max_speed_fraction}, got {move.speed_fraction}"
+            return Refusal(reason="speed", detail=detail)
+        over = np.maximum(JOINT_LOWER + c.joint_margin - joints, joints - JOINT_UPPER + c.joint_margin)
+        if (over > 0.0).any():
+            k = int(over.argmax())
+            bound = np.rad2deg(JOINT_UPPER[k] - c.joint_margin)
+            return Refusal(
+                reason="joint_limit",
+                detail=f"{JOINT_NAMES[k]} must stay within +-{bound:.1f} deg, got {np.rad2deg(joints[k]):.1f} deg",
+            )
+        step = np.abs(joints - state.joint_positions)
+        if (step > c.max_joint_step).any():
+            k = int(step.argmax())
+            return Refusal(
+                reason="joint_step",
+                detail=f"{JOINT_NAMES[k]} would turn {step[k]:.2f} rad in one move, allowed are {c.max_joint_step}",
+            )
+        return None
+
+    def _ages(self, state: ArmState, now: float, frame_stamp: float | None) -> Refusal | None:
+        c = self.config
+        age = now - state.stamp
+        if not 0.0 <= age <= c.max_state_age:
+            detail = f"the arm's state is {age:.3f} s old, it must be from 0 to {c.max_state_age} s"
+            return Refusal(reason="stale_state", detail=detail)
+        if frame_stamp is not None and not 0.0 <= now - frame_stamp <= c.max_frame_age:
+            detail = f"the picture is {now - frame_stamp:.3f} s old, it must be from 0 to {c.max_frame_age} s"
+            return Refusal(reason="stale_frame", detail=detail)
+        return None
+
+    def _way(self, path: Float64) -> Refusal | None:
+        c = self.config
+        T_w_flange = forward_kinematics(torch.as_tensor(path)).numpy()
+        flange = T_w_flange[:, :3, 3]
+        camera = flange + T_w_flange[:, :3, :3] @ T_flange_camera_color_optical[:3, 3]
+        # The start is where the arm is already: a move may lead out of a wrong place, not into it.
+        outside = ~_within(flange[1:], c.workspace)
+        if outside.any():
+            k = int(outside.argmax())
+            return Refusal(
+                reason="workspace",
+                detail=f"the flange would be at {_metres(flange[1 + k])}, outside {c.workspace}",
+            )
+        for name, positions in (("flange", flange), ("camera", camera)):
+            for box in c.forbidden:
+                inside = _within(positions[1:], box)
+                if inside.any():
+                    k = int(inside.argmax())
+                    return Refusal(
+                        reason="forbidden_zone",
+                        detail=f"the {name} would be at {_metres(positions[1 + k])}, inside {box}",
+                    )
+        away = np.linalg.norm(flange - flange[0], axis=-1)
+        if (away > c.max_flange_step).any():
+            return Refusal(
+                reason="flange_step",
+                detail=f"the flange would get {away.max():.3f} m away in one move, allowed are {c.max_flange_step} m",
+            )
+        return None
+
+    def _contacts(self, path: Float64) -> Refusal | None:
+        contact = self._collisions.nearest(path[1:])
+        if contact is None:
+            return None
+        reason: Reason = "self_collision"
+        if contact.second == "table":
+            reason = "table"
+        elif contact.second.startswith("obstacle"):
+            reason = "obstacle"
+        share = (contact.sample + 1) / (len(path) - 1)
+        return Refusal(
+            reason=reason,
+            detail=f"{contact.first} would come within {contact.distance * 1e3:.0f} mm of {contact.second} after "
+            f"{share:.0%} of the move",
+        )
+
+    def _plant(self, path: Float64, points_w: Float64 | None) -> Refusal | None:
+        c = self.config
+        if c.plant_clearance is None or points_w is None or len(points_w) < c.plant_points_needed:
+            return None
+        distances = sphere_distances(path, points_w)
+        # Where the arm is near a leaf already, it may go away from it but not nearer.
+        near = (distances[1:] < c.plant_clearance) & (distances[1:] < distances[0] - 1e-3)
+        touched = near.any(axis=0)
+        if int(touched.sum()) < c.plant_points_needed:
+            return None
+        return Refusal(
+            reason="plant",
+            detail=f"{int(touched.sum())} points of the plant would be nearer than {c.plant_clearance * 1e3:.0f} mm to "
+            f"the arm's spheres, the nearest {distances[1:][near].min() * 1e3:.0f} mm",
+        )
+
+
+def joint_path(start: Float64, end: Float64, step: float) -> Float64:
+    """Joint positions on the straight line from `start` to `end`, both included, at most `step` [rad] apart.
+
+    Shape (N, 7), N at least 2.
+    """
+    count = max(1, int(np.ceil(np.abs(end - start).max() / step)))
+    shares = np.linspace(0.0, 1.0, count + 1)[:, None]
+    path: Float64 = start + shares * (end - start)
+    return path
+
+
+def _within(positions: Float64, box: Box) -> NDArray[np.bool_]:
+    inside = (positions >= np.array(box.low)) & (positions <= np.array(box.high))
+    return np.asarray(inside.all(-1))
+
+
+def _metres(position: Float64) -> str:
+    return "(" + ", ".join(f"{v:.3f}" for v in position) + ") m"

@@ -1,0 +1,240 @@
+"""ManiSkill's `Sim2RealEnv` for the viewpoint tasks: the observation comes from the arm and the camera, not from the
+simulation.
+
+What the base class would do wrong here, and what is done instead:
+
+- State observations would be the simulated robot's: they are made from the measured joints and the picture.
+- Kinematic tasks set no drive targets: the goal is read from the controller.
+- The picture would be cropped to a square and depth lose an axis: the agent delivers what the simulation has.
+- A dense reward would raise, `evaluate`'s numbers be missing: both are computed from what the camera sees.
+- A reset would wait for the enter key and send the arm to a simulated start: the arm stays where it is.
+- A step would be timed: it takes as long as the move.
+"""
+
+import logging
+from collections.abc import Mapping
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import torch
+from mani_skill.envs.sapien_env import BaseEnv
+from mani_skill.envs.sim2real_env import Sim2RealEnv
+from torch import Tensor
+
+from maniskill_tomato.deploy.errors import PerceptionError, ProfileError, RefusedError
+from maniskill_tomato.deploy.interface import Float64
+from maniskill_tomato.deploy.observing import Observing
+from maniskill_tomato.deploy.perceive import View
+from maniskill_tomato.deploy.real_agent import IiwaRealAgent
+from maniskill_tomato.robot.inverse_kinematics import Reach
+from maniskill_tomato.robot.look_at_controller import LookAtController
+from maniskill_tomato.robot.viewpoint_controller import ViewpointController
+
+logger = logging.getLogger(__name__)
+
+
+class TomatoSim2RealEnv(Sim2RealEnv):  # type: ignore[misc]
+    """A viewpoint task on hardware, with the spaces and wrappers of its simulation.
+
+    Info, each of shape (1,): `visible_fraction`, `visible_fraction_gain`, `success`, `fail`, `target_seen`,
+    `tomato_seen`, `reachability`, `refused` (safety held the move back, and the arm stands where it did). What only a
+    simulator knows, such as contact with the plant, is not told.
+    """
+
+    agent: IiwaRealAgent
+
+    def __init__(
+        self, sim_env: gym.Env[Any, Any], agent: IiwaRealAgent, skip_data_checks: bool = False
+    ) -> None:
+        """Takes a started agent.
+
+        Args:
+            sim_env: The simulation of the task, `num_envs=1`, on the CPU, with `pd_viewpoint` or `pd_look_at`.
+            agent: Started.
+            skip_data_checks: Do not compare an observation of both when beginning.
+
+        Raises:
+            ProfileError: The simulation has another control mode.
+            DeployError: A device fails.
+        """
+        base: Any = sim_env.unwrapped
+        if not isinstance(base.agent.controller, ViewpointController):
+            raise ProfileError(
+                f"control_mode must be pd_viewpoint or pd_look_at on hardware, got {base.agent.control_mode!r}"
+            )
+        self._observing: Observing | None = None
+        self._view: View | None = None
+        self._target: Float64 | None = None
+        self._fraction_before = 0.0
+        self._refused = False
+        self._moves = 0
+        reset: Any = _reset_without_moving
+        super().__init__(
+            sim_env,
+            agent,
+            real_reset_function=reset,
+            sensor_data_preprocessing_function=_as_it_is,
+            skip_data_checks=skip_data_checks,
+        )
+
+    @property
+    def target_position(self) -> Float64:
+        """Where the target is, world frame, in [m]. Shape (3,).
+
+        Raises:
+            PerceptionError: Before the first reset.
+        """
+        if self._target is None:
+            raise PerceptionError("no target is known before reset()")
+        return self._target
+
+    def begin(self) -> None:
+        """Looks for the target and begins an episode from where the arm stands.
+
+        Raises:
+            PerceptionError: No ripe fruit is in the picture.
+            DeployError: A device fails.
+        """
+        station = self.agent.station
+        frame, joints = self.agent.look()
+        T_world_camera = self.agent.camera_pose(joints)
+        target = station.target_position()
+        if target is None:
+            target = station.perception.find_target(frame, T_world_camera)
+        if target is None:
+            raise PerceptionError("the first picture shows no ripe fruit; start where one is in view")
+        self._target = target
+        self._moves, self._refused, self._fraction_before = 0, False, 0.0
+        layout = getattr(self.base_sim_env, "layout", None)
+        if layout is not None:
+            self._observing = Observing(station.profile.T_flange_camera, self._max_moves, layout)
+            self._observing.begin(target)
+        self._reach = torch.full((1,), int(Reach.REACHABLE), dtype=torch.int64)
+        self._take_view()
+        assert self._view is not None
+        self._fraction_before = self._view.visible_fraction
+
+    @property
+    def _max_moves(self) -> int:
+        base: Any = self.base_sim_env
+        return int(base.task.max_moves)
+
+    def _step_action(self, action: Any) -> Any:
+        if action is None:
+            return None
+        base: Any = self.base_sim_env
+        batch: Tensor = base._checked_action(action)
+        self._follow_the_arm()
+        controller: Any = base.agent.controller
+        controller.viewpoint = base._viewpoint
+        if isinstance(controller, LookAtController):
+            controller.target_position = self._target_tensor()
+        controller.set_action(batch)
+        self._reach = controller.reach.clone()
+        self._moves += 1
+        assert self._view is not None
+        self._fraction_before = self._view.visible_fraction
+        self._refused = False
+        try:
+            self.agent.set_target_qpos(controller.target_qpos)
+            base._viewpoint = controller.viewpoint
+        except RefusedError as error:
+            self._refused = True
+            logger.warning("the arm stays: %s", error)
+        self._take_view()
+        return batch
+
+    def get_info(self) -> dict[str, Any]:
+        """What the camera sees from where the arm stands."""
+        view = self._view
+        if view is None:
+            return {"elapsed_steps": self._elapsed_steps}
+        base: Any = self.base_sim_env
+        fraction = torch.tensor([view.visible_fraction])
+        seen, any_seen = torch.tensor([view.target_seen]), torch.tensor([view.fruits_seen > 0])
+        unreachable = self._reach == int(Reach.UNREACHABLE)
+        fail = unreachable & (getattr(base.task, "outside_workspace", "") == "end")
+        info: dict[str, Any] = {
+            "elapsed_steps": self._elapsed_steps,
+            "visible_fraction": fraction,
+            "visible_fraction_gain": fraction - self._fraction_before,
+            "success": (fraction > base.task.full_visibility) & ~fail,
+            "fail": fail,
+            "target_seen": seen,
+            "tomato_seen": any_seen,
+            "reachability": self._reach.clone(),
+            "refused": torch.tensor([self._refused]),
+        }
+        if hasattr(base.task, "visual_reward"):
+            forbidden = torch.zeros(1, dtype=torch.bool)  # Safety lets no move end there.
+            info["reward_visual"] = base.task.visual_reward(fraction, seen, any_seen, self._reach)
+            info["reward_penalty"] = base.task.pose_penalty(self._reach, forbidden)
+        return info
+
+    def compute_dense_reward(self, obs: Any, action: Tensor, info: Mapping[str, Tensor]) -> Tensor:
+        """The task's reward of what the camera sees, without contact. Shape (1,)."""
+        known = {"plant_contact": torch.zeros(1, dtype=torch.bool), **info}
+        task: Any = type(self.base_sim_env)
+        reward: Tensor = task.compute_dense_reward(self, obs, action, known)
+        return reward
+
+    def compute_normalized_dense_reward(self, obs: Any, action: Tensor, info: Mapping[str, Tensor]) -> Tensor:
+        """The reward over its largest value. Shape (1,)."""
+        known = {"plant_contact": torch.zeros(1, dtype=torch.bool), **info}
+        task: Any = type(self.base_sim_env)
+        reward: Tensor = task.compute_normalized_dense_reward(self, obs, action, known)
+        return reward
+
+    def _get_obs_state_dict(self, info: Mapping[str, Any]) -> dict[str, Any]:
+        return {"agent": self._get_obs_agent(), "extra": self._get_obs_extra(info)}
+
+    def _get_obs_extra(self, info: Mapping[str, Any]) -> dict[str, Tensor]:
+        base: Any = self.base_sim_env
+        if self._observing is not None:
+            vector = self._vector
+            return {name: vector[:, part].clone() for name, part in base.layout.slices.items()}
+        viewpoint: Tensor = base._viewpoint
+        return {
+            "ee_position": viewpoint[:, :3].clone(),
+            "ee_rpy": viewpoint[:, 3:].clone(),
+            "target_position": self._target_tensor(),
+        }
+
+    def _flatten_raw_obs(self, obs: Any) -> Any:
+        if self._obs_mode == "state":
+            return torch.cat(tuple(obs["extra"].values()), dim=-1)
+        base: Any = BaseEnv
+        return base._flatten_raw_obs(self, obs)
+
+    def _take_view(self) -> None:
+        """Looks, once for every place where the arm stands."""
+        frame, joints = self.agent.look()
+        self._view = self.agent.station.perception.look(
+            frame, self.agent.camera_pose(joints), self.target_position
+        )
+        self._follow_the_arm()
+        if self._observing is not None:
+            left = max(0, self._max_moves - self._moves)
+            self._vector = self._observing.observe(joints, self._view, left).observation
+
+    def _follow_the_arm(self) -> None:
+        """Puts the simulated arm where the real one stands."""
+        base: Any = self.base_sim_env
+        _, joints = self.agent.look()
+        base.agent.robot.set_qpos(torch.as_tensor(np.array(joints), dtype=torch.float32)[None])
+        base._observe_viewpoint()
+
+    def _target_tensor(self) -> Tensor:
+        return torch.as_tensor(self.target_position, dtype=torch.float32)[None]
+
+
+def _reset_without_moving(env: TomatoSim2RealEnv, seed: int | None = None, options: Any = None) -> None:
+    """A new episode of the simulation for its bookkeeping; the arm stays, and the target is looked for."""
+    env.sim_env.reset(seed=seed, options=options)
+    env._elapsed_steps[:] = 0
+    env.begin()
+
+
+def _as_it_is(data: dict[str, Any]) -> dict[str, Any]:
+    return data

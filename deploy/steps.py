@@ -1,0 +1,90 @@
+"""What a run writes down: one step a look, and what came of all of them."""
+
+from dataclasses import asdict, dataclass, field
+from typing import Any, Protocol
+
+from maniskill_tomato.deploy.interface import Float64, Frame
+from maniskill_tomato.deploy.perceive import View
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Step:
+    """A look, and the decision that followed."""
+
+    number: int
+    """Counts the looks from 0."""
+    frame: Frame
+    view: View
+    joint_positions: Float64
+    """When the picture was taken, in [rad]. Shape (7,)."""
+    T_world_camera: Float64
+    """Pose of the optical frame. Shape (4, 4)."""
+    target_position: Float64
+    """In [m]. Shape (3,)."""
+    moves_left: int
+    action: tuple[float, float, float] | None = None
+    """Right, up, forward; None where the run ended with this look."""
+    commanded: Float64 | None = None
+    """Joint positions that went out, in [rad]; None if none did. Shape (7,)."""
+    outcome: str = ""
+    """`moved`, `refused`, `dry_run`, `declined` or why the run ended."""
+    detail: str = ""
+    """Why a move was refused or the run ended."""
+    timing_ms: dict[str, float] = field(default_factory=dict)
+    """Wall time of each stage."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class RunResult:
+    """How a run ended."""
+
+    success: bool
+    """Whether V_f passed the threshold."""
+    reason: str
+    """`success`, `budget`, `target_lost`, `no_target`, `refused`, `dry_run`, `declined`, `stopped`, or a fault's."""
+    detail: str
+    """In words."""
+    is_fault: bool
+    """Whether something was broken."""
+    moves: int
+    """Moves decided on, refused ones among them, as the simulated task counts."""
+    refused_moves: int
+    """Those that did not reach the arm."""
+    visible_fraction: float
+    """V_f of the last look."""
+    best_visible_fraction: float
+    """Of all looks."""
+    visible_fractions: tuple[float, ...]
+    """Of each look."""
+    seconds: float
+    """Wall time, in [s]."""
+    device_seconds: float
+    """By the run's clock, in [s]: what it takes, or would take, on hardware."""
+    stage_ms: dict[str, float]
+    """Mean wall time of each stage of a step, in [ms]."""
+    end_state: str
+    """What the arm does now."""
+
+    def to_json(self) -> dict[str, Any]:
+        """Plain numbers, strings and lists."""
+        return asdict(self)
+
+
+class Recorder(Protocol):
+    """Keeps what happened."""
+
+    def step(self, step: Step) -> None:
+        """Writes a step.
+
+        Raises:
+            RecordingError: It cannot.
+        """
+        ...
+
+    def event(self, stamp: float, text: str) -> None:
+        """Writes a line of the log.
+
+        Raises:
+            RecordingError: It cannot.
+        """
+        ...

@@ -1,0 +1,92 @@
+"""Ways to stop a run: Ctrl-C, SIGTERM, a key, a file, and a loop that no longer beats."""
+
+import select
+import signal
+import sys
+import threading
+import time
+from collections.abc import Callable
+from pathlib import Path
+from types import FrameType, TracebackType
+from typing import Any, Self
+
+KEYS = ("q", "s", " ")
+"""Followed by Enter, each of these stops a run in a terminal."""
+
+
+class Stops:
+    """Says whether and why to stop; a context manager that puts signal handlers back."""
+
+    def __init__(
+        self,
+        *,
+        stop_file: Path | None = None,
+        keyboard: bool = False,
+        heartbeat_s: float = 60.0,
+        on_lost_heartbeat: Callable[[], object] | None = None,
+    ) -> None:
+        """Prepares without listening yet.
+
+        Args:
+            stop_file: The run stops when this file appears.
+            keyboard: Listen to `KEYS` on a terminal.
+            heartbeat_s: Longest time between two `beat`s, in [s] of real time.
+            on_lost_heartbeat: Called once from another thread when that passes.
+        """
+        self._stop_file = stop_file
+        self._keyboard = keyboard and sys.stdin.isatty()
+        self._heartbeat_s = heartbeat_s
+        self._on_lost = on_lost_heartbeat
+        self._reason: str | None = None
+        self._last_beat = time.monotonic()
+        self._ended = threading.Event()
+        self._handlers: dict[signal.Signals, Any] = {}
+
+    def __enter__(self) -> Self:
+        self._last_beat = time.monotonic()
+        if threading.current_thread() is threading.main_thread():
+            for number in (signal.SIGINT, signal.SIGTERM):
+                self._handlers[number] = signal.signal(number, self._on_signal)
+        self._watch = threading.Thread(target=self._watch_heartbeat, name="heartbeat", daemon=True)
+        self._watch.start()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._ended.set()
+        for number, handler in self._handlers.items():
+            signal.signal(number, handler)
+        self._handlers.clear()
+
+    def request(self, reason: str) -> None:
+        """Asks the run to stop; the first reason counts."""
+        if self._reason is None:
+            self._reason = reason
+
+    def beat(self) -> str | None:
+        """Says that the loop is alive; why it has to stop, or None."""
+        self._last_beat = time.monotonic()
+        if self._reason is None and self._stop_file is not None and self._stop_file.exists():
+            self.request(f"stop file {self._stop_file}")
+        if self._reason is None and self._keyboard and select.select([sys.stdin], [], [], 0)[0]:
+            line = sys.stdin.readline()
+            if line and (not line.strip() or line.strip().lower() in KEYS):
+                self.request("key")
+        return self._reason
+
+    @property
+    def reason(self) -> str | None:
+        """Why to stop, without a beat."""
+        return self._reason
+
+    def _on_signal(self, number: int, frame: FrameType | None) -> None:
+        self.request(signal.Signals(number).name)
+
+    def _watch_heartbeat(self) -> None:
+        while not self._ended.wait(min(1.0, self._heartbeat_s / 4)):
+            if time.monotonic() - self._last_beat > self._heartbeat_s:
+                self.request("heartbeat")
+                if self._on_lost is not None:
+                    self._on_lost()
+                return

@@ -1,0 +1,1 @@
+"""The KUKA iiwa through the Sunrise Toolbox server on its controller."""

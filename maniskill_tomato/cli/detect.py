@@ -1,0 +1,54 @@
+"""`maniskill-tomato detect`: fruits in image files."""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+
+
+@dataclass(frozen=True, kw_only=True)
+class Detect:
+    """Find the tomatoes in images: a JSON list with box, score, category and mask of each."""
+
+    images: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="IMAGE_OR_FOLDER")]
+    """An image, or a folder of images."""
+    segmenter: str = "light"
+    """light, colour, mask_rcnn or yolo, or a file of weights; by default the weights that ship."""
+    out: Path = Path("detections.json")
+    """File of the list."""
+    score_threshold: float = 0.05
+    """Leave out what is less certain; 0.3 is a good compromise to look at, lower ones to compute average precision."""
+    pictures: Path | None = None
+    """Also write each image with its fruits drawn over, into this folder."""
+
+    def run(self) -> None:
+        """Detects and says how many."""
+        from maniskill_tomato.errors import InvalidInputError
+        from maniskill_tomato.perception.detect import detect, image_files
+        from maniskill_tomato.perception.instances import Image, Instances
+        from maniskill_tomato.perception.pictures import draw_instances, write_picture
+        from maniskill_tomato.perception.segmenter import make_segmenter
+
+        if not 0 <= self.score_threshold <= 1:
+            raise InvalidInputError(f"--score-threshold must be between 0 and 1, got {self.score_threshold}")
+        if self.segmenter == "ground_truth":
+            raise InvalidInputError("the segmenter ground_truth knows rendered views only, no image files")
+        image_files(self.images)
+        options = {} if self.segmenter == "colour" else {"score_threshold": self.score_threshold}
+        segmenter = make_segmenter(self.segmenter, **options)
+
+        def draw(name: str, image: Image, found: Instances) -> None:
+            if self.pictures is not None:
+                write_picture(self.pictures / f"{Path(name).stem}.jpg", draw_instances(image, found, 0.3))
+
+        summary = detect(self.images, segmenter, self.out, draw)
+        for reason in summary.skipped[:10]:
+            print(f"skipped {reason}")
+        if len(summary.skipped) > 10:
+            print(f"skipped {len(summary.skipped) - 10} more")
+        fruits = "tomato" if summary.detections == 1 else "tomatoes"
+        print(
+            f"{summary.detections} {fruits} in {summary.images} images, {len(summary.skipped)} files skipped"
+        )
+        print(f"list {self.out}")

@@ -1,0 +1,85 @@
+"""What a student saw, and what the teacher would have done there."""
+
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+import gymnasium as gym
+import numpy as np
+import torch
+from torch import Tensor
+
+from maniskill_tomato.planners.env_truth import EnvironmentTruth
+from maniskill_tomato.planners.lattice_oracle import LatticeOracle
+from maniskill_tomato.visibility.situation import Situation
+
+
+class Student(Protocol):
+    """A policy that learns."""
+
+    def begin(self, situation: Situation, env_idx: Tensor) -> None:
+        """Forgets the last episode."""
+
+    def act(self, situation: Situation) -> Tensor:
+        """Its move. Shape (1, 3)."""
+        ...
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class ImitationData:
+    """N moves of M episodes, in the order in which they were made."""
+
+    observations: Tensor
+    """Shape (N, D), float16."""
+    actions: Tensor
+    """The teacher's moves. Shape (N, 3)."""
+    lengths: Tensor
+    """Moves of each episode. Shape (M,), int64."""
+
+    @classmethod
+    def join(cls, parts: list["ImitationData"]) -> "ImitationData":
+        """All of them, one after the other."""
+        return cls(
+            observations=torch.cat([p.observations for p in parts]),
+            actions=torch.cat([p.actions for p in parts]),
+            lengths=torch.cat([p.lengths for p in parts]),
+        )
+
+
+def collect_demonstrations(
+    env: gym.Env[Any, Any], seeds: range, student: Student | None, student_share: float
+) -> ImitationData:
+    """Runs episodes led by the student or the teacher, and asks the teacher everywhere (DAgger, Ross et al., 2011).
+
+    Args:
+        env: A general viewpoint task with one environment.
+        seeds: Of the episodes.
+        student: Leads some of the episodes; None leaves all to the teacher (behaviour cloning).
+        student_share: Probability that the student leads an episode.
+    """
+    world: Any = env.unwrapped
+    truth = EnvironmentTruth(env)
+    teacher = LatticeOracle(truth, truth.threshold)
+    first = torch.zeros(1, dtype=torch.int64)
+    observations: list[Tensor] = []
+    actions: list[Tensor] = []
+    lengths: list[int] = []
+    for seed in seeds:
+        env.reset(seed=seed)
+        led = student is not None and np.random.default_rng(seed).uniform() < student_share
+        teacher.begin(world.situation, first)
+        if student is not None:
+            student.begin(world.situation, first)
+        moves, done = 0, False
+        while not done:
+            situation: Situation = world.situation
+            wanted = teacher.act(situation)
+            observations.append(situation.observation[0].half())
+            actions.append(wanted[0])
+            move = student.act(situation) if led and student is not None else wanted
+            _, _, terminated, truncated, _ = env.step(move)
+            done = bool(terminated) or bool(truncated)
+            moves += 1
+        lengths.append(moves)
+    return ImitationData(
+        observations=torch.stack(observations), actions=torch.stack(actions), lengths=torch.tensor(lengths)
+    )

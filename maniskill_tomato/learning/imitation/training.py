@@ -1,0 +1,169 @@
+"""From nothing to an imitated policy: rounds of episodes and fits, kept in a folder and continued from there."""
+
+import dataclasses
+import json
+from collections.abc import Callable
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any, Literal
+
+import torch
+from torch import Tensor
+
+import maniskill_tomato
+from maniskill_tomato.errors import InvalidInputError
+from maniskill_tomato.files import write_atomically
+from maniskill_tomato.learning.agent import make_agent
+from maniskill_tomato.learning.blocks import Block, run_blocks
+from maniskill_tomato.learning.checkpoint import make_checkpoint, save_checkpoint
+from maniskill_tomato.learning.envs import make_env
+from maniskill_tomato.learning.imitation.collect import ImitationData, Student, collect_demonstrations
+from maniskill_tomato.learning.imitation.fit import ImitationFitConfig, fit_actor, fit_recurrent
+from maniskill_tomato.learning.policy import load_policy
+from maniskill_tomato.learning.presets import get_preset
+from maniskill_tomato.planners.learned import LearnedPolicy
+from maniskill_tomato.planners.recurrent import (
+    RecurrentActor,
+    RecurrentPolicy,
+    columns_of,
+    load_recurrent,
+    save_recurrent,
+)
+from maniskill_tomato.visibility.observation import ObservationLayout
+
+ENV_ID = "TomatoViewpoint-v1"
+
+StudentKind = Literal["actor", "recurrent"]
+
+
+@dataclass(frozen=True, kw_only=True)
+class ImitationConfig:
+    """A training."""
+
+    student: StudentKind = "actor"
+    """`actor`: the network of the preset `general-td3` on the whole observation; `recurrent`: a GRU on what the present
+    view tells, without the memory."""
+    rounds: tuple[int, ...] = (1500, 1000, 1000, 1000)
+    """Episodes of each round. The teacher leads the first, which alone is behaviour cloning; the student of the round
+    before leads `student_share` of the later ones (DAgger)."""
+    student_share: float = 0.9
+    """Share of the later rounds' episodes that the student leads."""
+    pool: int = 120
+    """Training plants that three quarters of the episodes draw from; the others grow a new one each."""
+    block: int = 100
+    """Episodes that a process runs and writes at a time; what a stopped training repeats."""
+    fit: ImitationFitConfig = field(default_factory=ImitationFitConfig)
+    """How each round's student is fitted, always from scratch to the data of all rounds."""
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        for name in ("pool", "block"):
+            if getattr(self, name) < 1:
+                raise InvalidInputError(f"{name} must be 1 or more, got {getattr(self, name)}")
+        if not self.rounds or min(self.rounds) < 1:
+            raise InvalidInputError(f"rounds must list one or more numbers above 0, got {self.rounds}")
+        if not 0.0 <= self.student_share <= 1.0:
+            raise InvalidInputError(f"student_share must be from 0 to 1, got {self.student_share}")
+        if not 0 <= self.seed < 100:
+            raise InvalidInputError(f"seed must be from 0 to 99, got {self.seed}")
+
+
+def train_imitation(
+    out: Path,
+    config: ImitationConfig | None = None,
+    jobs: int = 1,
+    env_options: dict[str, Any] | None = None,
+    report: Callable[[str], None] = lambda line: None,
+) -> Path:
+    """Trains, or goes on with the training in a folder.
+
+    Args:
+        out: Folder of the data and the policies.
+        config: How; the folder's own on a training that goes on.
+        jobs: Processes that run episodes.
+        env_options: Options of the task beside its plants' split.
+        report: Told one line after every block and every 500 batches.
+
+    Returns:
+        File of the last round's policy, `policy.pt`; `round-0.pt` is the behaviour-cloned one.
+
+    Raises:
+        InvalidInputError: The folder holds a training with another configuration.
+        TrainingDivergedError: A loss is not finite.
+    """
+    config = config or ImitationConfig()
+    options = env_options or {}
+    settings = json.loads(json.dumps({"config": asdict(config), "env_options": options}))
+    described = out / "config.json"
+    if described.is_file() and json.loads(described.read_text()) != settings:
+        raise InvalidInputError(f"{out} holds a training with other settings; choose another folder")
+    write_atomically(described, json.dumps(settings, indent=2).encode())
+    blocks: list[Block] = []
+    path = out / "round-0.pt"
+    for number, episodes in enumerate(config.rounds):
+        student = None if number == 0 else path
+        path = out / f"round-{number}.pt"
+        # Far from the seeds of other trainings on the same plants.
+        first = 500_000_000 + (config.seed * len(config.rounds) + number) * 100_000
+        for b in range(-(-episodes // config.block)):
+            # A quarter of the blocks meets new plants only.
+            pool = None if b % 4 == 3 else config.pool
+            seeds = first + b * config.block, min(config.block, episodes - b * config.block)
+            arguments = (*seeds, pool, options, config.student, student, config.student_share)
+            blocks.append(Block(path=out / f"train-{number}-{b}.pt", make=_collect, arguments=arguments))
+        if path.is_file():
+            continue
+        run_blocks(blocks, jobs, report)
+        data = ImitationData.join([ImitationData(**block.read()) for block in blocks])
+        report(f"round {number}: {len(data.actions)} moves in {len(data.lengths)} episodes")
+        _fit(config, data, path, report)
+    final = out / "policy.pt"
+    write_atomically(final, path.read_bytes())
+    return final
+
+
+def _fit(config: ImitationConfig, data: ImitationData, path: Path, report: Callable[[str], None]) -> None:
+    torch.manual_seed(config.fit.seed)
+    facts = {"episodes": len(data.lengths), "steps": len(data.actions), "seed": config.seed}
+
+    def tell(step: int, loss: float) -> None:
+        report(f"batch {step}: loss {loss:.4f}")
+
+    if config.student == "recurrent":
+        parts = ObservationLayout.without_memory().parts
+        columns = columns_of(parts)
+        recurrent = RecurrentActor(len(columns))
+        seen = dataclasses.replace(data, observations=data.observations[:, columns])
+        fit_recurrent(recurrent, seen, config.fit, tell)
+        about = {**facts, "env_id": ENV_ID, "package_version": maniskill_tomato.__version__}
+        save_recurrent(path, RecurrentPolicy(recurrent, parts, about))
+        return
+    agent = make_agent(get_preset("general-td3"), data.observations.shape[1], 3)
+    fit_actor(agent.actor, data, config.fit, tell)
+    bounds = -torch.ones(3), torch.ones(3)
+    checkpoint = make_checkpoint(agent, ENV_ID, bounds, {**facts}, with_training_state=False, env_options={})
+    save_checkpoint(path, checkpoint)
+
+
+def _student(kind: StudentKind, path: Path) -> Student:
+    return load_recurrent(path) if kind == "recurrent" else LearnedPolicy(load_policy(path))
+
+
+def _collect(
+    first: int,
+    episodes: int,
+    pool: int | None,
+    options: dict[str, Any],
+    kind: StudentKind,
+    student: Path | None,
+    student_share: float,
+) -> dict[str, Tensor]:
+    """Episodes of seeds from `first` on, in whatever process this is."""
+    plant = {"seed": "train", "pool": pool, **dict(options.get("plant", {}))}
+    env = make_env(ENV_ID, **{**options, "plant": plant})
+    try:
+        led_by = None if student is None else _student(kind, student)
+        data = collect_demonstrations(env, range(first, first + episodes), led_by, student_share)
+    finally:
+        env.close()
+    return {f.name: getattr(data, f.name) for f in dataclasses.fields(ImitationData)}

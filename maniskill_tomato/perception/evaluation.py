@@ -1,0 +1,85 @@
+"""How good a segmenter is on annotated images: numbers, curves, pictures."""
+
+import time
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from maniskill_tomato.errors import InvalidInputError
+from maniskill_tomato.perception.annotations import AnnotatedImage
+from maniskill_tomato.perception.coco_metrics import coco_metrics
+from maniskill_tomato.perception.detection_metrics import DetectionScore, ImageTruth, Overlap, image_truth
+from maniskill_tomato.perception.detection_plots import plot_precision_recall
+from maniskill_tomato.perception.instances import Image, Instances
+from maniskill_tomato.perception.pictures import contact_sheet, draw_instances, write_picture
+from maniskill_tomato.perception.segmenter import Segmenter
+
+PICTURES = 16
+"""Images on the sheet of results."""
+
+WORKING_SCORE = 0.3
+"""Score above which precision and recall are also given."""
+
+
+def evaluate_segmenter(
+    segmenter: Segmenter, images: Sequence[AnnotatedImage], out: Path, limit: int | None = None
+) -> dict[str, float]:
+    """Runs a segmenter over images and compares with their annotation; all fruits count, ripe or not.
+
+    Writes `precision_recall.png` (Fig. 4-20, 4-24) and `pictures.jpg` (Fig. 4-21 to 4-27). Masks are compared if every
+    image has them.
+
+    Args:
+        segmenter: What to judge.
+        images: Annotated images.
+        out: Folder of the figures.
+        limit: Look at this many images only, spread evenly.
+
+    Returns:
+        `box_AP50` and `mask_AP50` (Eq. 4-3 at an overlap of 0.5), precision and recall at `WORKING_SCORE`, COCO's
+        metrics as `coco_box_...` and `coco_mask_...`, counts, seconds an image.
+
+    Raises:
+        InvalidInputError: There is no image, or one cannot be read.
+        MissingPackageError: pycocotools is not installed.
+    """
+    if not images:
+        raise InvalidInputError("there must be annotated images to evaluate on")
+    if limit is not None:
+        images = [images[i] for i in np.linspace(0, len(images) - 1, min(limit, len(images))).astype(int)]
+    sheet = set(np.linspace(0, len(images) - 1, min(PICTURES, len(images))).astype(int).tolist())
+    drawn: list[Image] = []
+    with_masks = all(f.visible_mask is not None for image in images for f in image.fruits)
+    overlaps: tuple[Overlap, ...] = ("box", "mask") if with_masks else ("box",)
+    scores = {overlap: DetectionScore(overlap) for overlap in overlaps}
+    pairs: list[tuple[Instances, ImageTruth]] = []
+    seconds = []
+    for number, image in enumerate(images):
+        picture = image.load()
+        depth = image.load_depth()
+        start = time.perf_counter()
+        found = segmenter(picture, None if depth is None else depth.astype(np.float32))
+        seconds.append(time.perf_counter() - start)
+        truth = image_truth(image)
+        for score in scores.values():
+            score.add(found, truth)
+        pairs.append((found, truth))
+        if number in sheet:
+            drawn.append(draw_instances(picture, found, WORKING_SCORE))
+    metrics: dict[str, float] = {"images": len(images), "fruits": scores["box"].fruits}
+    curves = {}
+    for overlap, score in scores.items():
+        curve = score.precision_recall()
+        precision, recall = curve.at_score(WORKING_SCORE)
+        curves[overlap] = curve
+        metrics |= {
+            f"{overlap}_AP50": curve.average_precision,
+            f"{overlap}_precision": precision,
+            f"{overlap}_recall": recall,
+        }
+        metrics |= {f"coco_{overlap}_{k}": v for k, v in coco_metrics(pairs, overlap).items()}
+    metrics["median_seconds"] = float(np.median(seconds))
+    plot_precision_recall(curves, out / "precision_recall.png")
+    write_picture(out / "pictures.jpg", contact_sheet(drawn))
+    return metrics

@@ -1,0 +1,144 @@
+"""A training loop that can be stopped after any step and goes on bit for bit."""
+
+import io
+import json
+from abc import ABC, abstractmethod
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import nn
+
+from maniskill_tomato.errors import CheckpointError, TrainingDivergedError
+from maniskill_tomato.files import read_tensors, write_atomically
+
+CHECKPOINT = "checkpoint.pt"
+WEIGHTS = "weights.pt"
+HISTORY = "history.json"
+
+
+class ResumableTraining(ABC):
+    """What trainings of segmenters share: the loop, its history and its checkpoints.
+
+    Attributes:
+        step: Steps done.
+        history: A line every `log_every` steps: `step`, the mean of each loss term since the last line and, where they
+            were measured, the losses on validation images as `val_...`.
+    """
+
+    steps: int
+    log_every: int
+    save_every: int
+    rng: np.random.Generator
+    optimizer: torch.optim.Optimizer
+
+    def __init__(self) -> None:
+        self.step = 0
+        self.history: list[dict[str, float]] = []
+        self._sums: dict[str, float] = {}
+
+    @abstractmethod
+    def train_step(self) -> dict[str, float]:
+        """One batch; the loss terms, `loss` being their weighted sum. It counts `step` up."""
+
+    @abstractmethod
+    def validation_losses(self) -> dict[str, float]:
+        """The same on validation images, named `val_...`; empty without such images."""
+
+    @abstractmethod
+    def modules(self) -> dict[str, nn.Module]:
+        """The networks that a checkpoint holds, by name."""
+
+    @abstractmethod
+    def described(self) -> dict[str, Any]:
+        """The settings that decide the result, as JSON can hold them."""
+
+    @abstractmethod
+    def write_weights(self, path: Path) -> None:
+        """Writes the trained network for use."""
+
+    def run(
+        self, out: Path, report: Callable[[str], None], stopped: Callable[[], bool] = lambda: False
+    ) -> Path | None:
+        """Trains to the end.
+
+        Args:
+            out: Folder of checkpoints, history and weights.
+            report: Takes a line now and then.
+            stopped: Asked after every step; if true, the state is saved and the training ends early.
+
+        Returns:
+            File of the weights, or None if it was stopped.
+
+        Raises:
+            TrainingDivergedError: A loss is no longer a finite number.
+            CheckpointError: A file cannot be written.
+        """
+        while self.step < self.steps:
+            terms = self.train_step()
+            if not np.isfinite(terms["loss"]):
+                raise TrainingDivergedError(
+                    f"the loss is {terms['loss']} at step {self.step}; lower the learning rate"
+                )
+            for name, value in terms.items():
+                self._sums[name] = self._sums.get(name, 0.0) + value
+            if self.step % self.log_every == 0 or self.step == self.steps:
+                count = self.step % self.log_every or self.log_every
+                line = {"step": float(self.step), **{k: v / count for k, v in self._sums.items()}}
+                self._sums.clear()
+                self.history.append(line)
+                report("  ".join(f"{k} {v:.4g}" for k, v in line.items()))
+            end = stopped()
+            if end or self.step % self.save_every == 0 or self.step == self.steps:
+                if self.history and self.history[-1]["step"] == self.step:
+                    self.history[-1] |= self.validation_losses()
+                self.save(out)
+            if end:
+                return None
+        self.write_weights(out / WEIGHTS)
+        return out / WEIGHTS
+
+    def save(self, out: Path) -> None:
+        """Writes the state and the history.
+
+        Raises:
+            CheckpointError: A file cannot be written.
+        """
+        state = {
+            "step": self.step,
+            "settings": json.dumps(self.described()),
+            "modules": {name: module.state_dict() for name, module in self.modules().items()},
+            "optimizer": self.optimizer.state_dict(),
+            "rng": json.dumps(self.rng.bit_generator.state),
+            "torch_rng": torch.get_rng_state(),
+            "history": json.dumps(self.history),
+            "sums": json.dumps(self._sums),
+        }
+        buffer = io.BytesIO()
+        torch.save(state, buffer)
+        write_atomically(out / CHECKPOINT, buffer.getvalue())
+        write_atomically(out / HISTORY, json.dumps(self.history, indent=1).encode())
+
+    def resume(self, out: Path) -> None:
+        """Goes on where `save` was called last.
+
+        Raises:
+            CheckpointError: There is no usable checkpoint, or it is of other settings.
+        """
+        state = read_tensors(out / CHECKPOINT)
+        try:
+            if json.loads(state["settings"]) != json.loads(json.dumps(self.described())):
+                raise CheckpointError(
+                    f"{out / CHECKPOINT} was trained with other settings; repeat them, or choose another --out"
+                )
+            for name, module in self.modules().items():
+                module.load_state_dict(state["modules"][name])
+            self.optimizer.load_state_dict(state["optimizer"])
+            self.rng.bit_generator.state = json.loads(state["rng"])
+            torch.set_rng_state(state["torch_rng"])
+            self.step, self.history = int(state["step"]), json.loads(state["history"])
+            self._sums = json.loads(state["sums"])
+        except (KeyError, TypeError, ValueError, RuntimeError) as error:
+            raise CheckpointError(f"{out / CHECKPOINT} is no state of this training ({error})") from error

@@ -1,0 +1,99 @@
+"""Files of segmenter weights: what they are for, how they were trained, and half-precision tensors."""
+
+import io
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+import maniskill_tomato
+from maniskill_tomato.errors import CheckpointError
+from maniskill_tomato.files import read_tensors, write_atomically
+
+FORMAT = 1
+"""Version of the layout that `save_weights` documents."""
+
+
+def save_weights(
+    path: Path,
+    kind: str,
+    config: dict[str, Any],
+    state: dict[str, Tensor],
+    training: dict[str, Any] | None = None,
+    half: bool = True,
+) -> None:
+    """Writes the weights of a segmenter, whole or not at all.
+
+    Args:
+        path: Where to.
+        kind: Name of the segmenter that they are for.
+        config: What builds its network.
+        state: The network's weights.
+        training: How it was trained: data, pictures seen, measured results.
+        half: Keep floating-point tensors in 16 bits, for half the size.
+
+    Raises:
+        CheckpointError: The file cannot be written.
+    """
+    kept = {name: t.half() if half and t.is_floating_point() else t for name, t in state.items()}
+    buffer = io.BytesIO()
+    data = {
+        "format": FORMAT,
+        "package_version": maniskill_tomato.__version__,
+        "segmenter": kind,
+        "config": config,
+        "state": {name: t.detach().cpu().contiguous() for name, t in kept.items()},
+        "training": training or {},
+    }
+    torch.save(data, buffer)
+    write_atomically(path, buffer.getvalue())
+
+
+def load_weights(path: Path, kind: str) -> dict[str, Any]:
+    """What `save_weights` wrote, with tensors in 32 bits.
+
+    Raises:
+        CheckpointError: The file is missing, damaged, of another segmenter, or not one of ours.
+    """
+    if not Path(path).is_file():
+        raise CheckpointError(
+            f"no weights at {path}; train some with scripts/train_segmenter.py, or leave --segmenter out to use "
+            "those that ship"
+        )
+    data = read_tensors(path)
+    if not isinstance(data, dict) or "segmenter" not in data or "state" not in data:
+        raise CheckpointError(
+            f"{path} holds no segmenter's weights; scripts/train_segmenter.py writes such files"
+        )
+    if data["segmenter"] != kind:
+        raise CheckpointError(f"{path} holds weights of the segmenter {data['segmenter']!r}, not of {kind!r}")
+    if not isinstance(data["format"], int) or data["format"] > FORMAT:
+        raise CheckpointError(
+            f"{path} has weight format {data['format']}; this version, {maniskill_tomato.__version__}, reads up to "
+            f"{FORMAT}: upgrade maniskill-tomato",
+            newer_format=True,
+        )
+    data["state"] = {n: t.float() if t.is_floating_point() else t for n, t in data["state"].items()}
+    return data
+
+
+def read_kind(path: Path) -> str:
+    """The segmenter that a file of weights is for; `yolo` for one that is not ours but named `yolo*.pt`.
+
+    Raises:
+        CheckpointError: The file is missing, damaged, or says nothing.
+    """
+    if path.is_file() and path.name.lower().startswith("yolo"):
+        return "yolo"
+    if not path.is_file():
+        raise CheckpointError(
+            f"no weights at {path}; train some with scripts/train_segmenter.py, or leave --segmenter out to use "
+            "those that ship"
+        )
+    data = read_tensors(path)
+    if not isinstance(data, dict) or not isinstance(data.get("segmenter"), str):
+        raise CheckpointError(
+            f"{path} holds no segmenter's weights; scripts/train_segmenter.py writes such files"
+        )
+    return str(data["segmenter"])

@@ -1,0 +1,519 @@
+"""Hand-eye calibration from rendered boards: a known camera on the flange comes back, and what is wrong is said."""
+
+import json
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+import torch
+from numpy.typing import NDArray
+
+from maniskill_tomato.cli import main
+from maniskill_tomato.deploy.calibration.board import CharucoBoard
+from maniskill_tomato.deploy.calibration.board_print import print_board
+from maniskill_tomato.deploy.calibration.calibration_file import read_calibration, write_calibration
+from maniskill_tomato.deploy.calibration.capture import CapturePlan, camera_poses, capture_views
+from maniskill_tomato.deploy.calibration.hand_eye import (
+    BoardView,
+    CalibrationError,
+    HandEyeResult,
+    board_pose,
+    calibrate_hand_eye,
+)
+from maniskill_tomato.deploy.calibration.picture import draw_calibration
+from maniskill_tomato.deploy.calibration.rigid import (
+    difference,
+    inverse,
+    rotation_from_vector,
+    transform,
+    vector_from_rotation,
+)
+from maniskill_tomato.deploy.calibration.view_folder import (
+    RecordedView,
+    board_view,
+    flange_pose,
+    read_views,
+    write_views,
+)
+from maniskill_tomato.deploy.clock import SimulatedClock
+from maniskill_tomato.deploy.guarded_arm import GuardedArm
+from maniskill_tomato.deploy.interface import Arm, ArmState, Camera, Float64, Frame, JointMove
+from maniskill_tomato.deploy.profile import parse_profile
+from maniskill_tomato.deploy.safety import Safety
+from maniskill_tomato.deploy.safety_config import SafetyConfig
+from maniskill_tomato.errors import InvalidInputError
+from maniskill_tomato.robot import d435
+from maniskill_tomato.robot.d435 import CameraIntrinsics
+from maniskill_tomato.robot.inverse_kinematics import InverseKinematics
+from maniskill_tomato.robot.look_at import look_at_pose
+
+BOARD = CharucoBoard()
+COLOR = d435.color_intrinsics(640, 480, "measured")
+# A bracket 20 mm and 4 degrees off its drawing.
+X = d435.T_flange_camera_color_optical @ transform(
+    rotation_from_vector(np.array([0.03, -0.05, 0.04])), np.array([0.012, -0.008, 0.015])
+)
+# The board lies on a block before the robot, its print up.
+Z = transform(
+    np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
+    @ rotation_from_vector(np.array([0.1, 0.0, 0.3])),
+    np.array([0.5, -0.1, 0.15]),
+)
+START = np.deg2rad([0.0, 20.0, 0.0, -95.0, 0.0, 65.0, 0.0])
+
+
+def rendered(T_camera_board: Float64, seed: int, noise: float = 3.0) -> NDArray[np.uint8]:
+    """The board's print seen by the camera: a homography at three times the size, reduced, blurred, with noise."""
+    edge, up = 100, 3
+    paper = cv2.copyMakeBorder(BOARD.picture(edge), edge, edge, edge, edge, cv2.BORDER_CONSTANT, value=(255,))
+    metres = BOARD.square_length / edge
+    # From the paper's pixels (OpenCV counts from their centres) to metres on the board, to pixels of the picture.
+    to_board = np.array([[metres, 0, (0.5 - edge) * metres], [0, metres, (0.5 - edge) * metres], [0, 0, 1]])
+    to_pixels = np.diag([up, up, 1.0]) @ COLOR.matrix @ T_camera_board[:3, [0, 1, 3]]
+    shift = np.array([[1, 0, -0.5], [0, 1, -0.5], [0, 0, 1]])
+    size = (COLOR.width, COLOR.height)
+    large = cv2.warpPerspective(
+        paper,
+        shift @ to_pixels @ to_board,
+        (size[0] * up, size[1] * up),
+        flags=cv2.INTER_AREA,
+        borderValue=(90,),
+    )
+    grey = cv2.GaussianBlur(cv2.resize(large, size, interpolation=cv2.INTER_AREA), (0, 0), 0.6)
+    noisy = 0.8 * grey + 20.0 + np.random.default_rng(seed).normal(0.0, noise, grey.shape)
+    return np.repeat(np.clip(noisy, 0, 255).astype(np.uint8)[..., None], 3, axis=2)
+
+
+def postures(count: int, seed: int = 0, roll: float = 1.0, tilt: float = 0.6) -> list[Float64]:
+    """Joint angles from which the camera sees the board."""
+    rng = np.random.default_rng(seed)
+    kinematics, found = InverseKinematics(), list[Float64]()
+    middle = (Z @ np.array([BOARD.size[0] / 2, BOARD.size[1] / 2, 0.0, 1.0]))[:3]
+    while len(found) < count:
+        angle, azimuth, distance = rng.uniform(0, tilt), rng.uniform(-np.pi, np.pi), rng.uniform(0.3, 0.42)
+        away = np.array([np.sin(angle) * np.cos(azimuth), np.sin(angle) * np.sin(azimuth), np.cos(angle)])
+        pose = look_at_pose(
+            torch.from_numpy(middle + distance * away), torch.from_numpy(middle), rng.uniform(-roll, roll)
+        ).numpy()
+        solution = kinematics.solve(
+            torch.from_numpy(pose @ inverse(X))[None], torch.from_numpy(START)[None], neighbour=False
+        )
+        if int(solution.reach[0]) == 0:
+            found.append(solution.qpos[0].numpy())
+    return found
+
+
+def recorded(joints: Float64, number: int, noise: float = 3.0) -> RecordedView:
+    picture = rendered(inverse(flange_pose(joints) @ X) @ Z, number, noise)
+    return RecordedView(name=f"view_{number:03d}.png", color=picture, joint_positions=joints)
+
+
+def exact_views(joints: list[Float64], noise_px: float = 0.0, seed: int = 0) -> list[BoardView]:
+    """Views without pictures: corners by projection."""
+    rng = np.random.default_rng(seed)
+    views = []
+    for number, q in enumerate(joints):
+        points = BOARD.corners @ (chain := inverse(flange_pose(q) @ X) @ Z)[:3, :3].T + chain[:3, 3]
+        pixels = COLOR.project(points) + rng.normal(0.0, noise_px, (len(points), 2))
+        inside = np.all((pixels > 0) & (pixels < [COLOR.width, COLOR.height]), axis=1)
+        views.append(
+            BoardView(
+                name=f"{number}",
+                T_base_flange=flange_pose(q),
+                corner_ids=np.flatnonzero(inside).astype(np.int64),
+                corners_px=pixels[inside],
+            )
+        )
+    return views
+
+
+@pytest.fixture(scope="module")
+def views() -> list[RecordedView]:
+    return [recorded(q, k) for k, q in enumerate(postures(15))]
+
+
+@pytest.fixture(scope="module")
+def result(views: list[RecordedView]) -> HandEyeResult:
+    return calibrate_hand_eye(BOARD, [board_view(BOARD, v) for v in views], COLOR)
+
+
+def test_a_known_camera_comes_back_from_rendered_boards_to_a_millimetre_and_a_tenth_of_a_degree(
+    result: HandEyeResult,
+) -> None:
+    distance, angle = difference(result.T_flange_camera, X)
+    assert distance < 0.001 and np.degrees(angle) < 0.1
+    # What it does reach here, with a margin: a regression would show.
+    assert distance < 0.0002 and np.degrees(angle) < 0.03
+    distance, angle = difference(result.T_base_board, Z)
+    assert distance < 0.0005 and np.degrees(angle) < 0.05
+    assert len(result.views) == 15 and result.left_out == ()
+    assert result.rms_px < 0.15
+
+
+def test_its_standard_deviation_is_that_of_many_noisy_calibrations() -> None:
+    joints = postures(8, seed=3)
+    found = [calibrate_hand_eye(BOARD, exact_views(joints, 0.3, seed), COLOR) for seed in range(24)]
+    errors = np.array([r.T_flange_camera[:3, 3] - X[:3, 3] for r in found])
+    spread = np.sqrt(np.mean(np.sum(errors**2, axis=1)))
+    assert np.mean([r.position_std for r in found]) == pytest.approx(spread, rel=0.3)
+    angles = np.array([difference(r.T_flange_camera, X)[1] for r in found])
+    assert np.mean([r.rotation_std for r in found]) == pytest.approx(np.sqrt(np.mean(angles**2)), rel=0.3)
+
+
+def test_views_without_noise_give_the_exact_answer() -> None:
+    exact = calibrate_hand_eye(BOARD, exact_views(postures(6, seed=1)), COLOR)
+    distance, angle = difference(exact.T_flange_camera, X)
+    assert distance < 1e-8 and angle < 1e-8
+    assert exact.rms_px < 1e-6
+
+
+@pytest.mark.skipif(
+    not hasattr(cv2, "calibrateHandEye"), reason="this OpenCV hides its own solution from Python"
+)
+def test_the_closed_form_is_that_of_opencv() -> None:
+    from maniskill_tomato.deploy.calibration.hand_eye import _closed_form
+
+    seen = exact_views(postures(8, seed=2), 0.5)
+    flanges = np.stack([v.T_base_flange for v in seen])
+    boards = np.stack([board_pose(BOARD, v, COLOR) for v in seen])
+    ours = _closed_form(flanges, boards)
+    rotation, translation = cv2.calibrateHandEye(  # type: ignore[attr-defined]
+        flanges[:, :3, :3],
+        flanges[:, :3, 3],
+        boards[:, :3, :3],
+        boards[:, :3, 3],
+        method=cv2.CALIB_HAND_EYE_PARK,
+    )
+    np.testing.assert_allclose(ours[:3, :3], rotation, atol=1e-9)
+    np.testing.assert_allclose(ours[:3, 3], translation.ravel(), atol=1e-9)
+
+
+def test_a_board_that_was_pushed_in_one_view_leaves_that_view_out() -> None:
+    joints = postures(10, seed=4)
+    seen = exact_views(joints, 0.1)
+    pushed = seen[3].T_base_flange.copy()
+    pushed[:3, 3] += [0.01, -0.005, 0.0]
+    seen[3] = replace(seen[3], T_base_flange=pushed)
+    found = calibrate_hand_eye(BOARD, seen, COLOR)
+    assert [text.split(":")[0] for text in found.left_out] == ["3"]
+    assert difference(found.T_flange_camera, X)[0] < 0.0005
+
+
+def test_turns_about_one_axis_only_are_refused() -> None:
+    seen = exact_views(postures(1))
+    # The flange turned about the camera's axis: the board only spins in the picture.
+    spun = [
+        replace(
+            seen[0],
+            T_base_flange=seen[0].T_base_flange
+            @ transform(rotation_from_vector(np.array([0.0, 0.0, a])), np.zeros(3)),
+        )
+        for a in np.linspace(-0.5, 0.5, 8)
+    ]
+    shown = []
+    for view in spun:
+        chain = inverse(view.T_base_flange @ X) @ Z
+        pixels = COLOR.project(BOARD.corners @ chain[:3, :3].T + chain[:3, 3])
+        shown.append(replace(view, corner_ids=np.arange(len(pixels), dtype=np.int64), corners_px=pixels))
+    with pytest.raises(CalibrationError, match="second axis"):
+        calibrate_hand_eye(BOARD, shown, COLOR)
+
+
+def test_too_few_views_or_corners_are_refused_with_their_names() -> None:
+    seen = exact_views(postures(6, seed=5))
+    with pytest.raises(CalibrationError, match="4 usable views"):
+        calibrate_hand_eye(BOARD, seen[:4], COLOR)
+    few = [replace(v, corner_ids=v.corner_ids[:5], corners_px=v.corners_px[:5]) for v in seen[:2]]
+    with pytest.raises(CalibrationError, match="left out: 0: 5 corners; 1: 5 corners"):
+        calibrate_hand_eye(BOARD, [*few, *seen[2:]], COLOR)
+
+
+def test_an_empty_picture_shows_no_board() -> None:
+    ids, pixels = BOARD.find(np.full((480, 640, 3), 128, np.uint8))
+    assert len(ids) == 0 and pixels.shape == (0, 2)
+
+
+def test_corners_are_found_where_they_are_drawn() -> None:
+    """The print itself as a picture: corners lie on whole squares, counted from the picture's edge."""
+    edge = 40
+    paper = cv2.copyMakeBorder(BOARD.picture(edge), 30, 30, 20, 20, cv2.BORDER_CONSTANT, value=(255,))
+    ids, pixels = BOARD.find(np.repeat(np.asarray(paper, np.uint8)[..., None], 3, axis=2))
+    assert len(ids) == (BOARD.columns - 1) * (BOARD.rows - 1)
+    off = pixels - (BOARD.corners[ids, :2] / BOARD.square_length * edge + [20, 30])
+    # Corners of pure black and white pixels come out up to 0.2 px off, to both sides; half a pixel would be a mistake.
+    assert np.abs(off).max() < 0.25
+    assert np.abs(off.mean(axis=0)).max() < 0.1
+
+
+def test_the_board_is_printed_at_its_true_size(tmp_path: Path) -> None:
+    small = CharucoBoard(columns=4, rows=3, dictionary="DICT_4X4_50")
+    print_board(tmp_path / "board.png", small)
+    page = cv2.imread(str(tmp_path / "board.png"), cv2.IMREAD_COLOR)
+    assert page is not None
+    ids, pixels = small.find(np.asarray(page, np.uint8))
+    assert len(ids) == 6
+    # 254 dots an inch are ten a millimetre.
+    np.testing.assert_allclose(pixels, 10_000.0 * (small.corners[ids, :2] + 0.02), atol=1.0)
+    print_board(tmp_path / "board.pdf", small)
+    # A page 160 mm wide, in points of 1/72 inch.
+    assert b"[ 0 0 453.54330" in (tmp_path / "board.pdf").read_bytes()
+    with pytest.raises(InvalidInputError, match="pdf"):
+        print_board(tmp_path / "board.bmp", small)
+
+
+def test_rotation_vectors_and_rotations_agree_also_near_half_a_turn() -> None:
+    rng = np.random.default_rng(0)
+    for angle in (0.0, 1e-12, 1e-7, 0.5, 3.0, np.pi - 1e-8, np.pi):
+        axis = rng.normal(size=3)
+        vector = axis / np.linalg.norm(axis) * angle
+        rotation = rotation_from_vector(vector)
+        np.testing.assert_allclose(rotation, cv2.Rodrigues(vector)[0], atol=1e-9)
+        np.testing.assert_allclose(rotation_from_vector(vector_from_rotation(rotation)), rotation, atol=1e-7)
+
+
+def test_a_folder_of_views_comes_back_as_it_was_written(tmp_path: Path, views: list[RecordedView]) -> None:
+    write_views(tmp_path, views[:2], COLOR, "123")
+    write_views(tmp_path, views[:3], COLOR, "123")
+    again, intrinsics, serial = read_views(tmp_path)
+    assert serial == "123" and intrinsics == COLOR and len(again) == 3
+    for one, other in zip(again, views, strict=False):
+        np.testing.assert_array_equal(one.color, other.color)
+        np.testing.assert_array_equal(one.joint_positions, other.joint_positions)
+
+
+def broken(change: Callable[[dict[str, Any]], object]) -> Callable[[dict[str, Any]], object]:
+    return change
+
+
+@pytest.mark.parametrize(
+    ("change", "match"),
+    [
+        (lambda i: i.pop("intrinsics"), "intrinsics must have"),
+        (lambda i: i["intrinsics"].update(fx=float("nan")), "cannot be read|intrinsics must have"),
+        (lambda i: i.update(views={}), "list `views`"),
+        (lambda i: i["views"][0].pop("joint_positions"), r"views\[0\].joint_positions"),
+        (lambda i: i["views"][1].update(joint_positions=[0.0] * 6), r"views\[1\].joint_positions"),
+        (lambda i: i["views"][1].update(joint_positions=[90.0] * 7), "in radians"),
+        (lambda i: i["views"][1].update(joint_positions=[None] * 7), r"views\[1\].joint_positions"),
+        (lambda i: i["views"][0].update(image="../view_000.png"), "file of this folder"),
+        (lambda i: i["views"][0].update(image="views.json"), "no readable picture"),
+        (lambda i: i["intrinsics"].update(width=641), "640 x 480"),
+    ],
+)
+def test_a_broken_folder_is_told_with_the_key(
+    tmp_path: Path, views: list[RecordedView], change: Callable[[dict[str, Any]], object], match: str
+) -> None:
+    write_views(tmp_path, views[:2], COLOR)
+    index = json.loads((tmp_path / "views.json").read_text())
+    change(index)
+    (tmp_path / "views.json").write_text(json.dumps(index))
+    with pytest.raises(CalibrationError, match=match):
+        read_views(tmp_path)
+
+
+def test_the_calibration_file_is_read_again_and_by_the_profile(tmp_path: Path, result: HandEyeResult) -> None:
+    path = tmp_path / "calibration.json"
+    write_calibration(path, result, COLOR, "0123 4'5")
+    again = read_calibration(path)
+    np.testing.assert_array_equal(again.T_flange_camera, result.T_flange_camera)
+    assert again.color_size == (640, 480) and again.view_count == 15 and again.serial == "0123 4'5"
+    text = '[arm]\ndriver = "mock"\n[camera]\ndriver = "mock"\n[calibration]\nfile = "calibration.json"\n'
+    profile = parse_profile(text, tmp_path / "lab.toml")
+    assert profile.calibrated
+    np.testing.assert_array_equal(profile.T_flange_camera, result.T_flange_camera)
+
+
+@pytest.mark.parametrize(
+    ("change", "match"),
+    [
+        (lambda t: t.pop("T_flange_camera"), "T_flange_camera is missing"),
+        (lambda t: t["T_flange_camera"][0].__setitem__(0, float("nan")), "finite"),
+        (lambda t: t["T_flange_camera"][0].__setitem__(0, 2.0), "rotation"),
+        (lambda t: t["T_flange_camera"][2].__setitem__(3, 47.0), "metres"),
+        (lambda t: t["T_flange_camera"].pop(), "shape"),
+        (lambda t: t.update(rms_px="small"), "rms_px must be numbers"),
+        (lambda t: t.update(serial=5), "serial must be a string"),
+        (lambda t: t.update(view_count=0), "positive"),
+    ],
+)
+def test_a_broken_calibration_file_is_told_with_the_key(
+    tmp_path: Path, result: HandEyeResult, change: Callable[[dict[str, Any]], object], match: str
+) -> None:
+    path = tmp_path / "calibration.json"
+    write_calibration(path, result, COLOR)
+    table = json.loads(path.read_text())
+    change(table)
+    path.write_text(json.dumps(table))
+    with pytest.raises(CalibrationError, match=match):
+        read_calibration(path)
+
+
+def test_the_picture_of_the_residuals_is_drawn(tmp_path: Path, result: HandEyeResult) -> None:
+    draw_calibration(tmp_path / "calibration.png", result, COLOR)
+    picture = cv2.imread(str(tmp_path / "calibration.png"))
+    assert picture is not None and picture.shape[1] > 1000
+    assert picture.std() > 10.0
+
+
+def test_the_command_calculates_from_a_folder_and_writes_file_and_picture(
+    tmp_path: Path, views: list[RecordedView], capsys: pytest.CaptureFixture[str]
+) -> None:
+    write_views(tmp_path / "views", views, COLOR, "42")
+    out = tmp_path / "out"
+    main(["deploy", "calibrate", "--views", str(tmp_path / "views"), "--out", str(out)])
+    assert "15 views" in capsys.readouterr().out
+    calibration = read_calibration(out / "calibration.json")
+    assert calibration.serial == "42"
+    assert difference(calibration.T_flange_camera, X)[0] < 0.0002
+    assert (out / "calibration.png").stat().st_size > 10_000
+
+
+@pytest.mark.parametrize(
+    ("arguments", "match"),
+    [
+        ([], "either --profile"),
+        (["--views", "/nowhere"], "no views.json"),
+        (["--views", "/nowhere", "--square", "30"], "square_length must be"),
+        (["--profile", "mock", "--confirm", "--unattended"], "not both"),
+    ],
+)
+def test_the_command_says_in_one_line_what_is_wrong(
+    arguments: list[str], match: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with pytest.raises(SystemExit) as ended:
+        main(["deploy", "calibrate", "--out", str(tmp_path), *arguments])
+    assert ended.value.code == 2
+    lines = capsys.readouterr().err.strip().splitlines()
+    assert lines[-1].startswith("error: ") and match in lines[-1]
+
+
+def test_boards_that_cannot_be_are_refused() -> None:
+    cases: list[dict[str, Any]] = [
+        {"columns": 2},
+        {"square_length": 30.0},
+        {"marker_length": 0.03},
+        {"dictionary": "DICT_9X9"},
+        {"columns": 12, "rows": 12, "dictionary": "DICT_4X4_50"},
+    ]
+    for wrong in cases:
+        with pytest.raises(InvalidInputError):
+            CharucoBoard(**wrong)
+
+
+class StillArm(Arm):
+    """An arm that is at once where it is sent."""
+
+    name = "still"
+
+    def __init__(self, clock: SimulatedClock) -> None:
+        self.joints, self.clock = START, clock
+        self.moves: list[JointMove] = []
+
+    @property
+    def is_connected(self) -> bool:
+        return True
+
+    def connect(self) -> None:
+        pass
+
+    def disconnect(self) -> None:
+        pass
+
+    def read(self, max_age_s: float = 0.5) -> ArmState:
+        return ArmState(joint_positions=self.joints, joint_velocities=np.zeros(7), stamp=self.clock.now())
+
+    def command(self, move: JointMove) -> JointMove:
+        self.clock.sleep(20.0)
+        self.joints = move.joint_positions
+        self.moves.append(move)
+        return move
+
+    def wait(self, timeout_s: float) -> bool:
+        return True
+
+    def stop(self) -> bool:
+        return True
+
+
+class BoardCamera(Camera):
+    """A camera on that arm before the board."""
+
+    name = "board"
+
+    def __init__(self, arm: StillArm) -> None:
+        self.arm, self.number = arm, 0
+
+    @property
+    def is_connected(self) -> bool:
+        return True
+
+    def connect(self) -> None:
+        pass
+
+    def disconnect(self) -> None:
+        pass
+
+    @property
+    def intrinsics(self) -> CameraIntrinsics:
+        return COLOR
+
+    def read(self, max_age_s: float = 0.5, after: float | None = None) -> Frame:
+        self.number += 1
+        self.arm.clock.sleep(0.03)
+        color = rendered(inverse(flange_pose(self.arm.joints) @ X) @ Z, self.number)
+        depth = np.zeros(color.shape[:2], np.float32)
+        return Frame(
+            color=color, depth=depth, intrinsics=COLOR, stamp=self.arm.clock.now(), number=self.number
+        )
+
+
+def test_the_arm_goes_round_the_board_through_the_guard_and_the_operator(tmp_path: Path) -> None:
+    clock = SimulatedClock()
+    arm = StillArm(clock)
+    camera = BoardCamera(arm)
+    asked: list[str] = []
+
+    def confirm(question: str) -> bool:
+        asked.append(question)
+        return len(asked) % 3 != 0
+
+    guarded = GuardedArm(arm, Safety(SafetyConfig()), clock)
+    taken = capture_views(guarded, camera, BOARD, tmp_path, clock, confirm, CapturePlan(views=8), serial="7")
+    assert len(taken) >= 7
+    assert len(arm.moves) == len(asked) - len(asked) // 3
+    folder, intrinsics, serial = read_views(tmp_path)
+    assert len(folder) == len(taken) and serial == "7"
+    found = calibrate_hand_eye(BOARD, [board_view(BOARD, v) for v in folder], intrinsics)
+    distance, angle = difference(found.T_flange_camera, X)
+    assert distance < 0.001 and np.degrees(angle) < 0.1
+
+
+def test_nothing_moves_when_the_operator_says_no_or_the_board_is_not_seen(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    clock = SimulatedClock()
+    arm = StillArm(clock)
+    guarded = GuardedArm(arm, Safety(SafetyConfig()), clock)
+    taken = capture_views(guarded, BoardCamera(arm), BOARD, tmp_path, clock, lambda question: False)
+    assert len(taken) == 1 and arm.moves == []
+    other = CharucoBoard(dictionary="DICT_4X4_50")
+    with pytest.raises(CalibrationError, match="not in the picture"):
+        capture_views(guarded, BoardCamera(arm), other, tmp_path, clock, lambda question: True)
+    assert arm.moves == []
+
+
+def test_capture_poses_look_at_the_middle_of_the_board_from_its_front() -> None:
+    plan = CapturePlan(views=10)
+    poses = camera_poses(BOARD, Z, flange_pose(START) @ X, plan)
+    middle = (Z @ np.array([BOARD.size[0] / 2, BOARD.size[1] / 2, 0.0, 1.0]))[:3]
+    to_middle = middle - poses[:, :3, 3]
+    distances = np.linalg.norm(to_middle, axis=1)
+    assert distances.min() >= plan.distances[0] - 1e-9 and distances.max() <= plan.distances[1] + 1e-9
+    np.testing.assert_allclose(poses[:, :3, 2], to_middle / distances[:, None], atol=1e-9)
+    # The board's z goes into the print, away from whoever looks at it.
+    tilts = np.arccos(poses[:, :3, 2] @ Z[:3, 2])
+    assert tilts.max() <= plan.largest_tilt + 1e-9 and tilts.max() > 0.8 * plan.largest_tilt

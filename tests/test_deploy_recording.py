@@ -1,0 +1,156 @@
+"""Recordings: what goes in comes out, full disks, and replay through today's code."""
+
+import json
+import resource
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+
+from maniskill_tomato.deploy.errors import RecordingError
+from maniskill_tomato.deploy.interface import Frame
+from maniskill_tomato.deploy.profile import Profile, parse_profile
+from maniskill_tomato.deploy.recording import McapRecorder, decode_depth, encode_depth, read_messages
+from maniskill_tomato.deploy.replay import load_recording, replay
+from maniskill_tomato.deploy.run import RunConfig, run
+from maniskill_tomato.deploy.steps import RunResult
+
+TEXT = """
+[arm]
+driver = "mock"
+[camera]
+driver = "mock"
+[twin]
+width = 160
+height = 120
+[perception]
+segmenter = "ground_truth"
+[target]
+source = "twin"
+[loop]
+max_moves = 4
+"""
+
+
+def profile(text: str = TEXT) -> Profile:
+    return parse_profile(text, Path("recorded.toml"))
+
+
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, RunResult]:
+    out = tmp_path_factory.mktemp("run")
+    return out, run(RunConfig(profile=profile(), out=out, policy="nbv", seed=9))
+
+
+def test_a_run_leaves_result_report_and_recording(finished: tuple[Path, RunResult]) -> None:
+    out, result = finished
+    content = json.loads((out / "result.json").read_text())
+    assert {"success", "reason", "moves", "visible_fraction", "seconds"} <= set(content)
+    assert content["success"] == result.success and content["moves"] == result.moves
+    assert len(content["steps"]) == len(result.visible_fractions)
+    assert content["steps"][-1]["outcome"] == result.reason
+    picture: Any = cv2.imread(str(out / "report.png"))
+    assert picture is not None and picture.shape[1] > 300 and picture.std() > 20.0
+
+
+def test_the_recording_holds_what_the_loop_saw(finished: tuple[Path, RunResult]) -> None:
+    out, result = finished
+    messages = list(read_messages(out / "run.mcap"))
+    topics = [topic for topic, _ in messages]
+    looks = len(result.visible_fractions)
+    for topic in ("/camera/color", "/camera/depth", "/camera/mask", "/arm/state", "/step", "/truth"):
+        assert topics.count(topic) == looks
+    assert messages[0][0] == "/info" and messages[0][1]["seed"] == 9
+    assert any(topic == "/log" and "end: " in message["message"] for topic, message in messages)
+    recorded = load_recording(out / "run.mcap")
+    fractions = [step.facts["visible_fraction"] for step in recorded.steps]
+    assert [round(v, 4) for v in fractions] == list(result.visible_fractions)
+    frame: Frame = recorded.steps[0].frame
+    assert frame.truth is not None
+    seen = (frame.truth.labels == frame.truth.target_label) & (frame.depth > 0.0)
+    distance = np.linalg.norm(
+        frame.truth.target_position - np.array(recorded.steps[0].facts["T_world_camera"])[:3, 3]
+    )
+    assert seen.any() and abs(float(np.median(frame.depth[seen])) - distance) < 0.1
+
+
+def test_other_mcap_readers_open_it(finished: tuple[Path, RunResult]) -> None:
+    from mcap.reader import make_reader
+
+    with (finished[0] / "run.mcap").open("rb") as file:
+        summary = make_reader(file).get_summary()
+    assert summary is not None and summary.statistics is not None
+    names = {schema.name for schema in summary.schemas.values()}
+    assert {"foxglove.CompressedImage", "foxglove.Log", "maniskill_tomato.Step"} <= names
+
+
+def test_replay_of_an_unchanged_run_differs_nowhere(finished: tuple[Path, RunResult]) -> None:
+    found = replay(load_recording(finished[0] / "run.mcap"))
+    assert found.differences == ()
+    assert found.steps == len(finished[1].visible_fractions)
+    assert found.result.reason == finished[1].reason
+
+
+def test_replay_with_another_policy_or_envelope_says_where_it_differs(
+    finished: tuple[Path, RunResult],
+) -> None:
+    recorded = load_recording(finished[0] / "run.mcap")
+    found = replay(recorded, policy="random_step")
+    assert {d.what for d in found.differences} >= {"action"}
+    assert str(found.differences[0]).startswith("look 0: action was [")
+    assert all(d.what != "visible_fraction" for d in found.differences), "the pictures are the same"
+
+
+def test_depth_images_are_packed_without_loss() -> None:
+    rng = np.random.default_rng(0)
+    whole = (rng.integers(0, 4000, (12, 16)) / 1000.0).astype(np.float32)
+    for depth, kind in ((whole, "png"), (rng.random((12, 16), dtype=np.float32), "zlib-float32")):
+        data, encoding = encode_depth(depth)
+        assert encoding == kind
+        np.testing.assert_array_equal(decode_depth(data, encoding, (12, 16)), depth)
+
+
+def test_a_disk_that_fills_up_ends_the_run_as_a_fault(tmp_path: Path) -> None:
+    """The real write fails: no file of this process may grow beyond 60 kB meanwhile."""
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (60_000, hard))
+    try:
+        result = run(RunConfig(profile=profile(), out=tmp_path, policy="stay", seed=9))
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+    assert (result.reason, result.is_fault) == ("recording", True)
+    assert "cannot write the recording" in result.detail
+    assert result.end_state == "the arm stands and holds its position"
+    assert result.moves < 4, "it ended when the disk was full, not later"
+    assert json.loads((tmp_path / "result.json").read_text())["reason"] == "recording"
+    with pytest.raises(RecordingError, match="cut off"):
+        list(read_messages(tmp_path / "run.mcap"))
+
+
+def test_a_disk_that_is_full_from_the_start_is_told_before_anything_moves() -> None:
+    with pytest.raises(
+        RecordingError, match=r"cannot write the recording /dev/full.*No space left.*--no-record"
+    ):
+        McapRecorder(Path("/dev/full"), {})
+
+
+def test_damaged_and_foreign_files_are_errors_not_tracebacks(
+    tmp_path: Path, finished: tuple[Path, RunResult]
+) -> None:
+    content = (finished[0] / "run.mcap").read_bytes()
+    cut = tmp_path / "cut.mcap"
+    cut.write_bytes(content[: len(content) // 2])
+    noise = tmp_path / "noise.mcap"
+    noise.write_bytes(b"not a recording at all" * 10)
+    flipped = tmp_path / "flipped.mcap"
+    middle = len(content) // 3
+    flipped.write_bytes(
+        content[:middle] + bytes(255 - b for b in content[middle : middle + 64]) + content[middle + 64 :]
+    )
+    for path in (cut, noise, flipped):
+        with pytest.raises(RecordingError, match=r"readable recording|no recording|no look|incomplete"):
+            load_recording(path)
+    with pytest.raises(RecordingError, match="no recording at"):
+        load_recording(tmp_path / "missing.mcap")

@@ -1,0 +1,387 @@
+"""The envelope: what is refused and why, and that nothing outside it reaches an arm."""
+
+from typing import Any
+
+import mujoco
+import numpy as np
+import pytest
+import torch
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from maniskill_tomato.deploy.clock import SimulatedClock
+from maniskill_tomato.deploy.collision import CollisionChecker
+from maniskill_tomato.deploy.errors import DeviceTimeoutError, FaultError, RefusedError
+from maniskill_tomato.deploy.guarded_arm import GuardedArm
+from maniskill_tomato.deploy.interface import Arm, ArmState, JointMove
+from maniskill_tomato.deploy.plant_points import sphere_distances
+from maniskill_tomato.deploy.safety import Safety, joint_path
+from maniskill_tomato.deploy.safety_config import Box, SafetyConfig
+from maniskill_tomato.errors import InvalidInputError
+from maniskill_tomato.robot.description import urdf_path
+from maniskill_tomato.robot.iiwa14 import JOINT_AXES, JOINT_ORIGINS, JOINT_UPPER, READY_QPOS
+from maniskill_tomato.robot.kinematics import forward_kinematics
+
+mj: Any = mujoco
+
+
+def state(joints: Any = READY_QPOS, stamp: float = 10.0) -> ArmState:
+    return ArmState(joint_positions=joints, joint_velocities=np.zeros(7), stamp=stamp)
+
+
+def move(joints: Any, speed: float = 0.1) -> JointMove:
+    return JointMove(joint_positions=joints, speed_fraction=speed)
+
+
+def turned(**joints: float) -> Any:
+    """The ready posture with joints such as `j4` turned by an angle in [rad]."""
+    posture = READY_QPOS.copy()
+    for name, angle in joints.items():
+        posture[int(name[1:]) - 1] += angle
+    return posture
+
+
+@pytest.fixture(scope="module")
+def safety() -> Safety:
+    return Safety()
+
+
+def test_a_small_move_in_the_open_goes_through(safety: Safety) -> None:
+    assert safety.check(move(turned(j1=0.2, j6=-0.2)), state(), 10.1, 9.0) is None
+
+
+@pytest.mark.parametrize(
+    ("joints", "speed", "now", "frame", "reason"),
+    [
+        (turned(j1=np.nan), 0.1, 10.1, 9.0, "not_finite"),
+        (turned(j1=np.inf), 0.1, 10.1, 9.0, "not_finite"),
+        (turned(), np.nan, 10.1, 9.0, "not_finite"),
+        (turned(), 0.0, 10.1, 9.0, "speed"),
+        (turned(), -0.1, 10.1, 9.0, "speed"),
+        (turned(), 0.31, 10.1, 9.0, "speed"),
+        (turned(j4=np.deg2rad(-22.0)), 0.1, 10.1, 9.0, "joint_limit"),
+        (turned(j1=1.6), 0.1, 10.1, 9.0, "joint_step"),
+        (turned(), 0.1, 10.6, 9.0, "stale_state"),
+        (turned(), 0.1, 9.9, 9.0, "stale_state"),
+        (turned(), 0.1, 10.1, 0.0, "stale_frame"),
+        (turned(), 0.1, 10.1, 10.2, "stale_frame"),
+        (turned(), 0.1, 10.1, np.nan, "not_finite"),
+        (turned(j1=1.4), 0.1, 10.1, 9.0, "flange_step"),
+    ],
+)
+def test_each_check_refuses_with_its_reason(
+    safety: Safety, joints: Any, speed: float, now: float, frame: float, reason: str
+) -> None:
+    if reason == "flange_step":
+        safety = Safety(SafetyConfig(max_flange_step=0.1))
+    refusal = safety.check(move(joints, speed), state(), now, frame)
+    assert refusal is not None and refusal.reason == reason, refusal
+
+
+def test_a_state_that_is_not_finite_lets_nothing_through(safety: Safety) -> None:
+    bad = READY_QPOS.copy()
+    bad[2] = np.nan
+    refusal = safety.check(move(READY_QPOS), state(bad), 10.0)
+    assert refusal is not None and refusal.reason == "not_finite"
+
+
+def test_workspace_and_forbidden_zone_hold_on_the_way_too() -> None:
+    goal = turned(j1=0.8)
+    flange = forward_kinematics(torch.as_tensor(joint_path(READY_QPOS, goal, 0.02)))[:, :3, 3].numpy()
+    # The way is an arc about the z axis: its ends are allowed here, its middle is not.
+    middle = flange[len(flange) // 2]
+    zone = Box(low=tuple(middle - 0.005), high=tuple(middle + 0.005))
+    safety = Safety(SafetyConfig(forbidden=(zone,), max_flange_step=1.0))
+    refusal = safety.check(move(goal), state(), 10.0)
+    assert refusal is not None and refusal.reason == "forbidden_zone"
+    # Turning joint 1 from one side to the other, x is largest in the middle.
+    start, goal = turned(j1=-0.4), turned(j1=0.4)
+    ends = forward_kinematics(torch.as_tensor(np.stack([start, goal])))[:, 0, 3]
+    bound = 0.5 * (float(ends[0]) + float(flange[0, 0]))
+    narrow = Box(low=(-0.9, -0.9, 0.15), high=(bound, 0.9, 1.35))
+    safety = Safety(SafetyConfig(workspace=narrow, forbidden=(), max_flange_step=1.0))
+    assert bool((ends < bound).all())
+    refusal = safety.check(move(goal), state(start), 10.0)
+    assert refusal is not None and refusal.reason == "workspace"
+
+
+def test_contacts_with_table_itself_and_obstacles_are_refused() -> None:
+    low = np.deg2rad([0.0, 40.0, 0.0, -60.0, 0.0, 40.0, 0.0])
+    down = np.deg2rad([0.0, 95.0, 0.0, -45.0, 0.0, 40.0, 0.0])
+    everywhere = Box(low=(-2.0, -2.0, -2.0), high=(2.0, 2.0, 2.0))
+    safety = Safety(
+        SafetyConfig(
+            workspace=everywhere, max_joint_step=3.0, max_flange_step=3.0, forbidden=(), joint_margin=0.0
+        )
+    )
+    refusal = safety.check(move(down), state(low), 10.0)
+    assert refusal is not None and refusal.reason == "table", refusal
+    folded = np.deg2rad([0.0, 110.0, 0.0, -120.0, 0.0, 100.0, 0.0])
+    high_table = SafetyConfig(
+        workspace=everywhere,
+        max_joint_step=3.0,
+        max_flange_step=3.0,
+        forbidden=(),
+        joint_margin=0.0,
+        table_height=-1.0,
+    )
+    # A posture that `test_robot_description` knows to collide with the base.
+    refusal = Safety(high_table).check(move(folded), state(low), 10.0)
+    assert refusal is not None and refusal.reason == "self_collision"
+    flange = forward_kinematics(torch.tensor(READY_QPOS[None]))[0, :3, 3].numpy()
+    wall = Box(low=(float(flange[0]) + 0.12, -1.0, 0.0), high=(float(flange[0]) + 0.2, 1.0, 2.0))
+    safety = Safety(SafetyConfig(obstacles=(wall,), obstacle_clearance=0.02))
+    assert safety.check(move(READY_QPOS), state(), 10.0) is None
+    refusal = safety.check(move(turned(j2=0.3)), state(), 10.0)
+    assert refusal is not None and refusal.reason == "obstacle", refusal
+
+
+def test_the_plant_that_was_seen_is_kept_clear_of(safety: Safety) -> None:
+    goal = turned(j1=0.3)
+    on_the_way = forward_kinematics(torch.as_tensor(turned(j1=0.15)[None]))[0].numpy()
+    cluster = on_the_way[:3, 3] + np.random.default_rng(0).normal(0.0, 0.005, (20, 3))
+    refusal = safety.check(move(goal), state(), 10.0, points_w=cluster)
+    assert refusal is not None and refusal.reason == "plant"
+    assert safety.check(move(goal), state(), 10.0, points_w=cluster[:3]) is None, "a few points are noise"
+    assert safety.check(move(goal), state(), 10.0, points_w=cluster + [0.0, 0.0, 0.5]) is None
+    # Out of the leaves it may go: the same points at the start, and the move leads away.
+    inside = turned(j1=0.15)
+    assert safety.check(move(turned(j1=-0.2)), state(inside), 10.0, points_w=cluster) is None
+
+
+def test_sphere_distances_never_exceed_those_of_mujocos_shapes() -> None:
+    """The spheres hold every link mesh; MuJoCo's primitives stand out from them by up to 25 mm."""
+    spec = mj.MjSpec.from_file(urdf_path())
+    spec.worldbody.add_geom(
+        name="probe", type=mj.mjtGeom.mjGEOM_SPHERE, size=[1e-4, 0, 0], pos=[0.1, 0.2, 0.3]
+    )
+    model = spec.compile()
+    data = mj.MjData(model)
+    probe = model.geom("probe").id
+    links = {f"link_{k}" for k in (5, 6, 7)} | {"link_ee", "camera_link"}
+    shapes = [g for g in range(model.ngeom) if model.body(model.geom_bodyid[g]).name in links]
+    rng = np.random.default_rng(3)
+    fromto = np.zeros(6)
+    for _ in range(40):
+        data.qpos[:] = rng.uniform(-JOINT_UPPER, JOINT_UPPER)
+        mj.mj_kinematics(model, data)
+        point = data.body("link_ee").xpos + rng.uniform(-0.3, 0.3, 3)
+        model.geom_pos[probe] = point
+        mj.mj_kinematics(model, data)
+        exact = min(mj.mj_geomDistance(model, data, probe, g, 2.0, fromto) for g in shapes)
+        ours = float(sphere_distances(np.array(data.qpos)[None], point[None])[0, 0])
+        assert ours < exact + 0.025
+        assert ours > exact - 0.06
+
+
+def test_the_collision_checker_sees_what_plain_mujoco_sees() -> None:
+    """Random postures: some contact by ours if and only if by the URDF in MuJoCo, with its own filter."""
+    model = mj.MjModel.from_xml_path(urdf_path())
+    data = mj.MjData(model)
+    checker = CollisionChecker(
+        table_height=-5.0, table_clearance=0.0, self_clearance=0.0, obstacle_clearance=0.0
+    )
+    rng = np.random.default_rng(5)
+    hits = 0
+    for _ in range(1500):
+        joints = rng.uniform(-JOINT_UPPER, JOINT_UPPER)
+        data.qpos[:] = joints
+        mj.mj_kinematics(model, data)
+        mj.mj_collision(model, data)
+        touching = any(contact.dist < 0.0 for contact in data.contact[: data.ncon])
+        assert (checker.nearest(joints[None]) is not None) == touching
+        hits += touching
+    assert hits > 3
+
+
+def test_the_safety_configuration_refuses_what_makes_no_sense() -> None:
+    for wrong in (
+        {"speed_fraction": 0.5},
+        {"max_speed_fraction": 0.9},
+        {"joint_margin": -0.1},
+        {"path_step": 0.5},
+        {"plant_points_needed": 0},
+        {"speed_fraction": float("nan")},
+    ):
+        with pytest.raises(InvalidInputError):
+            SafetyConfig(**wrong)
+    with pytest.raises(InvalidInputError, match="low must lie below high"):
+        Box(low=(0.0, 0.0, 0.0), high=(1.0, 0.0, 1.0))
+
+
+class SpyArm(Arm):
+    """Goes at once where it is sent, and keeps what it was sent."""
+
+    name = "spy"
+    simulated = True
+    can_stop = True
+    is_connected = True
+
+    def __init__(self, clock: SimulatedClock) -> None:
+        self.clock = clock
+        self.joints: Any = READY_QPOS.copy()
+        self.sent: list[tuple[Any, JointMove]] = []
+        self.report: Any = None
+        self.arrives = True
+
+    def connect(self) -> None: ...
+
+    def disconnect(self) -> None: ...
+
+    def read(self, max_age_s: float = 0.5) -> ArmState:
+        joints = self.joints if self.report is None else self.report
+        return ArmState(joint_positions=joints, joint_velocities=np.zeros(7), stamp=self.clock.now())
+
+    def command(self, move: JointMove) -> JointMove:
+        self.sent.append((self.joints.copy(), move))
+        if self.arrives:
+            self.joints = np.array(move.joint_positions)
+        self.clock.sleep(60.0)
+        return move
+
+    def wait(self, timeout_s: float) -> bool:
+        self.clock.sleep(timeout_s)
+        return self.arrives
+
+    def stop(self) -> bool:
+        return True
+
+
+def plain_flange(joints: Any) -> Any:
+    """Flange position by a plain chain of rotation matrices."""
+    T = np.eye(4)
+    for origin, axis, angle in zip(JOINT_ORIGINS, JOINT_AXES, joints, strict=True):
+        x, y, z = axis
+        K = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
+        step = np.eye(4)
+        step[:3, :3] = np.eye(3) + np.sin(angle) * K + (1 - np.cos(angle)) * K @ K
+        step[:3, 3] = origin
+        T = T @ step
+    return (T @ [0.0, 0.0, 0.035, 1.0])[:3]
+
+
+def assert_inside(start: Any, sent: JointMove, config: SafetyConfig, model: Any, data: Any) -> None:
+    """The envelope once more, worked out on its own: plain chain, MuJoCo's own contacts, 40 samples of the way."""
+    goal = sent.joint_positions
+    assert np.isfinite(goal).all()
+    assert (np.abs(goal) <= JOINT_UPPER - config.joint_margin).all()
+    assert (np.abs(goal - start) <= config.max_joint_step).all()
+    assert 0.0 < sent.speed_fraction <= 0.3
+    first = plain_flange(start)
+    for share in np.linspace(0.025, 1.0, 40):
+        joints = start + share * (goal - start)
+        flange = plain_flange(joints)
+        slack = 3e-3  # Between samples of the checks.
+        assert (flange > np.array(config.workspace.low) - slack).all()
+        assert (flange < np.array(config.workspace.high) + slack).all()
+        assert not (np.abs(flange[:2]) < 0.3 - slack).all() or flange[2] > 0.25 - slack
+        assert np.linalg.norm(flange - first) <= config.max_flange_step + slack
+        data.qpos[:] = joints
+        mj.mj_kinematics(model, data)
+        mj.mj_collision(model, data)
+        assert all(contact.dist >= 0.0 for contact in data.contact[: data.ncon])
+
+
+def hostile(rng: np.random.Generator, here: Any) -> JointMove:
+    """A command from a broken or malicious policy: wild, near-limit, nearly right, or not numbers at all."""
+    kind = rng.integers(7)
+    if kind == 0:
+        joints = rng.uniform(-4.0, 4.0, 7)
+    elif kind == 1:
+        joints = rng.choice([-1.0, 1.0], 7) * JOINT_UPPER + rng.normal(0.0, 0.05, 7)
+    elif kind == 2:
+        joints = here + rng.normal(0.0, 0.8, 7)
+    elif kind == 3:
+        joints = here + rng.normal(0.0, 0.15, 7)
+    elif kind == 4:
+        joints = np.where(rng.random(7) < 0.3, rng.choice([np.nan, np.inf, -np.inf, 1e308, -0.0], 7), here)
+    elif kind == 5:
+        joints = np.rad2deg(here)  # The wrong unit.
+    else:
+        joints = here.copy()
+        joints[rng.integers(7)] += rng.normal(0.0, 1.5)
+    speed = rng.choice([0.1, 0.1, 0.3, 0.300001, 0.0, -0.1, 1.0, np.nan, np.inf])
+    return move(joints, float(speed))
+
+
+def attack(seed: int, commands: int) -> tuple[int, int]:
+    """Sends hostile commands; how many were refused and sent."""
+    config = SafetyConfig()
+    clock = SimulatedClock(100.0)
+    arm = SpyArm(clock)
+    guard = GuardedArm(arm, Safety(config), clock)
+    rng = np.random.default_rng(seed)
+    refused = 0
+    for _ in range(commands):
+        frame = clock.now() - float(
+            rng.choice([0.1, 1.0, 11.0, -1.0, np.nan], p=[0.7, 0.2, 0.04, 0.03, 0.03])
+        )
+        try:
+            guard.command(hostile(rng, arm.joints), frame)
+            assert guard.wait(0.1)
+        except RefusedError:
+            refused += 1
+    model = mj.MjModel.from_xml_path(urdf_path())
+    data = mj.MjData(model)
+    for start, sent in arm.sent:
+        assert_inside(start, sent, config, model, data)
+    assert refused + len(arm.sent) == commands
+    return refused, len(arm.sent)
+
+
+@settings(max_examples=25, deadline=None, suppress_health_check=[HealthCheck.too_slow])
+@given(seed=st.integers(0, 2**32 - 1))
+def test_no_hostile_command_outside_the_envelope_reaches_the_arm(seed: int) -> None:
+    attack(seed, 200)
+
+
+@pytest.mark.slow
+@settings(max_examples=100, deadline=None, suppress_health_check=[HealthCheck.too_slow])
+@given(seed=st.integers(0, 2**32 - 1))
+def test_none_of_100000_hostile_commands_reaches_the_arm_from_outside_the_envelope(seed: int) -> None:
+    attack(seed, 1000)
+
+
+def test_the_hostile_commands_are_neither_all_refused_nor_all_sent() -> None:
+    refused, sent = attack(1, 400)
+    assert refused > 200 and sent > 20
+
+
+def test_a_command_does_not_follow_on_one_that_has_not_ended() -> None:
+    clock = SimulatedClock(100.0)
+    guard = GuardedArm(SpyArm(clock), Safety(), clock)
+    guard.command(move(turned(j1=0.1)))
+    with pytest.raises(RefusedError, match="busy"):
+        guard.command(move(turned(j1=0.2)))
+
+
+def test_states_that_cannot_be_true_are_faults() -> None:
+    clock = SimulatedClock(100.0)
+    arm = SpyArm(clock)
+    guard = GuardedArm(arm, Safety(), clock)
+    guard.read()
+    arm.report = turned(j2=0.4)
+    with pytest.raises(FaultError, match="joint_2 jumped by 0.400 rad"):
+        guard.read()
+    arm.report = turned(j3=np.nan)
+    with pytest.raises(FaultError, match="not finite"):
+        guard.read()
+    arm.report = np.rad2deg(READY_QPOS)
+    with pytest.raises(FaultError, match="which unit"):
+        guard.read()
+
+
+def test_an_arm_that_does_not_arrive_is_a_fault_and_one_that_never_ends_a_timeout() -> None:
+    clock = SimulatedClock(100.0)
+    arm = SpyArm(clock)
+    guard = GuardedArm(arm, Safety(), clock)
+    guard.command(move(turned(j1=0.1)))
+    arm.joints = turned(j1=0.05)
+    with pytest.raises(FaultError, match="joint_1"):
+        guard.wait(0.1)
+    arm.arrives = False
+    guard = GuardedArm(arm, Safety(), clock)
+    guard.command(move(turned(j1=0.1)))
+    with pytest.raises(DeviceTimeoutError, match="blocked"):
+        while True:
+            guard.wait(1.0)

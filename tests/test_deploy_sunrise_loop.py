@@ -1,0 +1,112 @@
+"""The whole loop with the iiwa's driver over a real socket: the loopback controller's arm carries the twin's camera."""
+
+import time
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import pytest
+
+from maniskill_tomato.deploy.capture import Capture, CaptureConfig
+from maniskill_tomato.deploy.clock import MonotonicClock
+from maniskill_tomato.deploy.drivers import DriverContext, make_arm, make_camera
+from maniskill_tomato.deploy.guarded_arm import GuardedArm
+from maniskill_tomato.deploy.interface import Float64
+from maniskill_tomato.deploy.loop import Loop, LoopConfig
+from maniskill_tomato.deploy.mock.episode import load_episode
+from maniskill_tomato.deploy.mock.options import twin_options, twin_world
+from maniskill_tomato.deploy.perceive import TruthPerception
+from maniskill_tomato.deploy.policies import open_policy
+from maniskill_tomato.deploy.safety import Safety
+from maniskill_tomato.deploy.safety_config import SafetyConfig
+from maniskill_tomato.deploy.steps import RunResult
+from maniskill_tomato.deploy.stops import Stops
+from maniskill_tomato.deploy.sunrise.loopback import LoopbackController
+from maniskill_tomato.deploy.sunrise.loopback_faults import Fault
+from maniskill_tomato.robot.d435 import T_flange_camera_color_optical
+
+TWIN = {"width": 160, "height": 120, "depth_noise": 0.0}
+SEED = 1
+
+
+class CarriedBy:
+    """In the twin's world, the arm of the controller instead of MuJoCo's."""
+
+    moving = False
+
+    def __init__(self, controller: LoopbackController) -> None:
+        self._controller = controller
+
+    @property
+    def joint_positions(self) -> Float64:
+        return np.array(self._controller.arm.qpos)
+
+    @property
+    def joint_velocities(self) -> Float64:
+        return np.zeros(7)
+
+    def advance(self, time: float) -> None:
+        pass
+
+
+def run(faults: Sequence[Fault] = (), moves: int = 2) -> tuple[RunResult, LoopbackController]:
+    clock = MonotonicClock()
+    context = DriverContext(clock=clock, seed=SEED)
+    start = load_episode("held_out", SEED).start_joints
+    with LoopbackController(
+        qpos=start.tolist(), speedup=5.0, media_flange_m=0.026, faults=faults
+    ) as controller:
+        host, port = controller.address
+        options: dict[str, Any] = {"host": host, "port": port, "flange_xyz": [0.0, 0.0, 0.026]}
+        world: Any = twin_world(twin_options(TWIN), context)
+        world.arm = CarriedBy(controller)
+        camera = make_camera("mock", TWIN, context)
+        with make_arm("sunrise", options, context) as arm, camera, Stops() as stops:
+            result = Loop(
+                arm=GuardedArm(arm, Safety(SafetyConfig()), clock),
+                camera=camera,
+                capture=Capture(camera, CaptureConfig(max_age=5.0), clock),
+                perception=TruthPerception(),
+                policy=open_policy("nbv", 0),
+                T_flange_camera=T_flange_camera_color_optical,
+                clock=clock,
+                config=LoopConfig(max_moves=moves),
+                stops=stops,
+                mode="unattended",
+                target_position=world.episode.target_position.double().numpy(),
+            ).run()
+    return result, controller
+
+
+def test_the_loop_moves_the_arm_over_the_socket_through_safety_and_guarded_moves() -> None:
+    result, controller = run()
+    assert not result.is_fault, result.detail
+    assert result.reason in ("success", "budget")
+    assert result.moves > result.refused_moves
+    sent = [line for line in controller.received if line.startswith("doPTP")]
+    assert len(sent) >= result.moves - result.refused_moves
+    assert all(line.startswith("doPTP!inJS_0_") for line in sent)
+    targets = [line for line in controller.received if line.startswith("jp_")]
+    last = [float(token) for token in targets[-1].split("_")[1:8]]
+    np.testing.assert_allclose(controller.arm.qpos, last, atol=1e-9)
+    # A tenth of the largest speed, as the envelope says.
+    speeds = {line for line in controller.received if line.startswith("jRelVel")}
+    assert speeds == {"jRelVel_0.100000000_"}
+    assert controller.lost == []
+
+
+@pytest.mark.parametrize(
+    ("fault", "reason", "word"),
+    [
+        (Fault(kind="drop", command="doPTP", seconds=0.05), "not_connected", "emergency stop"),
+        (Fault(kind="jump", command="getJointsPositions", count=9, radians=0.5), "fault", "turned by"),
+        (Fault(kind="contact", command="doPTP"), "fault", "touched something"),
+    ],
+)
+def test_a_fault_of_the_controller_ends_the_run_with_its_reason(fault: Fault, reason: str, word: str) -> None:
+    began = time.monotonic()
+    result, controller = run([fault], moves=3)
+    assert result.is_fault and result.reason == reason and word in result.detail
+    before = len([line for line in controller.received if line.startswith("doPTP")])
+    assert before <= 2
+    assert time.monotonic() - began < 120.0

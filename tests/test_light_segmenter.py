@@ -1,0 +1,323 @@
+"""The light segmenter: decoding undoes the targets, pictures keep their annotation, training goes on bit for bit."""
+
+import json
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import torch
+
+from maniskill_tomato.errors import CheckpointError, InvalidInputError
+from maniskill_tomato.perception.annotations import AnnotatedImage, Instance
+from maniskill_tomato.perception.augmentation import AugmentationConfig, augmented
+from maniskill_tomato.perception.fruit_network import (
+    STRIDE,
+    FruitMaps,
+    FruitNetwork,
+    FruitNetworkConfig,
+    place_centres,
+)
+from maniskill_tomato.perception.fruit_targets import TrainingPicture, fruit_losses, make_targets
+from maniskill_tomato.perception.light_segmenter import (
+    LightSegmenter,
+    find_fruits,
+    open_light,
+    split_by_votes,
+)
+from maniskill_tomato.perception.light_training import LightTrainConfig, LightTraining, learning_rate
+from maniskill_tomato.perception.masks import EncodedMask
+from maniskill_tomato.perception.training_pictures import PictureDraw, training_picture
+from maniskill_tomato.perception.weights import save_weights
+
+SMALL = FruitNetworkConfig(widths=(8, 8, 8, 8), blocks=(0, 0, 0, 0), neck_width=8, head_width=8)
+
+
+def fruit_picture(seed: int = 0, count: int = 5, size: tuple[int, int] = (160, 192)) -> TrainingPicture:
+    """Red discs on green; later ones stand in front of earlier ones. Ripe and unripe in turn."""
+    rng = np.random.default_rng(seed)
+    height, width = size
+    image = np.full((height, width, 3), (40, 120, 40), np.uint8)
+    labels = np.zeros(size, np.int16)
+    whole = []
+    y, x = np.mgrid[:height, :width] + 0.5
+    for index in range(count):
+        radius = rng.uniform(8, 20)
+        cx, cy = rng.uniform(radius, width - radius), rng.uniform(radius, height - radius)
+        disc = (x - cx) ** 2 + (y - cy) ** 2 <= radius**2
+        image[disc] = (200, 30 + 20 * (index % 2), 30)
+        labels[disc] = index + 1
+        whole.append([cx - radius, cy - radius, cx + radius, cy + radius])
+    if len(np.unique(labels)) <= count:  # One is covered altogether.
+        return fruit_picture(seed + 1000, count, size)
+    boxes = []
+    for index in range(count):
+        rows, columns = np.nonzero(labels == index + 1)
+        boxes.append([columns.min(), rows.min(), columns.max() + 1, rows.max() + 1])
+    return TrainingPicture(
+        image=image,
+        boxes=np.array(boxes, np.float32),
+        ignored=np.zeros(count, bool),
+        labels=labels,
+        whole_boxes=np.array(whole, np.float32),
+        categories=np.arange(count) % 2 * 2,
+    )
+
+
+def perfect_maps(picture: TrainingPicture) -> FruitMaps:
+    """What a network says that is right everywhere."""
+    targets = make_targets([picture])
+    x, y = place_centres(*targets.heat.shape[2:])
+
+    def distances(box: torch.Tensor) -> torch.Tensor:
+        left, top, right, bottom = box.unbind(1)
+        return torch.stack([x - left, y - top, right - x, bottom - y], dim=1)
+
+    kinds = torch.nn.functional.one_hot(targets.category.clamp(min=0), 3).movedim(-1, 1).float()
+    return FruitMaps(
+        centre=torch.logit(targets.heat.clamp(1e-4, 1 - 1e-4)),
+        box=distances(targets.box),
+        whole=distances(targets.whole),
+        category=kinds * 10,
+        fruit=(targets.fruit - 0.5) * 20,
+        vote=targets.vote - torch.stack([x, y]),
+    )
+
+
+def apart(seed: int) -> TrainingPicture:
+    """The first picture from `seed` on whose fruits are not centred on neighbouring places."""
+    while True:
+        picture = fruit_picture(seed)
+        centres = (picture.boxes[:, :2] + picture.boxes[:, 2:]) / 2
+        away = np.abs(centres[:, None] - centres[None]).max(axis=2) + 100 * np.eye(len(centres))
+        if away.min() > 3 * STRIDE:
+            return picture
+        seed += 100
+
+
+@pytest.mark.parametrize("seed", [0, 1, 2, 3])
+def test_decoding_perfect_maps_gives_the_annotation_back(seed: int) -> None:
+    picture = apart(seed)
+    maps = perfect_maps(picture)
+    found = find_fruits(maps, 0.5, 0.9)
+    assert len(found["boxes"]) == len(picture.boxes)
+    order = np.array(
+        [int(((picture.boxes - box.numpy()) ** 2).sum(axis=1).argmin()) for box in found["boxes"]]
+    )
+    assert sorted(order) == list(range(len(order)))
+    np.testing.assert_allclose(found["boxes"].numpy(), picture.boxes[order], atol=1e-3)
+    assert picture.whole_boxes is not None and picture.categories is not None and picture.labels is not None
+    np.testing.assert_allclose(found["whole"].numpy(), picture.whole_boxes[order], atol=1e-3)
+    np.testing.assert_array_equal(found["category"].numpy(), picture.categories[order])
+    centres = np.concatenate([np.zeros((1, 2)), (picture.boxes[:, :2] + picture.boxes[:, 2:]) / 2])
+    votes = centres[picture.labels].transpose(2, 0, 1).astype(np.float32)
+    masks = split_by_votes(picture.labels > 0, votes, found["boxes"].numpy())
+    for mask, index in zip(masks, order, strict=True):
+        np.testing.assert_array_equal(mask, picture.labels == index + 1)
+
+
+def test_losses_are_near_zero_for_perfect_maps_and_not_for_others() -> None:
+    picture = apart(0)
+    targets = make_targets([picture])
+    right = fruit_losses(perfect_maps(picture), targets)
+    wrong = fruit_losses(FruitMaps(*(-m for m in perfect_maps(picture))), targets)
+    assert set(right) == {"centre", "box", "whole", "category", "fruit", "vote"}
+    for name in right:
+        # The heat around a centre and cells that are part fruit have an entropy that cannot vanish.
+        assert float(right[name]) < {"fruit": 0.35, "centre": 0.1}.get(name, 0.02), name
+        assert float(wrong[name]) > 2 * float(right[name]) + 0.2, name
+
+
+def test_terms_without_annotation_are_zero() -> None:
+    picture = fruit_picture()
+    boxes_only = TrainingPicture(image=picture.image, boxes=picture.boxes, ignored=picture.ignored)
+    losses = fruit_losses(FruitNetwork(SMALL)(torch.zeros(1, 3, 160, 192)), make_targets([boxes_only]))
+    assert all(float(losses[name].detach()) == 0 for name in ("whole", "category", "fruit", "vote"))
+    assert float(losses["box"].detach()) > 0
+
+
+def test_an_ignored_fruit_is_no_centre_and_its_box_does_not_count() -> None:
+    picture = fruit_picture(count=1)
+    ignored = TrainingPicture(
+        image=picture.image, boxes=picture.boxes, ignored=np.ones(1, bool), labels=picture.labels
+    )
+    targets = make_targets([ignored])
+    assert targets.heat.max() == 0 and targets.box_weight.max() == 0
+    left, top, right, bottom = (picture.boxes[0] / STRIDE).astype(int)
+    assert targets.heat_weight[0, 0, top : bottom + 1, left : right + 1].max() == 0
+    assert targets.heat_weight.mean() > 0.8
+
+
+@pytest.mark.parametrize("mosaic", [0.0, 1.0])
+def test_boxes_and_labels_move_with_the_picture(mosaic: float) -> None:
+    config = AugmentationConfig(size=160, mosaic_probability=mosaic, blur_probability=0, noise_probability=0)
+    rng = np.random.default_rng(0)
+    seen = 0
+    for _ in range(30):
+        picture = augmented(lambda: fruit_picture(int(rng.integers(100)), 3), config, rng)
+        assert picture.labels is not None and picture.image.shape == (160, 160, 3)
+        assert picture.labels.max(initial=0) <= len(picture.boxes)
+        for index in np.flatnonzero(~picture.ignored):
+            rows, columns = np.nonzero(picture.labels == index + 1)
+            if not len(rows):  # A sliver that fell between the sampled pixels.
+                continue
+            around = [columns.min(), rows.min(), columns.max() + 1, rows.max() + 1]
+            # Labels are sampled at the nearest pixel.
+            if mosaic == 0.0 and (picture.boxes[index] % 160 > 0).all():
+                np.testing.assert_allclose(picture.boxes[index], around, atol=2.5)
+                seen += 1
+            colours = picture.image[rows, columns].astype(float).mean(axis=0)
+            assert colours[0] > colours[1]
+    assert mosaic or seen > 10
+
+
+def annotated(folder: Path, count: int = 3, masks: bool = True) -> list[AnnotatedImage]:
+    """Pictures of discs as files."""
+    images = []
+    for number in range(count):
+        picture = fruit_picture(number, 3, (96, 96))
+        assert picture.labels is not None and picture.whole_boxes is not None
+        path = folder / f"{number}.png"
+        cv2.imwrite(str(path), picture.image[..., ::-1])
+        fruits = []
+        for index, (left, top, right, bottom) in enumerate(picture.boxes.tolist()):
+            mask = EncodedMask.encode(picture.labels == index + 1) if masks else None
+            a, b, c, d = picture.whole_boxes[index].tolist()
+            fruits.append(
+                Instance(
+                    category="tomato_ripe",
+                    box_xywh=(left, top, right - left, bottom - top),
+                    visible_mask=mask,
+                    amodal_box_xywh=(a, b, c - a, d - b) if masks else None,
+                )
+            )
+        images.append(
+            AnnotatedImage(path=path, file_name=path.name, width=96, height=96, instances=tuple(fruits))
+        )
+    return images
+
+
+def test_an_annotated_image_becomes_a_training_picture(tmp_path: Path) -> None:
+    (image,) = annotated(tmp_path, 1)
+    picture, expected = training_picture(image), fruit_picture(0, 3, (96, 96))
+    np.testing.assert_array_equal(picture.image, expected.image)
+    np.testing.assert_allclose(picture.boxes, expected.boxes)
+    assert picture.labels is not None and expected.labels is not None
+    np.testing.assert_array_equal(picture.labels, expected.labels)
+    (boxes_only,) = annotated(tmp_path, 1, masks=False)
+    assert training_picture(boxes_only).labels is None
+
+
+def small_config(steps: int) -> LightTrainConfig:
+    return LightTrainConfig(
+        steps=steps,
+        batch_size=2,
+        warmup_steps=2,
+        log_every=2,
+        save_every=2,
+        bfloat16=False,
+        network=SMALL,
+        augmentation=AugmentationConfig(size=64),
+    )
+
+
+def test_a_stopped_training_goes_on_bit_for_bit(tmp_path: Path) -> None:
+    images = annotated(tmp_path)
+    whole = LightTraining(small_config(4), [images], [1.0], images)
+    assert whole.run(tmp_path / "whole", lambda line: None) == tmp_path / "whole" / "weights.pt"
+    first = LightTraining(small_config(4), [images], [1.0], images)
+    assert first.run(tmp_path / "parts", lambda line: None, lambda: first.step == 3) is None
+    second = LightTraining(small_config(4), [images], [1.0], images)
+    second.resume(tmp_path / "parts")
+    assert second.step == 3
+    second.run(tmp_path / "parts", lambda line: None)
+    for name, tensor in whole.averaged.state_dict().items():
+        torch.testing.assert_close(second.averaged.state_dict()[name], tensor, rtol=0, atol=0)
+    histories = [json.loads((tmp_path / d / "history.json").read_text()) for d in ("whole", "parts")]
+    assert histories[0] == histories[1]
+    assert "val_loss" in histories[0][-1] and histories[0][-1]["step"] == 4
+
+
+def test_a_training_of_other_settings_is_not_continued(tmp_path: Path) -> None:
+    images = annotated(tmp_path)
+    LightTraining(small_config(2), [images], [1.0]).run(tmp_path / "run", lambda line: None)
+    with pytest.raises(CheckpointError, match="other settings"):
+        LightTraining(small_config(3), [images], [1.0]).resume(tmp_path / "run")
+
+
+def test_training_lowers_the_loss_on_two_pictures(tmp_path: Path) -> None:
+    torch.manual_seed(0)
+    images = annotated(tmp_path, 2)
+    config = LightTrainConfig(
+        steps=60,
+        batch_size=2,
+        learning_rate=5e-3,
+        warmup_steps=5,
+        log_every=20,
+        save_every=60,
+        network=SMALL,
+        bfloat16=False,
+        augmentation=AugmentationConfig(size=96, mosaic_probability=0, scale=(1.0, 1.0)),
+    )
+    training = LightTraining(config, [images], [1.0])
+    training.run(tmp_path / "run", lambda line: None)
+    assert training.history[-1]["loss"] < 0.8 * training.history[0]["loss"]
+    assert training.history[-1]["fruit"] < training.history[0]["fruit"]
+
+
+def test_the_learning_rate_rises_and_falls() -> None:
+    config = LightTrainConfig(steps=100, warmup_steps=10, learning_rate=1.0 - 1e-9)
+    rates = [learning_rate(config, step) for step in range(101)]
+    assert rates[0] == pytest.approx(0.1) and rates[10] == pytest.approx(1.0)
+    assert rates[55] == pytest.approx(0.505) and rates[100] == pytest.approx(0.01)
+
+
+def test_shares_that_do_not_fit_are_refused(tmp_path: Path) -> None:
+    images = annotated(tmp_path, 1)
+    rng = np.random.default_rng(0)
+    for sets, shares in (([], []), ([images, []], [1, 1]), ([images], [1, 1]), ([images], [0])):
+        with pytest.raises(InvalidInputError):
+            PictureDraw(sets=sets, shares=shares, rng=rng)
+
+
+@pytest.mark.parametrize("size", [(1, 1), (33, 70), (100, 700)])
+def test_images_of_any_size_give_masks_of_that_size(size: tuple[int, int], tmp_path: Path) -> None:
+    segmenter = LightSegmenter(FruitNetwork(SMALL), score_threshold=0.0)
+    found = segmenter(np.full((*size, 3), 90, np.uint8))
+    assert found.masks.shape[1:] == size
+    if len(found):
+        assert (
+            (found.boxes >= 0).all()
+            and (found.boxes[:, 2] <= size[1]).all()
+            and (found.boxes[:, 3] <= size[0]).all()
+        )
+        assert found.amodal_boxes is not None
+        assert (found.amodal_boxes[:, :2] <= found.boxes[:, :2]).all()
+        assert (np.diff(found.scores) <= 0).all()
+
+
+def test_weights_come_back_in_half_precision(tmp_path: Path) -> None:
+    network = FruitNetwork(SMALL)
+    save_weights(tmp_path / "w.pt", "light", SMALL.to_dict(), network.state_dict())
+    opened = open_light(tmp_path / "w.pt").network
+    for name, tensor in network.state_dict().items():
+        torch.testing.assert_close(opened.state_dict()[name].float(), tensor.float(), rtol=1e-3, atol=1e-3)
+
+
+def test_weights_that_do_not_fit_are_refused(tmp_path: Path) -> None:
+    state = FruitNetwork(SMALL).state_dict()
+    save_weights(tmp_path / "w.pt", "light", {**SMALL.to_dict(), "head_width": 9}, state)
+    with pytest.raises(CheckpointError, match="does not fit"):
+        open_light(tmp_path / "w.pt")
+    save_weights(tmp_path / "m.pt", "mask_rcnn", SMALL.to_dict(), state)
+    with pytest.raises(CheckpointError, match="mask_rcnn"):
+        open_light(tmp_path / "m.pt")
+    (tmp_path / "broken.pt").write_bytes((tmp_path / "w.pt").read_bytes()[:1000])
+    with pytest.raises(CheckpointError, match="truncated"):
+        open_light(tmp_path / "broken.pt")
+
+
+def test_a_network_of_boxes_only_gives_ellipses() -> None:
+    network = FruitNetwork(SMALL)
+    found = LightSegmenter(network, boxes_only=True, score_threshold=0.0)(np.full((64, 64, 3), 90, np.uint8))
+    assert found.amodal_boxes is None and set(found.categories) <= {"tomato"}
