@@ -6,6 +6,7 @@ from pathlib import Path
 import cv2
 import matplotlib.pyplot as plt
 import numpy as np
+from matplotlib.axes import Axes
 
 from maniskill_tomato.files import write_atomically
 from maniskill_tomato.perception.occlusion.estimate import Estimate, TomatoView, UInt8
@@ -64,7 +65,7 @@ def _outlined(rgb: UInt8, contours: list[np.ndarray[tuple[int, ...], np.dtype[np
 
 
 def _label(
-    axis: plt.Axes, masks: list[np.ndarray[tuple[int, ...], np.dtype[np.bool_]] | None], values: list[float]
+    axis: Axes, masks: list[np.ndarray[tuple[int, ...], np.dtype[np.bool_]] | None], values: list[float]
 ) -> None:
     """Outlines of whole tomatoes with their V_f."""
     for mask, value in zip(masks, values, strict=True):
