@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass
 
+import cv2
 import numpy as np
 
 from maniskill_tomato.errors import InvalidInputError
@@ -88,7 +89,7 @@ class ThesisModel:
             if not pieces:
                 continue
             new = np.zeros(shape, dtype=np.uint8)
-            steps.cv2.drawContours(new, [max(pieces, key=steps.cv2.contourArea)], -1, 255, -1)
+            cv2.drawContours(new, [max(pieces, key=cv2.contourArea)], -1, 255, -1)
             total = int(np.count_nonzero(new))
             contours.append(contour)
             ellipses.append(ellipse)

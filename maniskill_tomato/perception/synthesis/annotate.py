@@ -38,7 +38,7 @@ def annotate(
     height, width = thing.shape
     scale = width * height / (640 * 480)
     counts = np.bincount(thing[thing >= 0], minlength=len(things))
-    T_optical_plant = np.linalg.inv(T_plant_optical)
+    T_optical_plant = np.asarray(np.linalg.inv(T_plant_optical), dtype=np.float64)
     instances = []
     for k, what in enumerate(things):
         visible = int(counts[k])

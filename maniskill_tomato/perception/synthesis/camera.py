@@ -86,7 +86,7 @@ def develop(
     weight = np.exp(-aside / 0.15)
     metered = float((np.minimum(picture.mean(2), 1.0) * weight).sum() / weight.sum())
     picture = picture * np.float32(0.19 / max(metered, 0.02) * look.exposure)
-    picture = picture * np.float32(look.white_balance)
+    picture = picture * np.array(look.white_balance, dtype=np.float32)
     picture = picture * (1 - look.vignette * 2 * aside)[..., None]
     small = cv2.resize(np.minimum(picture, 3.0), None, fx=0.125, fy=0.125, interpolation=cv2.INTER_AREA)
     glow = cv2.resize(cv2.GaussianBlur(small, (0, 0), 2.5 * scale), (width, height))
@@ -105,7 +105,7 @@ def _toned(picture: Float32, look: CameraLook) -> NDArray[np.uint8]:
     display = np.sqrt(picture)  # Close to the sRGB curve, and quick.
     smooth = display * display * (3 - 2 * display)
     display = (1 - look.contrast) * display + look.contrast * smooth
-    grey = display @ np.float32([0.299, 0.587, 0.114])
+    grey = display @ np.array([0.299, 0.587, 0.114], dtype=np.float32)
     display = grey[..., None] + look.saturation * (display - grey[..., None])
     if look.sharpening > 0:
         soft = cv2.GaussianBlur(display.astype(np.float32), (0, 0), 1.2)

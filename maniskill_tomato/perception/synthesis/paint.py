@@ -1,6 +1,7 @@
 """Materials of a rendered scene: the plants' own textures in other colours, and those of what stands around."""
 
 from functools import lru_cache
+from typing import Any
 
 import cv2
 import numpy as np
@@ -36,29 +37,32 @@ class PlantMaterials(dict[str, sapien.render.RenderMaterial]):
         material = MATERIALS[name]
         pixels = material.base_color.astype(np.float32) / 255.0
         rng = np.random.default_rng([self._seed, sum(name.encode())])
-        colour, roughness, specular = pixels[..., :3], material.roughness, material.specular
+        colour: NDArray[np.floating[Any]] = pixels[..., :3]
+        roughness, specular = material.roughness, material.specular
         if name.startswith("leaf"):
-            colour = colour * np.float32(self._look.leaf_gain)
+            colour = colour * np.array(self._look.leaf_gain, dtype=np.float32)
             colour = _blemished(colour, self._look.leaf_blemish, rng)
             roughness = float(np.clip(roughness * self._look.gloss, 0.3, 0.95))
         elif name.startswith("fruit"):
-            colour = colour * np.float32(self._look.fruit_gain) * np.float32(np.exp(rng.normal(0, 0.05, 3)))
+            colour = (
+                colour * np.array(self._look.fruit_gain, dtype=np.float32) * np.exp(rng.normal(0, 0.05, 3))
+            )
             roughness = float(np.clip(roughness * self._look.gloss, 0.12, 0.5))
             specular = 0.25
         else:
-            colour = colour * np.float32(self._look.leaf_gain)
+            colour = colour * np.array(self._look.leaf_gain, dtype=np.float32)
         pixels = np.dstack([np.clip(colour, 0, 1), pixels[..., 3:]])
         self[name] = textured((pixels * 255).astype(np.uint8), roughness=roughness, specular=specular)
         return self[name]
 
 
-def _blemished(colour: NDArray[np.float32], share: float, rng: Generator) -> NDArray[np.float32]:
+def _blemished(colour: NDArray[np.floating[Any]], share: float, rng: Generator) -> NDArray[np.floating[Any]]:
     """Yellow between the veins and a few dry spots."""
     size = colour.shape[0]
     yellow = np.clip((cloud(rng, size, size, 3) - (1 - share)) / 0.5, 0, 1)[..., None] * 0.5
-    colour = colour * (1 - yellow) + np.float32([0.56, 0.58, 0.2]) * yellow
+    colour = colour * (1 - yellow) + np.array([0.56, 0.58, 0.2]) * yellow
     dry = np.clip((cloud(rng, size, size, 9, octaves=2) - (1.05 - 0.5 * share)) / 0.08, 0, 1)[..., None]
-    return np.asarray(colour * (1 - dry) + np.float32([0.62, 0.5, 0.3]) * dry, dtype=np.float32)
+    return np.asarray(colour * (1 - dry) + np.array([0.62, 0.5, 0.3]) * dry)
 
 
 def textured(pixels: UInt8, *, roughness: float, specular: float = 0.3) -> sapien.render.RenderMaterial:

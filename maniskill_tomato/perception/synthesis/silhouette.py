@@ -80,7 +80,7 @@ def draw_silhouette(
     fine = max(1, min(SUBPIXELS, MAX_SIDE // max(width, height)))
     corners = uv[faces]
     edge_a, edge_b = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
-    # Counter-clockwise from outside is clockwise, so of positive area, where rows count downward... seen from outside.
+    # Rows count downward, so that counter-clockwise triangles have a negative area here.
     facing = edge_a[:, 0] * edge_b[:, 1] - edge_a[:, 1] * edge_b[:, 0] < 0
     canvas = np.zeros((height * fine, width * fine), dtype=np.uint8)
     # OpenCV's coordinates are those of pixel centres, here with 4 fractional bits.
@@ -90,7 +90,7 @@ def draw_silhouette(
     if fine == 1:
         mask = canvas > 0
     else:
-        # OpenCV fills the pixels that the outline touches, half a fine pixel too many; the share evens that out.
+        # OpenCV fills the pixels that the outline touches: half a fine pixel too many, by which the half is raised.
         share = cv2.resize(canvas, (width, height), interpolation=cv2.INTER_AREA)
-        mask = share > 127
+        mask = share > 255 * (0.5 + 0.5 / fine)
     return Silhouette(np.asarray(mask), int(low[0]), int(low[1]))

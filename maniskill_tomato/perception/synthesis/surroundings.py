@@ -6,6 +6,7 @@ import numpy as np
 import sapien
 import sapien.render
 from numpy.random import Generator
+from numpy.typing import NDArray
 
 from maniskill_tomato.assets import asset_path
 from maniskill_tomato.perception.synthesis import paint
@@ -18,7 +19,10 @@ HALF_LENGTH = 4.0
 
 def _box(half: list[float], material: sapien.render.RenderMaterial) -> sapien.render.RenderShape:
     # A box's own texture would stretch over its faces; this one repeats every 0.6 m.
-    corners, normals, uvs, faces = [], [], [], []
+    corners: list[NDArray[np.float64]] = []
+    normals: list[NDArray[np.float64]] = []
+    uvs: list[list[float]] = []
+    faces: list[list[int]] = []
     size = np.array(half)
     for axis in range(3):
         i, j = (axis + 1) % 3, (axis + 2) % 3
