@@ -11,6 +11,7 @@ import torch
 from maniskill_tomato.errors import CheckpointError, InvalidInputError
 from maniskill_tomato.perception.annotations import AnnotatedImage, Instance
 from maniskill_tomato.perception.augmentation import AugmentationConfig, augmented
+from maniskill_tomato.perception.detection_metrics import box_overlaps
 from maniskill_tomato.perception.fruit_network import (
     STRIDE,
     FruitMaps,
@@ -294,6 +295,23 @@ def test_images_of_any_size_give_masks_of_that_size(size: tuple[int, int], tmp_p
         assert found.amodal_boxes is not None
         assert (found.amodal_boxes[:, :2] <= found.boxes[:, :2]).all()
         assert (np.diff(found.scores) <= 0).all()
+
+
+def test_two_looks_at_one_image_are_joined_in_order_and_sizes_are_shared_out() -> None:
+    torch.manual_seed(0)
+    image = fruit_picture(size=(224, 288)).image
+    network = FruitNetwork(SMALL)
+    both = LightSegmenter(network, score_threshold=0.0, overlap_threshold=0.5)(image)
+    fine = LightSegmenter(network, score_threshold=0.0, overlap_threshold=0.5, scales=(1.0,))(image)
+    assert len(both) > 0 and (np.diff(both.scores) <= 0).all()
+    overlaps, _ = box_overlaps(both.boxes.astype(np.float64), both.boxes.astype(np.float64))
+    assert (overlaps - np.eye(len(both))).max() <= 0.5 + 1e-6
+    # Small boxes can only come from the fine look.
+    small = (both.boxes[:, 2:] - both.boxes[:, :2]).min(axis=1) < 60
+    for box in both.boxes[small]:
+        assert np.abs(fine.boxes - box).max(axis=1).min() < 1e-3
+    with pytest.raises(InvalidInputError, match="scales"):
+        LightSegmenter(network, scales=(0.5, 1.0))
 
 
 def test_weights_come_back_in_half_precision(tmp_path: Path) -> None:

@@ -19,7 +19,14 @@ from maniskill_tomato.perception.fruit_network import (
     FruitNetworkConfig,
     place_centres,
 )
-from maniskill_tomato.perception.instances import FRUIT_CATEGORIES, TOMATO, Image, Instances, box_ellipse
+from maniskill_tomato.perception.instances import (
+    FRUIT_CATEGORIES,
+    TOMATO,
+    Image,
+    Instances,
+    box_ellipse,
+    joined,
+)
 from maniskill_tomato.perception.segmenter import check_image
 from maniskill_tomato.perception.weights import load_weights
 
@@ -29,6 +36,10 @@ MOST_FRUITS = 300
 """Fruits that are looked at in one image, the best ones."""
 
 PADDING_COLOUR = 110.0
+
+COARSE_SIDES = (32.0, 192.0)
+"""Fruits with a side longer than the second, in [px] of the network's input, are left to the next smaller image, where
+those with a side shorter than the first are left out."""
 
 
 class LightSegmenter:
@@ -41,6 +52,7 @@ class LightSegmenter:
         score_threshold: float = 0.3,
         overlap_threshold: float = 0.6,
         longest_side: int = 640,
+        scales: tuple[float, ...] = (1.0, 0.5),
     ) -> None:
         """Takes a trained network.
 
@@ -51,6 +63,8 @@ class LightSegmenter:
             score_threshold: Fruits below this are left out.
             overlap_threshold: Of two boxes with a larger intersection over union only the better one stays.
             longest_side: Larger images are made smaller first, in [px].
+            scales: Factors on the image's size at which it is looked at, falling: the network was trained on fruits of
+                limited size, so that a fruit close to the camera is found in a smaller image.
 
         Raises:
             InvalidInputError: A threshold is not between 0 and 1, or the side is too short.
@@ -60,38 +74,56 @@ class LightSegmenter:
                 raise InvalidInputError(f"{name} must be between 0 and 1, got {value}")
         if longest_side < SIZE_MULTIPLE:
             raise InvalidInputError(f"longest_side must be at least {SIZE_MULTIPLE} px, got {longest_side}")
+        if not scales or min(scales) <= 0 or list(scales) != sorted(scales, reverse=True):
+            raise InvalidInputError(f"scales must be positive and fall, got {scales}")
         self.network = network.eval().requires_grad_(False).to(memory_format=torch.channels_last)
         self.boxes_only = boxes_only
         self.score_threshold = score_threshold
         self.overlap_threshold = overlap_threshold
         self.longest_side = longest_side
+        self.scales = scales
 
     def __call__(self, image: Image, depth_m: NDArray[np.float32] | None = None) -> Instances:
         """The fruits in an image; see `Segmenter`."""
         check_image(image, depth_m)
         height, width = image.shape[:2]
-        factor = min(1.0, self.longest_side / max(height, width))
-        size = max(round(height * factor), 1), max(round(width * factor), 1)
+        largest = min(1.0, self.longest_side / max(height, width))
         x = torch.from_numpy(np.ascontiguousarray(image)).permute(2, 0, 1)[None].float()
+        looks = []
+        with torch.inference_mode():
+            for number, scale in enumerate(self.scales):
+                found = self._look(x, largest * scale)
+                sides = (found.boxes[:, 2:] - found.boxes[:, :2]) * largest * scale
+                kept = np.ones(len(found), bool)
+                if number > 0:
+                    kept &= sides.min(axis=1, initial=np.inf) >= COARSE_SIDES[0]
+                if number + 1 < len(self.scales):
+                    kept &= sides.max(axis=1, initial=0) <= COARSE_SIDES[1]
+                looks.append(found.chosen(kept))
+        together = joined(looks)
+        boxes, scores = torch.from_numpy(together.boxes), torch.from_numpy(together.scores)
+        return together.chosen(nms(boxes, scores, self.overlap_threshold).numpy())
+
+    def _look(self, x: Tensor, factor: float) -> Instances:
+        """The fruits in an image (1, 3, H, W), seen at a factor of its size."""
+        height, width = x.shape[2:]
+        size = max(round(height * factor), 1), max(round(width * factor), 1)
         if size != (height, width):
             x = functional.interpolate(x, size, mode="bilinear", antialias=True, align_corners=False)
         padding = [-size[1] % SIZE_MULTIPLE, -size[0] % SIZE_MULTIPLE]
-        x = functional.pad(x, (0, padding[0], 0, padding[1]), value=PADDING_COLOUR)
-        with torch.inference_mode():
-            maps = self.network(x)
-            found = find_fruits(maps, self.score_threshold, self.overlap_threshold)
+        maps = self.network(functional.pad(x, (0, padding[0], 0, padding[1]), value=PADDING_COLOUR))
+        found = find_fruits(maps, self.score_threshold, self.overlap_threshold)
         scale = torch.tensor([width / size[1], height / size[0]] * 2)
         limit = torch.tensor([width, height] * 2, dtype=torch.float32)
         boxes = (found["boxes"] * scale).clamp(min=torch.zeros(4), max=limit)
         kept = ((boxes[:, 2:] - boxes[:, :2]) >= 1).all(1)
         boxes = boxes[kept]
         whole = found["whole"][kept] * scale
-        fruit, votes = self._full_maps(maps, size, (height, width), scale)
-        masks = (
-            split_by_votes(fruit, votes, boxes.numpy())
-            if not self.boxes_only
-            else ellipses(boxes, height, width)
-        )
+        if self.boxes_only:
+            masks = ellipses(boxes, height, width)
+        else:
+            fruit, votes = full_maps(maps, size, (height, width))
+            masks = split_by_votes(fruit, votes, boxes.numpy())
         kinds = found["category"][kept].tolist()
         return Instances(
             boxes=boxes.numpy(),
@@ -101,22 +133,27 @@ class LightSegmenter:
             amodal_boxes=None if self.boxes_only else enclosing(whole, boxes).numpy(),
         )
 
-    def _full_maps(
-        self, maps: FruitMaps, size: tuple[int, int], full: tuple[int, int], scale: Tensor
-    ) -> tuple[NDArray[np.bool_], NDArray[np.float32]]:
-        """Fruit pixels (H, W) and the centres they vote for (2, H, W), in the image's pixels."""
-        if self.boxes_only:
-            return np.zeros(full, bool), np.zeros((2, *full), np.float32)
-        x, y = place_centres(*maps.vote.shape[2:])
-        votes = torch.stack([x, y]) + maps.vote[0]
-        both = torch.cat([maps.fruit[0], votes])[None]
-        padded = both.shape[2] * STRIDE, both.shape[3] * STRIDE
-        both = functional.interpolate(both, padded, mode="bilinear", align_corners=False)[
-            :, :, : size[0], : size[1]
-        ]
-        if size != full:
-            both = functional.interpolate(both, full, mode="bilinear", align_corners=False)
-        return (both[0, 0] > 0).numpy(), (both[0, 1:] * scale[:2, None, None]).numpy()
+
+def full_maps(
+    maps: FruitMaps, size: tuple[int, int], full: tuple[int, int]
+) -> tuple[NDArray[np.bool_], NDArray[np.float32]]:
+    """Fruit pixels (H, W) and the centres they vote for (2, H, W), in the image's pixels.
+
+    Args:
+        maps: What the network says about the image made to `size` and padded.
+        size: Height and width without the padding, in [px].
+        full: Height and width of the image, in [px].
+    """
+    x, y = place_centres(*maps.vote.shape[2:])
+    votes = torch.stack([x, y]) + maps.vote[0]
+    both = torch.cat([maps.fruit[0], votes])[None]
+    padded = both.shape[2] * STRIDE, both.shape[3] * STRIDE
+    both = functional.interpolate(both, padded, mode="bilinear", align_corners=False)
+    both = both[:, :, : size[0], : size[1]]
+    if size != full:
+        both = functional.interpolate(both, full, mode="bilinear", align_corners=False)
+    scale = torch.tensor([full[1] / size[1], full[0] / size[0]])
+    return (both[0, 0] > 0).numpy(), (both[0, 1:] * scale[:, None, None]).numpy()
 
 
 def open_light(
@@ -124,6 +161,7 @@ def open_light(
     score_threshold: float = 0.3,
     overlap_threshold: float = 0.6,
     longest_side: int = 640,
+    scales: tuple[float, ...] = (1.0, 0.5),
 ) -> LightSegmenter:
     """Opens the shipped weights, or those in a file.
 
@@ -146,7 +184,7 @@ def open_light(
             f"{path} does not fit this version's network ({str(error).splitlines()[0]})"
         ) from error
     boxes_only = bool(data["training"].get("boxes_only", False))
-    return LightSegmenter(network, boxes_only, score_threshold, overlap_threshold, longest_side)
+    return LightSegmenter(network, boxes_only, score_threshold, overlap_threshold, longest_side, scales)
 
 
 def find_fruits(maps: FruitMaps, score_threshold: float, overlap_threshold: float) -> dict[str, Tensor]:

@@ -65,7 +65,7 @@ class ResumableTraining(ABC):
         """Trains to the end.
 
         Args:
-            out: Folder of checkpoints, history and weights.
+            out: Folder of checkpoints, history and weights; those of each checkpoint can be used already.
             report: Takes a line now and then.
             stopped: Asked after every step; if true, the state is saved and the training ends early.
 
@@ -95,9 +95,9 @@ class ResumableTraining(ABC):
                 if self.history and self.history[-1]["step"] == self.step:
                     self.history[-1] |= self.validation_losses()
                 self.save(out)
+                self.write_weights(out / WEIGHTS)
             if end:
                 return None
-        self.write_weights(out / WEIGHTS)
         return out / WEIGHTS
 
     def save(self, out: Path) -> None:
