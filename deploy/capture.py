@@ -27,8 +27,8 @@ class CaptureConfig:
     """Between attempts, in [s]."""
     max_age: float = 0.5
     """Oldest picture, in [s]."""
-    min_depth_share: float = 0.01
-    """Share of the pixels that must have depth."""
+    min_depth_share: float = 0.001
+    """Share of the pixels that must have depth; small, because a leaf before the lens leaves hardly any."""
 
     def __post_init__(self) -> None:
         if self.attempts < 1:
@@ -89,6 +89,6 @@ class Capture:
         share = float((frame.depth > 0.0).mean())
         if share < self._config.min_depth_share or not np.isfinite(frame.depth).all():
             raise PerceptionError(
-                f"{share:.1%} of the pixels have depth, at least {self._config.min_depth_share:.1%} are needed; "
-                "is the infrared projector on, and is anything within 0.1 to 3 m?"
+                f"{share:.2%} of the pixels have depth, at least {self._config.min_depth_share:.2%} are needed; "
+                "is the infrared projector on, is anything within 0.1 to 3 m, or does a leaf cover the lens?"
             )

@@ -186,10 +186,13 @@ class _PlayedArm(Arm):
     name = "playback"
     simulated = True
     can_stop = True
-    is_connected = True
 
     def __init__(self, playback: _Playback) -> None:
         self._playback = playback
+
+    @property
+    def is_connected(self) -> bool:
+        return True
 
     def connect(self) -> None: ...
 
@@ -216,7 +219,6 @@ class _PlayedArm(Arm):
 class _PlayedCamera(Camera):
     name = "playback"
     simulated = True
-    is_connected = True
 
     def __init__(self, playback: _Playback) -> None:
         self._playback = playback
@@ -224,6 +226,10 @@ class _PlayedCamera(Camera):
     @property
     def intrinsics(self) -> CameraIntrinsics:
         return self._playback.steps[0].frame.intrinsics
+
+    @property
+    def is_connected(self) -> bool:
+        return True
 
     def connect(self) -> None: ...
 

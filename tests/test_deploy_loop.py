@@ -17,8 +17,9 @@ from maniskill_tomato.deploy.clock import SimulatedClock
 from maniskill_tomato.deploy.errors import ProfileError
 from maniskill_tomato.deploy.fruits import TruthFinder
 from maniskill_tomato.deploy.guarded_arm import GuardedArm
+from maniskill_tomato.deploy.interface import Frame
 from maniskill_tomato.deploy.loop import Loop, Proposal
-from maniskill_tomato.deploy.perceive import ImagePerception
+from maniskill_tomato.deploy.perceive import ImagePerception, View
 from maniskill_tomato.deploy.policies import default_policy, open_policy
 from maniskill_tomato.deploy.profile import Profile, load_profile, parse_profile, profile_names
 from maniskill_tomato.deploy.station import Station, make_station
@@ -156,8 +157,8 @@ class Hidden(ImagePerception):
         super().__init__(TruthFinder())
         self.looks = 0
 
-    def look(self, *arguments: Any) -> Any:
-        view = super().look(*arguments)
+    def look(self, frame: Frame, T_world_camera: Any, target_position: Any) -> View:
+        view = super().look(frame, T_world_camera, target_position)
         self.looks += 1
         empty = np.zeros_like(view.mask)
         return view if self.looks == 1 else replace(view, visible_fraction=0.0, mask=empty)

@@ -195,14 +195,15 @@ def test_the_collision_checker_sees_what_plain_mujoco_sees() -> None:
 
 
 def test_the_safety_configuration_refuses_what_makes_no_sense() -> None:
-    for wrong in (
+    cases: tuple[dict[str, Any], ...] = (
         {"speed_fraction": 0.5},
         {"max_speed_fraction": 0.9},
         {"joint_margin": -0.1},
         {"path_step": 0.5},
         {"plant_points_needed": 0},
         {"speed_fraction": float("nan")},
-    ):
+    )
+    for wrong in cases:
         with pytest.raises(InvalidInputError):
             SafetyConfig(**wrong)
     with pytest.raises(InvalidInputError, match="low must lie below high"):
@@ -215,7 +216,6 @@ class SpyArm(Arm):
     name = "spy"
     simulated = True
     can_stop = True
-    is_connected = True
 
     def __init__(self, clock: SimulatedClock) -> None:
         self.clock = clock
@@ -223,6 +223,10 @@ class SpyArm(Arm):
         self.sent: list[tuple[Any, JointMove]] = []
         self.report: Any = None
         self.arrives = True
+
+    @property
+    def is_connected(self) -> bool:
+        return True
 
     def connect(self) -> None: ...
 
