@@ -1,5 +1,6 @@
 """A rendered scene: a row of plants with its surroundings, and what a camera sees of it, as numbers for every pixel."""
 
+import tempfile
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
@@ -241,12 +242,17 @@ class GreenhouseScene:
 def _sky(strength: float) -> sapien.render.RenderCubemap:
     from sapien.asset import create_dome_envmap
 
-    return create_dome_envmap(
-        sky_color=[1.1 * strength, 1.15 * strength, 1.2 * strength],
-        ground_color=[0.45 * strength, 0.45 * strength, 0.42 * strength],
-        blend=0.4,
-        resolution=SKY_RESOLUTION,
-    )
+    # SAPIEN writes colours as 8-bit numbers, in which anything above 1 would wrap round to near 0.
+    sky = np.minimum(np.array([0.78, 0.81, 0.83]) * strength, 1.0)
+    ground = np.minimum(np.array([0.33, 0.33, 0.31]) * strength, 1.0)
+    with tempfile.TemporaryDirectory() as folder:  # Its default file is one for all processes.
+        return create_dome_envmap(
+            filename=f"{folder}/sky.ktx",
+            sky_color=sky.tolist(),
+            ground_color=ground.tolist(),
+            blend=0.4,
+            resolution=SKY_RESOLUTION,
+        )
 
 
 def _merged(parts: Sequence[MeshPart]) -> list[MeshPart]:
