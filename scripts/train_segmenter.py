@@ -154,7 +154,7 @@ def main(argv: Sequence[str] | None = None) -> None:
             | Annotated[Yolo, tyro.conf.subcommand("yolo")]
         )
         args: Light | MaskRcnn | Yolo = tyro.cli(
-            kinds,  # type: ignore[arg-type]
+            kinds,
             args=argv,
             description=__doc__,
         )

@@ -51,7 +51,7 @@ def test_average_precision_is_the_one_worked_out_by_hand() -> None:
     Precision 1, 1/2, 2/3, 3/4; recall 1/4, 1/4, 2/4, 3/4; best precision from there on 1, 3/4, 3/4, 3/4; so
     AP = 1/4 * 1 + 1/4 * 3/4 + 1/4 * 3/4 = 0.625 (Eq. 4-3).
     """
-    fruits = [[0.0, 0, 10, 10], [20, 0, 30, 10], [40, 0, 50, 10], [60, 0, 70, 10]]
+    fruits: list[list[float]] = [[0.0, 0, 10, 10], [20, 0, 30, 10], [40, 0, 50, 10], [60, 0, 70, 10]]
     found = found_boxes([fruits[0], [80, 80, 90, 90], fruits[1], fruits[2]], [0.9, 0.8, 0.7, 0.6])
     score = DetectionScore()
     score.add(found, true_boxes(fruits))

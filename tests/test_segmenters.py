@@ -1,6 +1,7 @@
 """Segmenters behind one interface: what each finds, and what each refuses."""
 
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -74,7 +75,7 @@ def test_depth_takes_far_fruits_away_and_parts_fruits_of_one_colour() -> None:
 
 def test_watershed_parts_are_disjoint_and_cover_the_whole_but_for_ridges() -> None:
     _, masks = drawn((40, 40, 20), (70, 50, 20), (110, 70, 30))
-    whole = masks.any(axis=0)
+    whole: NDArray[np.bool_] = np.asarray(masks.any(axis=0))
     parts = split_by_watershed(whole)
     assert len(parts) == 3
     assert parts.sum(axis=0).max() == 1 and not (parts.any(axis=0) & ~whole).any()
@@ -120,7 +121,8 @@ def test_images_of_another_kind_are_refused(name: str, image: NDArray[np.uint8])
 
 def test_depth_of_another_size_or_type_is_refused() -> None:
     image, _ = drawn((50, 60, 22))
-    for depth in (np.zeros((10, 10), np.float32), np.zeros(image.shape[:2], np.uint16)):
+    wrong: list[Any] = [np.zeros((10, 10), np.float32), np.zeros(image.shape[:2], np.uint16)]
+    for depth in wrong:
         with pytest.raises(InvalidInputError, match="depth must"):
             make_segmenter("colour")(image, depth)
 

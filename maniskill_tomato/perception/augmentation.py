@@ -92,7 +92,7 @@ def _placed(
     whole = None if picture.whole_boxes is None else _moved(picture.whole_boxes, matrix)
     clipped = np.clip(boxes, 0, [width, height, width, height]).astype(np.float32)
     if labels is not None:
-        for index in np.flatnonzero((clipped != boxes).any(axis=1)):
+        for index in np.flatnonzero((clipped != boxes).any(axis=1)).tolist():
             clipped[index] = _visible_box(labels, index + 1, clipped[index])
     sides = clipped[:, 2:] - clipped[:, :2]
     share = sides.prod(axis=1) / np.maximum((boxes[:, 2:] - boxes[:, :2]).prod(axis=1), 1e-6)

@@ -56,9 +56,11 @@ def mirrored(picture: TrainingPicture) -> TrainingPicture:
 
 def brighter(image: Image, factor: float) -> Image:
     """Every pixel times a factor."""
-    return np.clip(image.astype(np.float32) * factor, 0, 255).astype(np.uint8)
+    changed: Image = np.clip(image.astype(np.float32) * factor, 0, 255).astype(np.uint8)
+    return changed
 
 
 def contrasted(image: Image, alpha: float) -> Image:
     """Every pixel v as 127 + alpha (v - 127)."""
-    return np.clip(127 + alpha * (image.astype(np.float32) - 127), 0, 255).astype(np.uint8)
+    changed: Image = np.clip(127 + alpha * (image.astype(np.float32) - 127), 0, 255).astype(np.uint8)
+    return changed

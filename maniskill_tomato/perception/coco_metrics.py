@@ -3,6 +3,7 @@
 import contextlib
 import io
 from collections.abc import Iterable
+from typing import Any
 
 import numpy as np
 
@@ -31,7 +32,9 @@ def coco_metrics(pairs: Iterable[tuple[Instances, ImageTruth]], overlap: Overlap
         from pycocotools.cocoeval import COCOeval
     except ImportError as error:
         raise MissingPackageError.extra("pycocotools", "perception") from error
-    images, truths, detections = [], [], []
+    images: list[dict[str, Any]] = []
+    truths: list[dict[str, Any]] = []
+    detections: list[dict[str, Any]] = []
     for number, (found, truth) in enumerate(pairs, start=1):
         height, width = found.masks.shape[1:]
         images.append({"id": number, "height": height, "width": width})

@@ -76,7 +76,8 @@ class ColourSegmenter:
         red &= (saturation >= self.least_saturation) & (value >= self.least_value)
         kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (3, 3))
         opened = cv2.morphologyEx(red.astype(np.uint8), cv2.MORPH_OPEN, kernel)
-        return cv2.morphologyEx(opened, cv2.MORPH_CLOSE, kernel).astype(bool)
+        closed: NDArray[np.bool_] = cv2.morphologyEx(opened, cv2.MORPH_CLOSE, kernel).astype(bool)
+        return closed
 
     def _jumps(self, depth_m: NDArray[np.float32], known: NDArray[np.bool_]) -> NDArray[np.bool_]:
         """Pixels on the near side of nothing: where a neighbour is nearer by more than the jump. Shape (H, W)."""

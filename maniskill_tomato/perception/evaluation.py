@@ -9,7 +9,13 @@ import numpy as np
 from maniskill_tomato.errors import InvalidInputError
 from maniskill_tomato.perception.annotations import AnnotatedImage
 from maniskill_tomato.perception.coco_metrics import coco_metrics
-from maniskill_tomato.perception.detection_metrics import DetectionScore, ImageTruth, Overlap, image_truth
+from maniskill_tomato.perception.detection_metrics import (
+    DetectionScore,
+    ImageTruth,
+    Overlap,
+    PrecisionRecall,
+    image_truth,
+)
 from maniskill_tomato.perception.detection_plots import plot_precision_recall
 from maniskill_tomato.perception.instances import Image, Instances
 from maniskill_tomato.perception.pictures import contact_sheet, draw_instances, write_picture
@@ -68,7 +74,7 @@ def evaluate_segmenter(
         if number in sheet:
             drawn.append(draw_instances(picture, found, WORKING_SCORE))
     metrics: dict[str, float] = {"images": len(images), "fruits": scores["box"].fruits}
-    curves = {}
+    curves: dict[str, PrecisionRecall] = {}
     for overlap, score in scores.items():
         curve = score.precision_recall()
         precision, recall = curve.at_score(WORKING_SCORE)

@@ -45,7 +45,8 @@ class FruitNetworkConfig:
     @classmethod
     def from_dict(cls, data: dict[str, Any]) -> "FruitNetworkConfig":
         """The inverse of `to_dict`."""
-        return cls(**{k: tuple(v) if isinstance(v, list) else v for k, v in data.items()})
+        values: dict[str, Any] = {k: tuple(v) if isinstance(v, list) else v for k, v in data.items()}
+        return cls(**values)
 
 
 class FruitMaps(NamedTuple):

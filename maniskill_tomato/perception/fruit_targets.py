@@ -5,6 +5,7 @@ loss of CornerNet (Law and Deng, 2018), generalised IoU weighted by the logarith
 """
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import torch
@@ -110,7 +111,8 @@ def _picture_targets(picture: TrainingPicture) -> dict[str, NDArray[np.float32] 
     count = len(picture.boxes)
     boxes = picture.boxes if count else np.zeros((1, 4), np.float32)
     whole = np.full_like(boxes, np.nan) if picture.whole_boxes is None or not count else picture.whole_boxes
-    whole_known = owned & np.isfinite(whole).all(axis=1)[index]
+    known_fruits: NDArray[np.bool_] = np.asarray(np.isfinite(whole).all(axis=1))
+    whole_known = owned & known_fruits[index]
     kinds = np.full(max(count, 1), -1) if picture.categories is None or not count else picture.categories
     fruit, fruit_weight, vote, vote_weight = _mask_targets(picture, rows, columns)
     return {
@@ -137,12 +139,12 @@ def _mask_targets(
         return nothing, nothing, np.zeros((2, rows, columns), np.float32), nothing
     labels = picture.labels[: rows * STRIDE, : columns * STRIDE]
     cells = labels.reshape(rows, STRIDE, columns, STRIDE).transpose(0, 2, 1, 3).reshape(rows, columns, -1)
-    fruit = (cells > 0).mean(axis=2, dtype=np.float32)
-    known = (cells >= 0).all(axis=2).astype(np.float32)
+    fruit = np.asarray((cells > 0).mean(axis=2), np.float32)
+    known = np.asarray((cells >= 0).all(axis=2), np.float32)
     # The fruit in the middle of a cell stands for the cell.
     middle = cells[:, :, STRIDE * STRIDE // 2 + STRIDE // 2]
     on_fruit = middle > 0
-    centres = np.zeros((max(len(picture.boxes), 1), 2), np.float32)
+    centres: NDArray[np.floating[Any]] = np.zeros((max(len(picture.boxes), 1), 2), np.float32)
     if len(picture.boxes):
         centres = (picture.boxes[:, :2] + picture.boxes[:, 2:]) / 2
     vote = centres[np.maximum(middle - 1, 0)].transpose(2, 0, 1).astype(np.float32)

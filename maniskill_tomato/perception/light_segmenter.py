@@ -246,9 +246,9 @@ def split_by_votes(
         closer = distance < nearest[rows, columns]
         nearest[rows, columns][closer] = distance[closer]
         owner[rows, columns][closer] = index
-    masks = (owner[None] == np.arange(len(boxes))[:, None, None]) & fruit
-    for index in np.flatnonzero(~masks.any(axis=(1, 2))):
-        masks[index] = box_ellipse(boxes[index], height, width)
+    masks: NDArray[np.bool_] = (owner[None] == np.arange(len(boxes))[:, None, None]) & fruit
+    for empty in np.flatnonzero(~masks.any(axis=(1, 2))).tolist():
+        masks[empty] = box_ellipse(boxes[empty], height, width)
     return masks
 
 

@@ -103,12 +103,13 @@ def _backbone(config: MaskRcnnConfig, pretrained: bool) -> nn.Module:
     """Features at strides 4 to 32, and one more level by pooling."""
     weights: Any = "IMAGENET1K_V1" if pretrained else None
     if config.backbone != "mobilenet":
-        return resnet_fpn_backbone(
+        residual: nn.Module = resnet_fpn_backbone(
             backbone_name=config.backbone,
             weights=weights,
             norm_layer=FrozenBatchNorm2d if pretrained else nn.BatchNorm2d,
             trainable_layers=5,
         )
+        return residual
     features = mobilenet_v3_large(weights=weights).features
     with torch.no_grad():
         channels, x = {}, torch.zeros(1, 3, 64, 64)
@@ -116,7 +117,7 @@ def _backbone(config: MaskRcnnConfig, pretrained: bool) -> nn.Module:
             x = block(x)
             channels[name] = x.shape[1]
     features.train()
-    return BackboneWithFPN(
+    mobile: nn.Module = BackboneWithFPN(
         features,
         MOBILENET_LAYERS,
         [channels[name] for name in MOBILENET_LAYERS],
@@ -124,3 +125,4 @@ def _backbone(config: MaskRcnnConfig, pretrained: bool) -> nn.Module:
         extra_blocks=LastLevelMaxPool(),
         norm_layer=nn.BatchNorm2d,
     )
+    return mobile
