@@ -285,7 +285,7 @@ def test_a_jump_of_a_joint_at_rest_is_a_fault() -> None:
 
 
 def test_a_jump_of_a_joint_in_a_move_is_a_fault() -> None:
-    faults = [Fault(kind="jump", command="getJointsPositions", count=5, radians=0.9)]
+    faults = [Fault(kind="jump", command="getJointsPositions", count=5, radians=2.5)]
     with LoopbackController(qpos=REST, faults=faults) as controller, driver(controller) as arm:
         arm.command(move_to(NEAR, speed=0.05))
         with pytest.raises(FaultError, match="joint 4 turned by .* faster than it can"):

@@ -99,7 +99,7 @@ def test_the_loop_moves_the_arm_over_the_socket_through_safety_and_guarded_moves
     ("fault", "reason", "word"),
     [
         (Fault(kind="drop", command="doPTP", seconds=0.05), "not_connected", "emergency stop"),
-        (Fault(kind="jump", command="getJointsPositions", count=9, radians=0.5), "fault", "turned by"),
+        (Fault(kind="jump", command="getJointsPositions", count=3, radians=0.5), "fault", "turned by"),
         (Fault(kind="contact", command="doPTP"), "fault", "touched something"),
     ],
 )
