@@ -158,7 +158,9 @@ def test_an_unknown_asset_is_refused_with_the_folder_and_its_content() -> None:
 
 def test_assets_are_real_files_under_the_size_limit() -> None:
     sizes = {path: path.stat().st_size for path in ASSETS_DIR.rglob("*") if path.is_file()}
-    assert {path.name: size for path, size in sizes.items() if size > 5_000_000} == {}
+    # Segmenters see pictures: their weights are larger than anything else.
+    limits = {path: 20_000_000 if path.parent.name == "perception" else 5_000_000 for path in sizes}
+    assert {path.name: size for path, size in sizes.items() if size > limits[path]} == {}
 
 
 def test_the_console_command_is_declared() -> None:
