@@ -1,6 +1,7 @@
 """The thesis's settings, number by number, and that the networks are built with them."""
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -105,7 +106,7 @@ def test_the_network_is_built_with_the_settings() -> None:
     from maniskill_tomato.perception.mask_rcnn import build_mask_rcnn
 
     config = replace(MASK_RCNN_PRESETS["strategy-3"], backbone="mobilenet")
-    network = build_mask_rcnn(config)
+    network: Any = build_mask_rcnn(config)
     assert [sizes[0] for sizes in network.rpn.anchor_generator.sizes] == [16, 64, 128, 256, 512]
     assert network.rpn.nms_thresh == 0.5
     assert network.roi_heads.fg_bg_sampler.batch_size_per_image == 300

@@ -68,7 +68,7 @@ def fruit_picture(seed: int = 0, count: int = 5, size: tuple[int, int] = (160, 1
 def perfect_maps(picture: TrainingPicture) -> FruitMaps:
     """What a network says that is right everywhere."""
     targets = make_targets([picture])
-    x, y = place_centres(*targets.heat.shape[2:])
+    x, y = place_centres(targets.heat.shape[2], targets.heat.shape[3])
 
     def distances(box: torch.Tensor) -> torch.Tensor:
         left, top, right, bottom = box.unbind(1)

@@ -160,7 +160,7 @@ def test_a_file_that_is_no_weights_is_refused(tmp_path: Path) -> None:
 
 def test_yolo_says_what_to_install(tmp_path: Path) -> None:
     try:
-        import ultralytics  # noqa: F401
+        import ultralytics  # noqa: F401 # pyright: ignore[reportMissingImports]
     except ImportError:
         (tmp_path / "yolov8n.pt").write_bytes(b"weights")
         with pytest.raises(MissingPackageError, match=r"maniskill-tomato\[yolo\]"):

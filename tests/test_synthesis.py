@@ -1,6 +1,7 @@
 """Rendered data sets: the parts as functions with known answers, and a small data set where a renderer is there."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -166,8 +167,8 @@ def test_a_small_data_set_is_whole_continued_and_the_same_again(tmp_path: Path) 
             assert fruit.visible_fraction <= seen.sum() / whole.sum() + 1e-6
     assert write_statistics(read, tmp_path / "a").is_file()
     # Continued to three images it keeps the first two, and made anew in one go it is the same.
-    grown = make_dataset(DatasetConfig(**(vars(config) | {"count": 3})), tmp_path / "a")
-    again = make_dataset(DatasetConfig(**(vars(config) | {"count": 3})), tmp_path / "b")
+    grown = make_dataset(replace(config, count=3), tmp_path / "a")
+    again = make_dataset(replace(config, count=3), tmp_path / "b")
     for one, other in zip(grown.images, again.images, strict=True):
         assert one.path.read_bytes() == other.path.read_bytes()
         assert one.instances == other.instances

@@ -169,7 +169,7 @@ def read_picture(path: Path) -> NDArray[np.uint8]:
     picture = cv2.imread(str(path), cv2.IMREAD_COLOR)
     if picture is None:
         raise InvalidInputError(f"{path} cannot be read as an image; use JPEG or PNG")
-    return np.ascontiguousarray(picture[..., ::-1])
+    return np.ascontiguousarray(picture[..., ::-1], dtype=np.uint8)
 
 
 def clip_box(box: Box, width: int, height: int) -> Box | None:

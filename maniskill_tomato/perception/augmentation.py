@@ -85,9 +85,10 @@ def _placed(
     how = cv2.INTER_AREA if scale < 0.5 else cv2.INTER_LINEAR
     grey = tuple(float(v) for v in rng.uniform(60, 200, 3))
     image = cv2.warpAffine(picture.image, centred, (width, height), flags=how, borderValue=grey)
-    labels = None
+    labels: NDArray[np.int16] | None = None
     if picture.labels is not None:
-        labels = cv2.warpAffine(picture.labels, centred, (width, height), flags=cv2.INTER_NEAREST)
+        warped = cv2.warpAffine(picture.labels, centred, (width, height), flags=cv2.INTER_NEAREST)
+        labels = np.asarray(warped, np.int16)
     boxes = _moved(picture.boxes, matrix)
     whole = None if picture.whole_boxes is None else _moved(picture.whole_boxes, matrix)
     clipped = np.clip(boxes, 0, [width, height, width, height]).astype(np.float32)

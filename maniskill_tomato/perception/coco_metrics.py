@@ -61,7 +61,7 @@ def coco_metrics(pairs: Iterable[tuple[Instances, ImageTruth]], overlap: Overlap
                 entry["bbox"] = [left, top, right - left, bottom - top]
             detections.append(entry)
     with contextlib.redirect_stdout(io.StringIO()):  # pycocotools prints.
-        truth_set = COCO()
+        truth_set: Any = COCO()
         truth_set.dataset = {
             "images": images,
             "annotations": truths,

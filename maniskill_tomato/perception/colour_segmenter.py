@@ -102,7 +102,7 @@ def split_by_watershed(pixels: NDArray[np.bool_], summit: float = 0.6) -> NDArra
         Masks of shape (N, H, W).
     """
     count, parts = cv2.connectedComponents(pixels.astype(np.uint8))
-    distance = cv2.distanceTransform(pixels.astype(np.uint8), cv2.DIST_L2, 5)
+    distance = np.asarray(cv2.distanceTransform(pixels.astype(np.uint8), cv2.DIST_L2, 5), np.float32)
     seeds = np.zeros(pixels.shape, np.int32)
     number = 0
     for part in range(1, count):

@@ -58,7 +58,7 @@ def evaluate_segmenter(
     drawn: list[Image] = []
     with_masks = all(f.visible_mask is not None for image in images for f in image.fruits)
     overlaps: tuple[Overlap, ...] = ("box", "mask") if with_masks else ("box",)
-    scores = {overlap: DetectionScore(overlap) for overlap in overlaps}
+    scores: dict[Overlap, DetectionScore] = {overlap: DetectionScore(overlap) for overlap in overlaps}
     pairs: list[tuple[Instances, ImageTruth]] = []
     seconds = []
     for number, image in enumerate(images):

@@ -144,7 +144,7 @@ def full_maps(
         size: Height and width without the padding, in [px].
         full: Height and width of the image, in [px].
     """
-    x, y = place_centres(*maps.vote.shape[2:])
+    x, y = place_centres(maps.vote.shape[2], maps.vote.shape[3])
     votes = torch.stack([x, y]) + maps.vote[0]
     both = torch.cat([maps.fruit[0], votes])[None]
     padded = both.shape[2] * STRIDE, both.shape[3] * STRIDE
@@ -199,7 +199,7 @@ def find_fruits(maps: FruitMaps, score_threshold: float, overlap_threshold: floa
     scores, places = scores.topk(min(MOST_FRUITS, scores.numel()))
     chosen = scores >= max(score_threshold, 1e-6)
     scores, places = scores[chosen], places[chosen]
-    x, y = (c.flatten()[places] for c in place_centres(*heat.shape))
+    x, y = (c.flatten()[places] for c in place_centres(heat.shape[0], heat.shape[1]))
 
     def corners(distances: Tensor) -> Tensor:
         left, top, right, bottom = distances[0].flatten(1)[:, places]

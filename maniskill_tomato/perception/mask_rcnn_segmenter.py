@@ -36,7 +36,8 @@ class MaskRcnnSegmenter:
         if score_threshold is not None:
             if not 0 <= score_threshold <= 1:
                 raise InvalidInputError(f"score_threshold must be between 0 and 1, got {score_threshold}")
-            network.roi_heads.score_thresh = score_threshold
+            heads: Any = network.roi_heads
+            heads.score_thresh = score_threshold
         self.network = network.eval().requires_grad_(False)
         self.categories = categories
 

@@ -42,7 +42,7 @@ class EncodedMask:
 
         if mask.ndim != 2 or 0 in mask.shape:
             raise InvalidInputError(f"a mask must have shape (height, width), got {mask.shape}")
-        coded = coco_mask.encode(np.asfortranarray(mask.astype(bool).astype(np.uint8)))
+        coded: Any = coco_mask.encode(np.asfortranarray(mask.astype(bool).astype(np.uint8)))
         return cls(mask.shape[0], mask.shape[1], coded["counts"].decode("ascii"))
 
     @classmethod
@@ -72,7 +72,7 @@ class EncodedMask:
         # Far outside, pycocotools would walk the outline pixel by pixel.
         far = 2.0 * max(height, width)
         clipped = [np.clip(polygon, -far, far).tolist() for polygon in whole]
-        coded = coco_mask.merge(coco_mask.frPyObjects(clipped, height, width))
+        coded: Any = coco_mask.merge(coco_mask.frPyObjects(clipped, height, width))
         return cls(height, width, coded["counts"].decode("ascii"))
 
     @classmethod
@@ -110,7 +110,8 @@ class EncodedMask:
         """Left, top, width and height of the smallest box around it, in [px]; zeros for an empty mask."""
         from pycocotools import mask as coco_mask
 
-        x, y, w, h = coco_mask.toBbox(self._coded()).tolist()
+        coded: Any = self._coded()
+        x, y, w, h = coco_mask.toBbox(coded).tolist()
         return float(x), float(y), float(w), float(h)
 
     def to_coco(self) -> dict[str, Any]:

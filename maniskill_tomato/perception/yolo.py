@@ -74,7 +74,7 @@ def import_ultralytics() -> Any:
         MissingPackageError: It is not installed.
     """
     try:
-        import ultralytics
+        import ultralytics  # pyright: ignore[reportMissingImports] # An extra of its own.
     except ImportError as error:
         raise MissingPackageError.extra("ultralytics (licence AGPL-3.0)", "yolo") from error
     return ultralytics

@@ -75,7 +75,7 @@ class ImprovedModel:
         pieces = steps.outlines(grown, 1.0)
         if not pieces:
             return Estimate.failed()
-        ellipse = steps.fit_ellipse(cv2.convexHull(np.concatenate(pieces)))
+        ellipse = steps.fit_ellipse(np.asarray(cv2.convexHull(np.concatenate(pieces)), np.int32))
         inside = steps.fill_ellipse(ellipse, here.shape) if ellipse is not None else grown
         inside = steps.remove_deeper(inside, z, own + c.behind_share * c.diameter_m)
         for other in others:

@@ -237,7 +237,7 @@ def _collect(
         in_window = (ox >= 0) & (oy >= 0) & (ox < here.shape[1]) & (oy < here.shape[0])
         out = z[np.clip(oy, 0, here.shape[0] - 1), np.clip(ox, 0, here.shape[1] - 1)]
         deeper &= in_window & ((out > own + step) | (out == 0))
-    edge = np.stack([ex + 0.5, ey + 0.5], 1)[deeper]
+    edge = np.stack([ex + 0.5, ey + 0.5], 1).astype(np.float64)[deeper]
     grown = cv2.dilate(image, np.ones((5, 5), np.uint8)) > 0
     behind = (z > own + 2 * step) & ~grown
     core = cv2.erode(image, np.ones((5, 5), np.uint8)) > 0

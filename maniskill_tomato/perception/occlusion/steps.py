@@ -80,8 +80,8 @@ def fit_ellipse(contour: Contour) -> Ellipse | None:
     """The least-squares ellipse of a contour (Fitzgibbon et al. 1999); None if there is no sensible one."""
     if len(contour) < 6:
         return None
-    ellipse: Ellipse = cv2.fitEllipseDirect(contour)
-    (x, y), (a, b), _ = ellipse
+    (x, y), (a, b), turn = cv2.fitEllipseDirect(contour)
+    ellipse: Ellipse = (float(x), float(y)), (float(a), float(b)), float(turn)
     if not np.isfinite([x, y, a, b]).all() or min(a, b) < 2 or max(a, b) > 10 * min(a, b):
         return None
     return ellipse

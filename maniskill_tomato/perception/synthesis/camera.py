@@ -122,7 +122,9 @@ def _occlusion(depth_m: NDArray[np.float64], scale: float, strength: float) -> F
         nearer = small - cv2.GaussianBlur(small, (0, 0), sigma / part * scale)
         # What lies far behind an edge is lit by its own surroundings again.
         dark = share * np.clip(nearer / reach, 0, 1) * np.exp(-np.clip(nearer, 0, None) / (5 * reach))
-        darkening += cv2.resize(dark, (depth.shape[1], depth.shape[0]), interpolation=cv2.INTER_LINEAR)
+        darkening += cv2.resize(
+            np.asarray(dark, np.float32), (depth.shape[1], depth.shape[0]), interpolation=cv2.INTER_LINEAR
+        )
     darkening *= np.exp(-np.clip(depth - 0.6, 0, None) / 0.6)
     return np.asarray(np.exp(-1.5 * strength * darkening), dtype=np.float32)
 
@@ -153,4 +155,5 @@ def _moved(picture: Float32, motion: tuple[float, float]) -> Float32:
     for t in np.linspace(-0.5, 0.5, 4 * size):
         x, y = size / 2 + t * motion[0], size / 2 + t * motion[1]
         kernel[int(np.clip(y, 0, size - 1)), int(np.clip(x, 0, size - 1))] += 1
-    return np.asarray(cv2.filter2D(picture, -1, kernel / kernel.sum(), borderType=cv2.BORDER_REFLECT))
+    moved = cv2.filter2D(picture, -1, kernel / kernel.sum(), borderType=cv2.BORDER_REFLECT)
+    return np.asarray(moved, np.float32)

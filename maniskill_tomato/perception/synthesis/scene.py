@@ -179,9 +179,10 @@ class GreenhouseScene:
 
     def relight(self, look: SceneLook) -> None:
         """Moves the sun and changes its strength, for another view of the same scene."""
-        turn = sapien.math.shortest_rotation([1, 0, 0], look.sun_direction)
+        ahead = np.array([1, 0, 0], np.float32)
+        turn = sapien.math.shortest_rotation(ahead, np.array(look.sun_direction, np.float32))
         self._sun.pose = sapien.Pose(_SUN_CENTRE, turn)
-        self._sun.color = list(look.sun)
+        self._sun.set_color(list(look.sun))
 
     def _add(self, shapes: Sequence[sapien.render.RenderShape], pose: sapien.Pose) -> sapien.Entity:
         body = sapien.render.RenderBodyComponent()

@@ -75,7 +75,8 @@ def _tile(image: AnnotatedImage, width: int) -> NDArray[np.uint8]:
             cv2.rectangle(picture, (x, y), (x + w, y + h), colour, 2)
     height = min(round(width * image.height / image.width), round(width * 1.25))
     scale = min(width / image.width, height / image.height)
-    return np.asarray(cv2.resize(picture, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA))
+    small = cv2.resize(picture, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
+    return np.asarray(small, np.uint8)
 
 
 def _outline(

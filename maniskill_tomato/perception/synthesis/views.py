@@ -58,8 +58,8 @@ def draw_views(plant: Plant, count: int, intrinsics: CameraIntrinsics, rng: Gene
     for number in range(count):
         low, high = BANDS[number % len(BANDS)]
         pool = targets if number % 5 else list(range(len(plant.fruits)))
+        view = draw_view(plant, pool, rng)
         for _ in range(TRIES):
-            view = draw_view(plant, pool, rng)
             seen = caster.cast(
                 torch.from_numpy(view.T_plant_optical.astype(np.float32))[None],
                 torch.tensor([view.target_fruit]),
@@ -67,6 +67,7 @@ def draw_views(plant: Plant, count: int, intrinsics: CameraIntrinsics, rng: Gene
             )
             if low <= float(seen.visible_fraction[0]) < high:
                 break
+            view = draw_view(plant, pool, rng)
         views.append(view)
     return views
 
