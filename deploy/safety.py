@@ -7,6 +7,7 @@ A command passes whole or not at all. Checks run from cheap to dear: numbers, li
 flange, then collisions along the straight line in joint space, which is what a PTP move follows.
 """
 
+import math
 from dataclasses import dataclass
 from typing import Literal
 
@@ -21,6 +22,8 @@ from maniskill_tomato.deploy.safety_config import Box, SafetyConfig
 from maniskill_tomato.robot.d435 import T_flange_camera_color_optical
 from maniskill_tomato.robot.iiwa14 import JOINT_LOWER, JOINT_NAMES, JOINT_UPPER
 from maniskill_tomato.robot.kinematics import forward_kinematics
+
+DEGREES = 180.0 / math.pi
 
 Reason = Literal[
     "not_finite",
@@ -118,10 +121,10 @@ class Safety:
         over = np.maximum(JOINT_LOWER + c.joint_margin - joints, joints - JOINT_UPPER + c.joint_margin)
         if (over > 0.0).any():
             k = int(over.argmax())
-            bound = np.rad2deg(JOINT_UPPER[k] - c.joint_margin)
+            bound = (JOINT_UPPER[k] - c.joint_margin) * DEGREES
             return Refusal(
                 reason="joint_limit",
-                detail=f"{JOINT_NAMES[k]} must stay within +-{bound:.1f} deg, got {np.rad2deg(joints[k]):.1f} deg",
+                detail=f"{JOINT_NAMES[k]} must stay within +-{bound:.1f} deg, got {float(joints[k]) * DEGREES:.1f} deg",
             )
         step = np.abs(joints - state.joint_positions)
         if (step > c.max_joint_step).any():

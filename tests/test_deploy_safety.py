@@ -340,6 +340,7 @@ def test_no_hostile_command_outside_the_envelope_reaches_the_arm(seed: int) -> N
 
 
 @pytest.mark.slow
+@pytest.mark.timeout(3000)
 @settings(max_examples=100, deadline=None, suppress_health_check=[HealthCheck.too_slow])
 @given(seed=st.integers(0, 2**32 - 1))
 def test_none_of_100000_hostile_commands_reaches_the_arm_from_outside_the_envelope(seed: int) -> None:
