@@ -4,6 +4,7 @@ import tempfile
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
+from typing import Any
 
 import numpy as np
 import sapien
@@ -179,8 +180,10 @@ class GreenhouseScene:
 
     def relight(self, look: SceneLook) -> None:
         """Moves the sun and changes its strength, for another view of the same scene."""
-        ahead = np.array([1, 0, 0], np.float32)
-        turn = sapien.math.shortest_rotation(ahead, np.array(look.sun_direction, np.float32))
+        # SAPIEN's declared types want arrays of a fixed shape; it takes any three numbers.
+        ahead: Any = np.array([1, 0, 0], np.float32)
+        sun: Any = np.array(look.sun_direction, np.float32)
+        turn = sapien.math.shortest_rotation(ahead, sun)
         self._sun.pose = sapien.Pose(_SUN_CENTRE, turn)
         self._sun.set_color(list(look.sun))
 
