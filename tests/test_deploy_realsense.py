@@ -165,8 +165,8 @@ def test_the_temporal_filter_averages_within_a_viewpoint(tmp_path: Path) -> None
 def test_nothing_of_an_earlier_viewpoint_is_left_after_the_next_begins(tmp_path: Path) -> None:
     full, hole = picture(0, 500), picture(1, 500)
     hole[1][60:180, 100:300] = 0
-    pictures = [full] * 4 + [hole] * 4
-    path = record(tmp_path / "hole.db3", pictures)
+    # More than are read: on a busy machine the SDK may drop one.
+    path = record(tmp_path / "hole.db3", [full] * 4 + [hole] * 12)
     with camera(path, temporal_frames=4) as device:
         assert device.read().depth[240, 320] == pytest.approx(0.5, abs=0.002)
         device.begin_view()
