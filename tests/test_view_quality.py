@@ -14,8 +14,10 @@ from torch import Tensor
 
 from maniskill_tomato.cli import main
 from maniskill_tomato.errors import CheckpointError, InvalidInputError
+from maniskill_tomato.evaluation.metrics import summarise
+from maniskill_tomato.evaluation.rollout import run_episodes
 from maniskill_tomato.evaluation.view_rollout import run_view_episode
-from maniskill_tomato.evaluation.viewpoint_policy import open_viewpoint_policy
+from maniskill_tomato.evaluation.viewpoint_policy import acting_policy, open_viewpoint_policy
 from maniskill_tomato.learning.envs import make_env
 from maniskill_tomato.learning.view_quality.collect import QualityData, collect_episodes
 from maniskill_tomato.learning.view_quality.fit import FitConfig, fit, judge, mirrored
@@ -324,3 +326,22 @@ def test_without_a_policy_eval_says_how_to_get_one(
         main(["eval", "TomatoViewpoint-v1"])
     told = capsys.readouterr().err
     assert stopped.value.code == 2 and "nbv" in told and "train_view_quality.py" in told
+
+
+def test_the_evaluation_of_a_row_counts_the_tomatoes_that_were_seen() -> None:
+    env: Any = make_env("TomatoViewpointRow-v1", plant={"seed": 7})
+    try:
+        policy = acting_policy("nbv", env)
+        (episode,) = run_episodes(env, policy, 1, seed=3, show_progress=False)
+        env.reset(seed=3)
+        steps, done = 0, False
+        while not done:
+            _, _, terminated, truncated, info = env.step(policy.act(torch.zeros(1, 1)))
+            steps, done = steps + 1, bool(terminated) or bool(truncated)
+    finally:
+        env.close()
+    assert episode.targets_seen == (int(info["seen_count"]), int(info["target_count"]))
+    figures = summarise([episode, episode])
+    seen, wanted = episode.targets_seen
+    assert 0 < seen <= wanted and figures["target_seen_share"] == pytest.approx(seen / wanted)
+    assert figures["moves_per_seen_target"] == pytest.approx(steps / seen)

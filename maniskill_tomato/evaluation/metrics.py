@@ -46,6 +46,8 @@ def summarise(episodes: Sequence[Episode]) -> dict[str, Any]:
     steps = np.array([e.steps for e in episodes])
     success = np.array([e.success for e in episodes])
     touches = [e.plant_contact for e in episodes if e.plant_contact is not None]
+    rows = [(*e.targets_seen, e.steps) for e in episodes if e.targets_seen is not None]
+    found, wanted, moves = (sum(values) for values in zip(*rows, strict=True)) if rows else (0, 0, 0)
     return {
         "episodes": count,
         "success_rate": len(solved) / count,
@@ -61,6 +63,8 @@ def summarise(episodes: Sequence[Episode]) -> dict[str, Any]:
         "unreachable_step_share": float(np.concatenate([e.reachability == 2 for e in episodes]).mean()),
         "forbidden_zone_step_share": float(np.concatenate([e.in_forbidden_zone for e in episodes]).mean()),
         "plant_contact_step_share": float(np.concatenate(touches).mean()) if touches else None,
+        "target_seen_share": found / wanted if wanted else None,
+        "moves_per_seen_target": moves / found if found else None,
         "per_episode": {
             "seed": [e.seed for e in episodes],
             "success": [e.success for e in episodes],

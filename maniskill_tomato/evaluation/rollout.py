@@ -1,6 +1,7 @@
 """Episodes of a policy, each with its own seed, recorded step by step."""
 
 import sys
+from collections.abc import Container
 from dataclasses import dataclass
 from typing import Any, Protocol
 
@@ -46,6 +47,8 @@ class Episode:
     """Whether each step ended in the forbidden zone. Shape (T,)."""
     plant_contact: NDArray[np.bool_] | None = None
     """Whether each step touched a plant; None where the task does not say. Shape (T,)."""
+    targets_seen: tuple[int, int] | None = None
+    """How many tomatoes were seen, and of how many; None where the task has one target."""
 
     @property
     def steps(self) -> int:
@@ -119,15 +122,14 @@ def _run_batch(env: gym.Env[Any, Any], policy: ActingPolicy, seeds: list[int]) -
             info.get("in_forbidden_zone", nowhere),
             running,
             info.get("plant_contact", nowhere),
+            info.get("seen_count", nowhere),
+            info.get("target_count", nowhere),
         )
         steps.append(torch.stack([value.float() for value in outcome], dim=-1))
         running = running & ~(terminated | truncated)
     seen = torch.stack(views).double().cpu().numpy()
     happened = torch.stack(steps).double().cpu().numpy()
-    contacts = "plant_contact" in info
-    return [
-        _episode(seeds[i], bool(success[i]), seen[:, i], happened[:, i], contacts) for i in range(len(seeds))
-    ]
+    return [_episode(seeds[i], bool(success[i]), seen[:, i], happened[:, i], info) for i in range(len(seeds))]
 
 
 def _view(env: gym.Env[Any, Any], observations: Tensor, info: dict[str, Tensor]) -> Tensor:
@@ -141,9 +143,10 @@ def _view(env: gym.Env[Any, Any], observations: Tensor, info: dict[str, Tensor])
     return torch.cat((poses, info["visible_fraction"][:, None]), dim=-1)
 
 
-def _episode(seed: int, success: bool, seen: Float64, happened: Float64, contacts: bool) -> Episode:
-    """The part of one environment's record until its episode ended."""
+def _episode(seed: int, success: bool, seen: Float64, happened: Float64, told: Container[str]) -> Episode:
+    """The part of one environment's record until its episode ended; `told` says what the task tells."""
     steps = int(happened[:, 3].sum())
+    found, wanted = (int(v) for v in happened[steps - 1, 5:7])
     return Episode(
         seed=seed,
         success=success,
@@ -153,5 +156,6 @@ def _episode(seed: int, success: bool, seen: Float64, happened: Float64, contact
         rewards=happened[:steps, 0],
         reachability=happened[:steps, 1].astype(np.int64),
         in_forbidden_zone=happened[:steps, 2].astype(np.bool_),
-        plant_contact=happened[:steps, 4].astype(np.bool_) if contacts else None,
+        plant_contact=happened[:steps, 4].astype(np.bool_) if "plant_contact" in told else None,
+        targets_seen=(found, wanted) if "seen_count" in told else None,
     )
