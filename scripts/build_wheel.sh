@@ -27,4 +27,14 @@ say "installing $wheel into a clean environment"
 say "trying it"
 # From another folder and isolated (-I), so that nothing of the checkout can be imported.
 (cd "$work" && "$work/venv/bin/python" -I "$root/scripts/wheel_smoke.py")
+say "trying deploy in an environment without ManiSkill and SAPIEN"
+"$uv" venv -q --python "$root/.venv/bin/python" "$work/robot"
+"$uv" pip install -q --python "$work/robot/bin/python" --override overrides-deploy.txt -c constraints.txt \
+    "$root/$wheel[deploy,hardware]"
+(
+    cd "$work"
+    "$work/robot/bin/python" -I -c 'import importlib.util as u; assert not u.find_spec("mani_skill") and not u.find_spec("sapien")'
+    "$work/robot/bin/maniskill-tomato" deploy run --profile mock --out "$work/run" </dev/null
+)
+
 say "done: $wheel ($(du -h "$wheel" | cut -f1))"

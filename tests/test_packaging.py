@@ -191,7 +191,7 @@ def test_torchvision_operators_load_into_the_installed_torch() -> None:
 
 
 @needs_checkout
-@pytest.mark.parametrize("name", ["constraints.txt", "overrides.txt"])
+@pytest.mark.parametrize("name", ["constraints.txt", "overrides.txt", "overrides-deploy.txt"])
 def test_pinned_requirements_name_versions_and_never_an_address(name: str) -> None:
     lines = [line for line in (ROOT / name).read_text().splitlines() if line and not line.startswith("#")]
     assert lines
