@@ -1,6 +1,5 @@
 """A recurrent policy: what it has seen is kept by a network instead of a map."""
 
-import io
 from pathlib import Path
 from typing import Any, Final
 
@@ -8,9 +7,9 @@ import torch
 from torch import Tensor, nn
 from torch.nn.utils.rnn import PackedSequence
 
-from maniskill_tomato.errors import CheckpointError, InvalidInputError
-from maniskill_tomato.files import read_tensors, write_atomically
+from maniskill_tomato.errors import InvalidInputError
 from maniskill_tomato.planners.base import Planner
+from maniskill_tomato.planners.network_file import holds, load_network, save_network
 from maniskill_tomato.visibility.observation import ObservationLayout, Part
 from maniskill_tomato.visibility.situation import Situation
 
@@ -93,16 +92,8 @@ def columns_of(parts: tuple[Part, ...]) -> Tensor:
 
 def save_recurrent(path: Path, policy: RecurrentPolicy) -> None:
     """Writes the actor, what it sees, and the facts."""
-    data = {
-        "format": FORMAT,
-        "sizes": policy.actor.sizes,
-        "weights": policy.actor.state_dict(),
-        "parts": list(policy.parts),
-        "facts": policy.facts,
-    }
-    buffer = io.BytesIO()
-    torch.save(data, buffer)
-    write_atomically(path, buffer.getvalue())
+    actor = policy.actor
+    save_network(path, FORMAT, actor.sizes, actor.state_dict(), parts=list(policy.parts), facts=policy.facts)
 
 
 def load_recurrent(path: Path, device: str | torch.device = "cpu") -> RecurrentPolicy:
@@ -111,20 +102,14 @@ def load_recurrent(path: Path, device: str | torch.device = "cpu") -> RecurrentP
     Raises:
         CheckpointError: The file is missing, damaged, or of something else.
     """
-    data = read_tensors(path, device)
-    if not is_recurrent(data):
-        raise CheckpointError(f"{path} holds no recurrent policy; scripts/train_imitation.py makes one")
-    try:
+
+    def build(data: dict[str, Any]) -> tuple[RecurrentPolicy, RecurrentActor]:
         actor = RecurrentActor(**data["sizes"])
-        actor.load_state_dict(data["weights"])
-        policy = RecurrentPolicy(actor.to(device), tuple(data["parts"]), dict(data["facts"]))
-    except (KeyError, TypeError, ValueError, RuntimeError) as error:
-        raise CheckpointError(f"{path} does not fit itself: {error}; train the policy again") from error
-    if not all(bool(p.isfinite().all()) for p in actor.parameters()):
-        raise CheckpointError(f"{path} holds weights that are not finite; train it again")
-    return policy
+        return RecurrentPolicy(actor, tuple(data["parts"]), dict(data["facts"])), actor
+
+    return load_network(path, FORMAT, device, build, "recurrent policy; scripts/train_imitation.py makes one")
 
 
 def is_recurrent(data: object) -> bool:
     """Whether the content of a file is of `save_recurrent`."""
-    return isinstance(data, dict) and data.get("format") == FORMAT
+    return holds(data, FORMAT)

@@ -6,7 +6,6 @@ largest P(full view) x `patience` - moves: with moves as the cost, `patience` is
 a look fails, the rule that is best when looks succeed or fail independently and their number is not bounded.
 """
 
-import io
 import math
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -15,10 +14,10 @@ from typing import Any, Final
 import torch
 from torch import Tensor
 
-from maniskill_tomato.errors import CheckpointError, InvalidInputError
-from maniskill_tomato.files import read_tensors, write_atomically
+from maniskill_tomato.errors import InvalidInputError
 from maniskill_tomato.planners.base import Planner
 from maniskill_tomato.planners.moves import Candidates, moves_needed
+from maniskill_tomato.planners.network_file import holds, load_network, save_network
 from maniskill_tomato.planners.quality_features import MAP_CHANNELS, SCALARS, quality_features
 from maniskill_tomato.planners.quality_network import ViewQualityNetwork
 from maniskill_tomato.visibility.situation import Situation
@@ -102,16 +101,10 @@ class ViewQuality(Planner):
 
 def save_view_quality(path: Path, policy: ViewQuality) -> None:
     """Writes the network, the settings and the facts."""
-    data = {
-        "format": FORMAT,
-        "sizes": policy.network.sizes,
-        "weights": policy.network.state_dict(),
-        "config": asdict(policy.config),
-        "facts": policy.facts,
-    }
-    buffer = io.BytesIO()
-    torch.save(data, buffer)
-    write_atomically(path, buffer.getvalue())
+    network = policy.network
+    save_network(
+        path, FORMAT, network.sizes, network.state_dict(), config=asdict(policy.config), facts=policy.facts
+    )
 
 
 def load_view_quality(path: Path, device: str | torch.device = "cpu") -> ViewQuality:
@@ -120,23 +113,19 @@ def load_view_quality(path: Path, device: str | torch.device = "cpu") -> ViewQua
     Raises:
         CheckpointError: The file is missing, damaged, or of something else.
     """
-    data = read_tensors(path, device)
-    if not is_view_quality(data):
-        raise CheckpointError(f"{path} holds no view-quality policy; scripts/train_view_quality.py makes one")
-    try:
+
+    def build(data: dict[str, Any]) -> tuple[ViewQuality, ViewQualityNetwork]:
         network = ViewQualityNetwork(**data["sizes"])
-        network.load_state_dict(data["weights"])
-        config, facts = ViewQualityConfig(**data["config"]), dict(data["facts"])
-    except (KeyError, TypeError, ValueError, RuntimeError) as error:
-        raise CheckpointError(f"{path} does not fit itself: {error}; train the policy again") from error
-    if not all(bool(p.isfinite().all()) for p in network.parameters()):
-        raise CheckpointError(f"{path} holds weights that are not finite; train it again")
-    return ViewQuality(network.to(device), config, facts)
+        return ViewQuality(network, ViewQualityConfig(**data["config"]), dict(data["facts"])), network
+
+    return load_network(
+        path, FORMAT, device, build, "view-quality policy; scripts/train_view_quality.py makes one"
+    )
 
 
 def is_view_quality(data: object) -> bool:
     """Whether the content of a file is of `save_view_quality`."""
-    return isinstance(data, dict) and data.get("format") == FORMAT
+    return holds(data, FORMAT)
 
 
 def new_network(width: int = 32, blocks: int = 3) -> ViewQualityNetwork:

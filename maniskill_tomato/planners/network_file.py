@@ -1,0 +1,72 @@
+"""Files of planners that carry a network: its sizes and weights with settings, as tensors, numbers and text."""
+
+import io
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, TypeVar
+
+import torch
+from torch import Tensor, nn
+
+from maniskill_tomato.errors import CheckpointError
+from maniskill_tomato.files import read_tensors, write_atomically
+
+P = TypeVar("P")
+
+
+def save_network(
+    path: Path, kind: str, sizes: dict[str, int], weights: dict[str, Tensor], **content: Any
+) -> None:
+    """Writes a planner's file, whole or not at all.
+
+    Args:
+        path: Where to.
+        kind: What it holds, with the version of its form.
+        sizes: What builds the network.
+        weights: Its state.
+        content: What else the planner needs.
+
+    Raises:
+        CheckpointError: It cannot be written.
+    """
+    buffer = io.BytesIO()
+    torch.save({"format": kind, "sizes": sizes, "weights": weights, **content}, buffer)
+    write_atomically(path, buffer.getvalue())
+
+
+def holds(data: object, kind: str) -> bool:
+    """Whether the content of a file is of `save_network` with this kind."""
+    return isinstance(data, dict) and data.get("format") == kind
+
+
+def load_network(
+    path: Path,
+    kind: str,
+    device: str | torch.device,
+    build: Callable[[dict[str, Any]], tuple[P, nn.Module]],
+    missing: str,
+) -> P:
+    """The planner of a file.
+
+    Args:
+        path: The file.
+        kind: What it must hold.
+        device: Where the network runs.
+        build: Makes the planner and its empty network from the file's content.
+        missing: What a file of another kind lacks and what makes one, for the message.
+
+    Raises:
+        CheckpointError: The file is missing, damaged, or of something else.
+    """
+    data = read_tensors(path, device)
+    if not holds(data, kind):
+        raise CheckpointError(f"{path} holds no {missing}")
+    try:
+        planner, network = build(data)
+        network.load_state_dict(data["weights"])
+    except (KeyError, TypeError, ValueError, RuntimeError) as error:
+        raise CheckpointError(f"{path} does not fit itself: {error}; train the policy again") from error
+    if not all(bool(p.isfinite().all()) for p in network.parameters()):
+        raise CheckpointError(f"{path} holds weights that are not finite; train it again")
+    network.to(device)
+    return planner
