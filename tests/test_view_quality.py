@@ -334,12 +334,14 @@ def test_the_evaluation_of_a_row_counts_the_tomatoes_that_were_seen() -> None:
         policy = acting_policy("nbv", env)
         (episode,) = run_episodes(env, policy, 1, seed=3, show_progress=False)
         env.reset(seed=3)
+        info: dict[str, Any] = {}
         steps, done = 0, False
         while not done:
             _, _, terminated, truncated, info = env.step(policy.act(torch.zeros(1, 1)))
             steps, done = steps + 1, bool(terminated) or bool(truncated)
     finally:
         env.close()
+    assert episode.targets_seen is not None
     assert episode.targets_seen == (int(info["seen_count"]), int(info["target_count"]))
     figures = summarise([episode, episode])
     seen, wanted = episode.targets_seen
