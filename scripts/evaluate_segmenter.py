@@ -16,7 +16,7 @@ from maniskill_tomato.errors import TomatoError
 from maniskill_tomato.files import write_atomically
 from maniskill_tomato.perception.evaluation import evaluate_segmenter
 from maniskill_tomato.perception.segmenter import make_segmenter
-from maniskill_tomato.perception.training_pictures import read_place
+from maniskill_tomato.perception.training_pictures import SMALLEST_SHARE, read_place
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -29,6 +29,8 @@ class Args:
     """Name of a segmenter, or a file of weights."""
     limit: int | None = None
     """Look at this many images only, spread over the list."""
+    smallest_share: float = SMALLEST_SHARE
+    """Rendered fruits narrower than this share of the image's longer side are set aside; 0: the tiniest alone."""
     out: Path = Path("runs/segmenter-evaluation")
     """Folder of metrics.json, precision_recall.png and pictures.jpg."""
 
@@ -43,7 +45,7 @@ def main(argv: list[str] | None = None) -> None:
         found = read_place(args.data)
         if found.skipped:
             print(f"{args.data}: {found.skipped_text()}", file=sys.stderr)
-        metrics = evaluate_segmenter(segmenter, found.images, args.out, args.limit)
+        metrics = evaluate_segmenter(segmenter, found.images, args.out, args.limit, args.smallest_share)
         write_atomically(
             args.out / "metrics.json",
             json.dumps({"segmenter": args.segmenter, "data": args.data, **metrics}, indent=1).encode(),

@@ -7,6 +7,7 @@ import pytest
 from numpy.typing import NDArray
 
 from maniskill_tomato.errors import InvalidInputError
+from maniskill_tomato.perception.annotations import Instance
 from maniskill_tomato.perception.coco_metrics import coco_metrics
 from maniskill_tomato.perception.detection_metrics import (
     DetectionScore,
@@ -17,6 +18,7 @@ from maniskill_tomato.perception.detection_metrics import (
     match,
 )
 from maniskill_tomato.perception.instances import Instances
+from maniskill_tomato.perception.training_pictures import ignored_fruit
 
 pytest.importorskip("pycocotools")
 
@@ -160,3 +162,18 @@ def test_the_curve_of_a_perfect_detector_has_area_one() -> None:
     ones: NDArray[np.float64] = np.ones(4)
     curve = PrecisionRecall(scores=ones, precision=ones, recall=np.arange(1, 5) / 4, fruits=4)
     assert curve.average_precision == 1
+
+
+def test_rendered_fruits_that_no_one_would_label_are_set_aside_and_labelled_ones_are_not() -> None:
+    def fruit(width: float, fraction: float | None) -> Instance:
+        return Instance(category="tomato", box_xywh=(10.0, 10.0, width, 40.0), visible_fraction=fraction)
+
+    # 12 of 640 px for what is rendered; whoever draws boxes by hand has chosen what counts.
+    assert not ignored_fruit(fruit(12.0, 0.5), 640)
+    assert ignored_fruit(fruit(11.9, 0.5), 640)
+    assert ignored_fruit(fruit(12.0, 0.5), 1280)
+    assert not ignored_fruit(fruit(11.9, None), 640)
+    assert not ignored_fruit(fruit(6.0, None), 640) and ignored_fruit(fruit(5.9, None), 640)
+    assert ignored_fruit(fruit(5.9, 0.5), 640, smallest_share=0.0)
+    assert not ignored_fruit(fruit(6.0, 0.1), 640, smallest_share=0.0)
+    assert ignored_fruit(fruit(40.0, 0.0999), 640)

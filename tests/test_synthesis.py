@@ -164,7 +164,9 @@ def test_a_small_data_set_is_whole_continued_and_the_same_again(tmp_path: Path) 
             seen, whole = fruit.visible_mask.decode(), fruit.amodal_mask.decode()
             assert not (seen & ~whole).any()
             assert fruit.visible_fraction is not None and 0 < fruit.visible_fraction <= 1
-            assert fruit.visible_fraction <= seen.sum() / whole.sum() + 1e-6
+            assert (
+                fruit.visible_fraction <= seen.sum() / whole.sum() + 6e-6
+            )  # It is written with five decimals.
     assert write_statistics(read, tmp_path / "a").is_file()
     # Continued to three images it keeps the first two, and made anew in one go it is the same.
     grown = make_dataset(replace(config, count=3), tmp_path / "a")

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from maniskill_tomato.errors import InvalidInputError
 from maniskill_tomato.perception.annotations import AnnotatedImage
 from maniskill_tomato.perception.instances import Instances
-from maniskill_tomato.perception.training_pictures import ignored_fruit
+from maniskill_tomato.perception.training_pictures import SMALLEST_SHARE, ignored_fruit
 
 Overlap = Literal["box", "mask"]
 
@@ -33,15 +33,16 @@ class ImageTruth:
     """Visible pixels; None where only boxes are annotated. Shape (N, H, W)."""
 
 
-def image_truth(image: AnnotatedImage) -> ImageTruth:
+def image_truth(image: AnnotatedImage, smallest_share: float = SMALLEST_SHARE) -> ImageTruth:
     """The visible fruits of an annotated image, ripe or not; see `ignored_fruit` for those set aside."""
+    longer = max(image.width, image.height)
     fruits = image.fruits
     boxes = np.array([f.box_xywh for f in fruits], np.float64).reshape(-1, 4)
     boxes[:, 2:] += boxes[:, :2]
     masks = [f.visible_mask.decode() for f in fruits if f.visible_mask is not None]
     return ImageTruth(
         boxes=boxes,
-        ignored=np.array([ignored_fruit(f) for f in fruits], bool),
+        ignored=np.array([ignored_fruit(f, longer, smallest_share) for f in fruits], bool),
         masks=np.array(masks, bool).reshape(-1, image.height, image.width)
         if len(masks) == len(fruits)
         else None,

@@ -20,6 +20,7 @@ from maniskill_tomato.perception.detection_plots import plot_precision_recall
 from maniskill_tomato.perception.instances import Image, Instances
 from maniskill_tomato.perception.pictures import contact_sheet, draw_instances, write_picture
 from maniskill_tomato.perception.segmenter import Segmenter
+from maniskill_tomato.perception.training_pictures import SMALLEST_SHARE
 
 PICTURES = 16
 """Images on the sheet of results."""
@@ -29,7 +30,11 @@ WORKING_SCORE = 0.3
 
 
 def evaluate_segmenter(
-    segmenter: Segmenter, images: Sequence[AnnotatedImage], out: Path, limit: int | None = None
+    segmenter: Segmenter,
+    images: Sequence[AnnotatedImage],
+    out: Path,
+    limit: int | None = None,
+    smallest_share: float = SMALLEST_SHARE,
 ) -> dict[str, float]:
     """Runs a segmenter over images and compares with their annotation; all fruits count, ripe or not.
 
@@ -41,6 +46,7 @@ def evaluate_segmenter(
         images: Annotated images.
         out: Folder of the figures.
         limit: Look at this many images only, spread evenly.
+        smallest_share: Rendered fruits narrower than this share of the image's longer side are set aside.
 
     Returns:
         `box_AP50` and `mask_AP50` (Eq. 4-3 at an overlap of 0.5), precision and recall at `WORKING_SCORE`, COCO's
@@ -67,7 +73,7 @@ def evaluate_segmenter(
         start = time.perf_counter()
         found = segmenter(picture, None if depth is None else depth.astype(np.float32))
         seconds.append(time.perf_counter() - start)
-        truth = image_truth(image)
+        truth = image_truth(image, smallest_share)
         for score in scores.values():
             score.add(found, truth)
         pairs.append((found, truth))

@@ -82,13 +82,14 @@ def _fruit(
     silhouette = draw_silhouette(optical, what.faces, intrinsics)
     if silhouette is None:
         return None
-    # The renderer's edge and ours differ by parts of a pixel.
-    whole = silhouette.in_image(width, height) | seen
+    # The renderer's edge and ours differ by parts of a pixel: what is seen belongs to the whole.
+    inside = silhouette.in_image(width, height)
+    whole = inside | seen
     if np.count_nonzero(whole) < MIN_WHOLE * scale:
         return None
     enough = visible >= MIN_VISIBLE * scale
     mask = EncodedMask.encode(seen) if enough else None
-    total = max(silhouette.total, visible)
+    total = silhouette.total + int(np.count_nonzero(seen & ~inside))
     return Instance(
         category=what.category,
         box_xywh=mask.box_xywh if mask is not None else (0.0, 0.0, 0.0, 0.0),

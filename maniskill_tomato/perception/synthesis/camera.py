@@ -45,14 +45,14 @@ def draw_camera_look(rng: Generator) -> CameraLook:
     warmth, tint = np.clip(rng.normal(0, 0.07), -0.14, 0.14), np.clip(rng.normal(0, 0.03), -0.05, 0.05)
     moving = rng.random() < 0.2
     return CameraLook(
-        exposure=float(np.exp(rng.normal(0.1, 0.38))),
+        exposure=float(np.exp(rng.normal(-0.08, 0.4))),
         white_balance=(float(np.exp(warmth)), float(np.exp(tint)), float(np.exp(-warmth))),
         defocus=float(rng.uniform(0.0, 4.5)),
         focus_m=float(np.exp(rng.uniform(np.log(0.3), np.log(1.2)))),
         motion=(float(rng.normal(0, 3.0)), float(rng.normal(0, 3.0))) if moving else (0.0, 0.0),
         vignette=float(rng.uniform(0, 0.35)),
         noise=float(np.exp(rng.uniform(np.log(0.004), np.log(0.03)))),
-        saturation=float(np.clip(rng.normal(1.12, 0.16), 0.7, 1.5)),
+        saturation=float(np.clip(rng.normal(0.98, 0.14), 0.6, 1.35)),
         contrast=float(rng.uniform(0.2, 0.9)),
         ambient_occlusion=float(rng.uniform(0.4, 1.0)),
         haze=float(rng.uniform(0, 0.05)),

@@ -36,6 +36,8 @@ class SceneLook:
     """Share of the blades with yellow or brown spots, 0 to 1."""
     fruit_gain: Colour
     """Factor on the fruits' colours."""
+    fruit_bloom: float
+    """Share of pale dust and wax on the fruits' colours, 0 to 1."""
     fine_leaves: bool
     """Whether the middle plant's leaves are made of many triangles; that takes longer."""
     gloss: float
@@ -52,6 +54,8 @@ class SceneLook:
     """Base colour of the ground cover."""
     wall: Colour
     """Light that comes from the far wall, linear."""
+    greenery: bool
+    """Whether that wall shows foliage instead of sky or sheeting."""
     strings: int
     """Wires and strings that hang among the plants."""
     robot: bool
@@ -115,14 +119,14 @@ def draw_look(rng: Generator, *, vary_crop: bool = True) -> SceneLook:
     paint = float(rng.uniform(0.45, 0.95))
     ground = float(rng.uniform(0.25, 0.9))
     backdrop: Backdrop = "gutters"
-    if (kind := rng.random()) < 0.4:
+    if (kind := rng.random()) < 0.55:
         backdrop = "foliage"
-    elif kind < 0.55:
+    elif kind < 0.7:
         backdrop = "bright"
     wall = float(np.exp(rng.uniform(np.log(0.2), np.log(3.0))))
     return SceneLook(
         crop=crop,
-        leaf_density=float(rng.uniform(0.55, 1.45)) if vary_crop else 1.0,
+        leaf_density=float(rng.uniform(0.6, 1.9)) if vary_crop else 1.0,
         sun_direction=(
             float(np.cos(azimuth) * np.cos(height)),
             float(np.sin(azimuth) * np.cos(height)),
@@ -133,6 +137,7 @@ def draw_look(rng: Generator, *, vary_crop: bool = True) -> SceneLook:
         leaf_gain=_leaf_gain(rng),
         leaf_blemish=float(rng.beta(1, 4)),
         fruit_gain=_gain(rng, 0.06),
+        fruit_bloom=float(rng.uniform(0.1, 0.42)),
         fine_leaves=bool(rng.random() < 0.4),
         gloss=float(rng.uniform(0.7, 1.6)),
         backdrop=backdrop,
@@ -141,6 +146,7 @@ def draw_look(rng: Generator, *, vary_crop: bool = True) -> SceneLook:
         paint=(paint, paint * float(rng.uniform(0.96, 1.02)), paint * float(rng.uniform(0.9, 1.04))),
         floor_colour=(ground, ground * float(rng.uniform(0.94, 1.0)), ground * float(rng.uniform(0.82, 1.0))),
         wall=(wall, wall * float(rng.uniform(0.95, 1.08)), wall * float(rng.uniform(0.9, 1.1))),
+        greenery=bool(rng.random() < 0.6),
         strings=int(rng.integers(0, 9)),
         robot=bool(rng.random() < 0.12),
     )

@@ -16,6 +16,11 @@ from maniskill_tomato.plants.textures import cloud
 UInt8 = NDArray[np.uint8]
 
 
+BLOOM = (0.66, 0.6, 0.4)
+"""Colour of what lies on a fruit's skin, sRGB, 0 to 1: in photos from greenhouses green is 0.43 of the red of ripe
+fruits in the median, blue 0.24."""
+
+
 class PlantMaterials(dict[str, sapien.render.RenderMaterial]):
     """The plants' materials under one look, made when first asked for; like the dictionary that shapes take."""
 
@@ -47,6 +52,7 @@ class PlantMaterials(dict[str, sapien.render.RenderMaterial]):
             colour = (
                 colour * np.array(self._look.fruit_gain, dtype=np.float32) * np.exp(rng.normal(0, 0.05, 3))
             )
+            colour = colour * (1 - self._look.fruit_bloom) + np.array(BLOOM) * self._look.fruit_bloom
             roughness = float(np.clip(roughness * self._look.gloss, 0.12, 0.5))
             specular = 0.25
         else:
@@ -122,4 +128,41 @@ def glowing(light: tuple[float, float, float]) -> sapien.render.RenderMaterial:
     """A surface that only shines, with linear strengths: a bright sheet of glass or sky."""
     material = sapien.render.RenderMaterial(base_color=[0, 0, 0, 1], roughness=1.0, specular=0.0)
     material.emission = [*light, 1.0]
+    return material
+
+
+def far_greenery(light: tuple[float, float, float], rng: Generator) -> sapien.render.RenderMaterial:
+    """A wall that shines like rows too far away to be built: blurred foliage, gaps of light, stems, a few fruits.
+
+    Meant to repeat every 4 m.
+
+    Args:
+        light: Linear strength of the light in the gaps; stronger light than 1 is left to walls of sky.
+        rng: Places everything.
+    """
+    rows = columns = 512
+    y, x = np.mgrid[:rows, :columns] / rows
+    leaves = cloud(rng, rows, columns, 12, octaves=4)
+    shade = cloud(rng, rows, columns, 30, octaves=2)
+    tint = np.array([0.13, 0.3, 0.06]) * np.exp(rng.normal(0, 0.25, 3))
+    picture = tint * (0.55 + 0.5 * shade[..., None]) * float(rng.uniform(0.5, 1.1))
+    gaps = np.clip((leaves - rng.uniform(0.1, 0.45)) / 0.25, 0, 1)[..., None]
+    picture = picture * (1 - gaps) + gaps
+    for _ in range(int(rng.integers(0, 30))):
+        # Too far to be asked for: a fruit here is narrower than those that count.
+        spot = np.exp(-((x - rng.random()) ** 2 + (y - rng.random()) ** 2) / float(rng.uniform(5e-6, 1.5e-5)))
+        colour = np.array([0.4, 0.06, 0.03]) if rng.random() < 0.6 else np.array([0.3, 0.36, 0.14])
+        picture = picture * (1 - spot[..., None]) + colour * spot[..., None]
+    pixels = np.dstack([np.clip(picture, 0, 1) ** (1 / 2.2) * 255, np.full((rows, columns), 255.0)])
+    texture = sapien.render.RenderTexture2D(
+        pixels.astype(np.uint8),
+        "R8G8B8A8Unorm",
+        mipmap_levels=6,
+        filter_mode="linear",
+        address_mode="repeat",
+        srgb=True,
+    )
+    brightest = max(*light, 1.0)
+    material = glowing((light[0] / brightest, light[1] / brightest, light[2] / brightest))
+    material.emission_texture = texture
     return material

@@ -17,8 +17,10 @@ HALF_LENGTH = 4.0
 """Half of the row's length that is built, in [m]."""
 
 
-def _box(half: list[float], material: sapien.render.RenderMaterial) -> sapien.render.RenderShape:
-    # A box's own texture would stretch over its faces; this one repeats every 0.6 m.
+def _box(
+    half: list[float], material: sapien.render.RenderMaterial, tile: float = 0.6
+) -> sapien.render.RenderShape:
+    # A box's own texture would stretch over its faces; this one repeats every `tile` metres.
     corners: list[NDArray[np.float64]] = []
     normals: list[NDArray[np.float64]] = []
     uvs: list[list[float]] = []
@@ -35,7 +37,7 @@ def _box(half: list[float], material: sapien.render.RenderMaterial) -> sapien.re
                 normals.append(sign * np.eye(3)[axis])
                 along, across = (i, j) if size[i] >= size[j] else (j, i)
                 # Print on the side that faces the aisle (-x) is the right way round.
-                uvs.append([-corner[along] / 0.6, 0.5 - corner[across] / 0.6])
+                uvs.append([-corner[along] / tile, 0.5 - corner[across] / tile])
             order = [[0, 1, 2], [0, 2, 3]] if sign > 0 else [[0, 2, 1], [0, 3, 2]]
             faces += [[first + k for k in face] for face in order]
     return sapien.render.RenderShapeTriangleMesh(
@@ -110,11 +112,11 @@ def _x_axis_to(
 
 def _add_walls(add: AddBody, look: SceneLook, rng: Generator) -> None:
     far = 5.0 if look.backdrop != "bright" else 2.2
-    wall = paint.glowing(look.wall)
+    wall = paint.far_greenery(look.wall, rng) if look.greenery else paint.glowing(look.wall)
     dark = paint.plain((0.35, 0.36, 0.36))
     for sign in (1.0, -1.0):
-        add([_box([0.01, 6.0, 4.0], wall)], sapien.Pose([sign * far, 0, 3.0]))
-        add([_box([6.0, 0.01, 4.0], wall)], sapien.Pose([0, sign * 5.0, 3.0]))
+        add([_box([0.01, 6.0, 4.0], wall, 4.0)], sapien.Pose([sign * far, 0, 3.0]))
+        add([_box([6.0, 0.01, 4.0], wall, 4.0)], sapien.Pose([0, sign * 5.0, 3.0]))
         for y in np.arange(-4, 4.1, float(rng.uniform(0.8, 2.0))):
             add([_box([0.02, 0.03, 4.0], dark)], sapien.Pose([sign * (far - 0.05), float(y), 3.0]))
     roof = paint.glowing((1.2 * look.wall[0], 1.2 * look.wall[1], 1.25 * look.wall[2]))
