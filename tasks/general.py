@@ -7,6 +7,7 @@ from typing import Any, get_args
 import numpy as np
 import torch
 from mani_skill.utils.registration import register
+from numpy.typing import NDArray
 from torch import Tensor
 
 from maniskill_tomato.errors import InvalidInputError
@@ -16,7 +17,7 @@ from maniskill_tomato.plants.row import Row
 from maniskill_tomato.robot.kinematics import link_transforms
 from maniskill_tomato.robot.look_at import camera_to_viewpoint
 from maniskill_tomato.tasks import MAX_GENERAL_STEPS, options
-from maniskill_tomato.tasks.camera_perception import CameraPerception, Perception
+from maniskill_tomato.tasks.camera_perception import RENDERED, RENDERED_SIZE, Perception, make_perception
 from maniskill_tomato.tasks.general_config import GeneralTaskConfig
 from maniskill_tomato.tasks.general_rewards import view_gain_reward
 from maniskill_tomato.tasks.ground_truth import GroundTruth
@@ -60,9 +61,9 @@ class TomatoViewpointGeneralEnv(TomatoEnv):
     - `contact_penalty`: what a move with plant contact costs.
     - `sensor_noise`: a `SensorNoise` or a mapping of its fields, what camera and segmenter get wrong. A saved state
       keeps no errors: taken back, the views are measured anew.
-    - `perception`: `"ground_truth"` or `"occlusion_model"`; with the latter V_f, success, reward, the target's position
-      and the rays' labels come from a camera image (mask and noisy depth), and the info also has
-      `true_visible_fraction` and `true_success`.
+    - `perception`: `"ground_truth"`, or a `Perception` with which V_f, success, reward, the target's position and the
+      rays' labels come from a camera image with noisy depth; the info then also has `true_visible_fraction` and
+      `true_success`. Those in `camera_perception.RENDERED` need a renderer, and `segmenter` the extra `perception`.
 
     `reset(options=...)` takes `episode` (index in the list), `target` (index of a ripe fruit in `Plant.fruits`) and
     `camera_position` (x, y, z [m], world frame).
@@ -98,7 +99,15 @@ class TomatoViewpointGeneralEnv(TomatoEnv):
                 "sensor_noise disturbs ground truth; leave it out with perception='occlusion_model', "
                 "whose depth has noise of its own"
             )
+        if perception in RENDERED and kwargs.get("render_backend") == "none":
+            raise InvalidInputError(
+                f"perception={perception!r} renders colours; leave render_backend='none' out, or use 'occlusion_model'"
+            )
         self.perception: Perception = perception
+        self._takes_pictures = perception in RENDERED
+        if self._takes_pictures:
+            width, height = RENDERED_SIZE
+            kwargs.setdefault("sensor_configs", {"width": width, "height": height})
         task = task or GeneralTaskConfig()
         if start_visibility is not None:
             low, high = options.check_range("start_visibility", start_visibility)
@@ -140,7 +149,9 @@ class TomatoViewpointGeneralEnv(TomatoEnv):
         )
         """What only the simulator knows; for planners that need the truth."""
         self._errors = SensorErrors(self._sensor_noise, n, device)
-        self._eyes = CameraPerception(self._caster) if self.perception == "occlusion_model" else None
+        self._eyes = make_perception(
+            self.perception, self._caster, self.camera_intrinsics, self._wrist_picture
+        )
         self.soft_starts = 0
         """Episodes so far that no drawn start made as hard as asked for."""
         self._views = torch.zeros(n, MAX_VIEWS, 7, device=device)
@@ -283,12 +294,20 @@ class TomatoViewpointGeneralEnv(TomatoEnv):
             )
             measured = self._errors.visible_fraction(self._seen.visible_fraction)
         else:
-            self._eyes.look(T_w_camera, self._target, T_w_plant, T_w_links)
+            self._eyes.look(T_w_camera, self._target, known, T_w_plant, T_w_links)
             rays = self._eyes.rays(T_w_camera, known)
             measured = self._eyes.visible_fraction.clone()
         self._observation = self._observer.observe(
             self._viewpoint, T_w_camera, rays, measured, self._moves_left(), mask
         )
+
+    def _wrist_picture(self, env_index: int) -> NDArray[np.uint8]:
+        """What the wrist's colour camera sees now. Shape (height, width, 3)."""
+        self.scene.update_render(update_sensors=True, update_human_render_cameras=False)
+        camera = self.scene.sensors["d435"]
+        camera.capture()
+        colours = camera.get_obs(rgb=True, depth=False, position=False, segmentation=False)["rgb"]
+        return np.asarray(colours[env_index].cpu().numpy())
 
     def _measured_fraction(self) -> Tensor:
         """V_f that success and reward go by. Shape (num_envs,)."""

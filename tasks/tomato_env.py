@@ -61,6 +61,9 @@ class TomatoEnv(BaseEnv):  # type: ignore[misc]
     SUPPORTED_REWARD_MODES = options.REWARD_MODES
     agent: Iiwa14D435  # pyright: ignore[reportIncompatibleVariableOverride]
 
+    _takes_pictures: bool = False
+    """Whether the task itself renders, whatever the observation."""
+
     def __init__(
         self,
         *args: Any,
@@ -96,7 +99,7 @@ class TomatoEnv(BaseEnv):  # type: ignore[misc]
         self.motion = motion
         self._rays_per_side = rays_per_side
         self._has_caster = False
-        rendering = options.needs_rendering(obs_mode, render_mode)
+        rendering = options.needs_rendering(obs_mode, render_mode) or self._takes_pictures
         render_backend = options.pick_render_backend(render_backend, rendering)
         # A new plant to look at needs new actors, and so a new scene.
         self._swaps_plants = self._choice.changes and render_backend == "none"

@@ -9,7 +9,11 @@ import torch
 
 import maniskill_tomato  # noqa: F401
 from maniskill_tomato.errors import InvalidInputError
-from maniskill_tomato.tasks.camera_perception import COARSE_POSITION
+from maniskill_tomato.perception.instances import Instances
+from maniskill_tomato.robot.d435 import color_intrinsics
+from maniskill_tomato.robot.kinematics import link_transforms
+from maniskill_tomato.tasks.camera_perception import COARSE_POSITION, IMAGE_SIZE, CameraPerception
+from maniskill_tomato.visibility.cast_image import ImageCaster, PixelLabel
 
 
 def make(**options: Any) -> Any:
@@ -79,3 +83,83 @@ def test_reward_goes_by_what_is_measured() -> None:
 def test_options_that_make_no_sense_are_refused(options: dict[str, Any]) -> None:
     with pytest.raises(InvalidInputError, match="perception"):
         make(**options)
+
+
+@pytest.mark.render
+@pytest.mark.parametrize("perception", ["thesis_model", "improved_model", "segmenter"])
+def test_rendered_perceptions_run_and_their_pictures_lie_on_the_cast_labels(perception: str) -> None:
+    env = gym.make(
+        "TomatoViewpoint-v1",
+        episodes="validation",
+        obs_mode="state",
+        perception=perception,
+        sensor_configs={"width": 320, "height": 240},
+    ).unwrapped
+    task: Any = env
+    task.reset(seed=1)
+    *_, info = task.step(torch.tensor([0.0, 0.6, 0.3]))
+    assert 0.0 <= float(info["visible_fraction"][0]) <= 1.0
+    assert set(info) >= {"true_visible_fraction", "true_success"}
+    picture = task._wrist_picture(0).astype(int)
+    assert picture.shape == (240, 320, 3)
+    T_w_links = link_transforms(task.agent.robot.get_qpos())
+    images = ImageCaster(task._caster, task.camera_intrinsics).cast(
+        T_w_links[:, -1] @ task._T_ee_camera, task._target, task.planting.T_world_plant, T_w_links
+    )
+    target = (images.label[0] == int(PixelLabel.TARGET)).numpy()
+    if np.count_nonzero(target) > 20:
+        red, green, _ = picture[target].T
+        assert np.median(red - green) > 30
+    # Leaves and stems are green where the caster meets the plant.
+    plant = (images.label[0] == int(PixelLabel.PLANT)).numpy()
+    nothing = (images.label[0] == int(PixelLabel.NOTHING)).numpy()
+    colourful = picture.max(-1) - picture.min(-1)
+    assert np.median(colourful[plant]) > 2 * np.median(colourful[nothing])
+    env.close()
+
+
+def test_of_several_fruits_found_the_one_near_the_known_place_is_the_target() -> None:
+    env = make(perception="occlusion_model")
+    env.reset(seed=0)
+    looks = []
+    for order in (1, -1):
+        eyes = CameraPerception(env._caster, segmenter=LabelSegmenter(env, order))
+        eyes.begin(0, np.random.RandomState(0))
+        T_w_links = link_transforms(env.agent.robot.get_qpos())
+        T_w_camera = T_w_links[:, -1] @ env._T_ee_camera
+        place = env._target_position_w
+        eyes.look(T_w_camera, env._target, place, env.planting.T_world_plant, T_w_links)
+        near = eyes.visible_fraction.clone()
+        eyes.look(T_w_camera, env._target, place + 1.0, env.planting.T_world_plant, T_w_links)
+        assert float(eyes.visible_fraction[0]) == 0.0, "a fruit a metre away is another one"
+        looks.append(float(near[0]))
+    assert looks[0] == looks[1] > 0.0
+    env.close()
+
+
+class LabelSegmenter:
+    """The target's mask and one of another fruit, in either order."""
+
+    def __init__(self, env: Any, order: int) -> None:
+        T_w_links = link_transforms(env.agent.robot.get_qpos())
+        caster = ImageCaster(env._caster, color_intrinsics(*IMAGE_SIZE))
+        images = caster.cast(
+            T_w_links[:, -1] @ env._T_ee_camera, env._target, env.planting.T_world_plant, T_w_links
+        )
+        target = (images.label[0] == int(PixelLabel.TARGET)).numpy()
+        other = np.zeros_like(target)
+        other[:30, :30] = True
+        self._masks = np.stack([target, other][::order])
+
+    def __call__(self, image: Any, depth_m: Any = None) -> Instances:
+        return Instances(
+            boxes=np.array([[0, 0, 5, 5], [0, 0, 5, 5]], np.float32),
+            scores=np.array([0.9, 0.8], np.float32),
+            categories=("tomato", "tomato"),
+            masks=self._masks,
+        )
+
+
+def test_rendered_perception_without_a_renderer_is_refused() -> None:
+    with pytest.raises(InvalidInputError, match="render_backend"):
+        make(perception="segmenter")

@@ -1,7 +1,9 @@
 """The light segmenter: decoding undoes the targets, pictures keep their annotation, training goes on bit for bit."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
+from typing import Literal
 
 import cv2
 import numpy as np
@@ -12,6 +14,7 @@ from maniskill_tomato.errors import CheckpointError, InvalidInputError
 from maniskill_tomato.perception.annotations import AnnotatedImage, Instance
 from maniskill_tomato.perception.augmentation import AugmentationConfig, augmented
 from maniskill_tomato.perception.detection_metrics import box_overlaps
+from maniskill_tomato.perception.efficientnet_lite import EfficientNetLite0
 from maniskill_tomato.perception.fruit_network import (
     STRIDE,
     FruitMaps,
@@ -19,6 +22,7 @@ from maniskill_tomato.perception.fruit_network import (
     FruitNetworkConfig,
     place_centres,
 )
+from maniskill_tomato.perception.fruit_session import FruitSession
 from maniskill_tomato.perception.fruit_targets import TrainingPicture, fruit_losses, make_targets
 from maniskill_tomato.perception.light_segmenter import (
     LightSegmenter,
@@ -31,7 +35,9 @@ from maniskill_tomato.perception.masks import EncodedMask
 from maniskill_tomato.perception.training_pictures import PictureDraw, training_picture
 from maniskill_tomato.perception.weights import save_weights
 
-SMALL = FruitNetworkConfig(widths=(8, 8, 8, 8), blocks=(0, 0, 0, 0), neck_width=8, head_width=8)
+SMALL = FruitNetworkConfig(
+    backbone="plain", widths=(8, 8, 8, 8), blocks=(0, 0, 0, 0), neck_width=8, head_width=8
+)
 
 
 def fruit_picture(seed: int = 0, count: int = 5, size: tuple[int, int] = (160, 192)) -> TrainingPicture:
@@ -239,6 +245,24 @@ def test_a_stopped_training_goes_on_bit_for_bit(tmp_path: Path) -> None:
     assert "val_loss" in histories[0][-1] and histories[0][-1]["step"] == 4
 
 
+def test_training_from_imagenet_moves_all_but_the_first_layers_and_the_backbone_more_slowly(
+    tmp_path: Path,
+) -> None:
+    images = annotated(tmp_path, 2)
+    network = replace(SMALL, backbone="efficientnet_lite0")
+    config = replace(small_config(1), network=network, warmup_steps=1, fixed_blocks=2, backbone_rate=0.25)
+    training = LightTraining(config, [images], [1.0])
+    start = EfficientNetLite0()
+    start.load_imagenet()
+    training.run(tmp_path / "run", lambda line: None)
+    # AdamW's first step moves every weight by its learning rate (Kingma and Ba, 2015), besides the decay.
+    rates = {group["share"]: group["lr"] for group in training.optimizer.param_groups}
+    assert rates == {1.0: config.learning_rate, 0.25: 0.25 * config.learning_rate}
+    for name, tensor in training.network.backbone.state_dict().items():
+        fixed = name.startswith(("stem", "blocks.0.", "blocks.1.")) or "running" in name or "tracked" in name
+        assert torch.equal(tensor, start.state_dict()[name]) == fixed, name
+
+
 def test_a_training_of_other_settings_is_not_continued(tmp_path: Path) -> None:
     images = annotated(tmp_path)
     LightTraining(small_config(2), [images], [1.0]).run(tmp_path / "run", lambda line: None)
@@ -339,3 +363,18 @@ def test_a_network_of_boxes_only_gives_ellipses() -> None:
     network = FruitNetwork(SMALL)
     found = LightSegmenter(network, boxes_only=True, score_threshold=0.0)(np.full((64, 64, 3), 90, np.uint8))
     assert found.amodal_boxes is None and set(found.categories) <= {"tomato"}
+
+
+@pytest.mark.parametrize("backbone", ["plain", "efficientnet_lite0"])
+def test_the_translated_network_says_the_same_at_any_size(
+    backbone: Literal["plain", "efficientnet_lite0"],
+) -> None:
+    torch.manual_seed(1)
+    network = FruitNetwork(replace(SMALL, backbone=backbone)).eval()
+    session = FruitSession(network)
+    for size in ((64, 96), (160, 128)):
+        image = torch.rand(1, 3, *size) * 255
+        with torch.no_grad():
+            expected = network(image)
+        for name, ours, theirs in zip(FruitMaps._fields, session(image), expected, strict=True):
+            torch.testing.assert_close(ours, theirs, rtol=1e-3, atol=1e-3, msg=name)

@@ -137,7 +137,20 @@ def test_the_training_script_writes_weights_and_curves(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     drawn_set(tmp_path / "set")
-    network = ("--config.network.widths", "8", "8", "8", "8", "--config.network.blocks", "0", "0", "0", "0")
+    network = (
+        "--config.network.backbone",
+        "plain",
+        "--config.network.widths",
+        "8",
+        "8",
+        "8",
+        "8",
+        "--config.network.blocks",
+        "0",
+        "0",
+        "0",
+        "0",
+    )
     options = ("--config.steps", "2", "--config.log-every", "1", "--config.batch-size", "2", *network)
     arguments = ["light", "--data", str(tmp_path / "set"), "--validation", str(tmp_path / "set"), *options]
     script("train_segmenter").main([*arguments, "--out", str(tmp_path / "run")])

@@ -7,11 +7,13 @@ are dense targets, which a small network learns from random weights on a CPU. Wh
 """
 
 from dataclasses import asdict, dataclass
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import torch
 from torch import Tensor, nn
 from torch.nn import functional
+
+from maniskill_tomato.perception.efficientnet_lite import FEATURE_WIDTHS, EfficientNetLite0
 
 STRIDE = 4
 """Pixels of the image between neighbouring places of the output."""
@@ -27,10 +29,12 @@ SIZE_MULTIPLE = 32
 class FruitNetworkConfig:
     """Size of the network."""
 
+    backbone: Literal["efficientnet_lite0", "plain"] = "efficientnet_lite0"
+    """A network that begins from ImageNet weights, or a plain one of the sizes below that begins from random ones."""
     widths: tuple[int, int, int, int] = (32, 64, 128, 256)
-    """Channels at strides 4, 8, 16 and 32."""
+    """Channels of the plain one at strides 4, 8, 16 and 32."""
     blocks: tuple[int, int, int, int] = (1, 2, 2, 1)
-    """Residual blocks at these strides."""
+    """Its residual blocks at these strides."""
     neck_width: int = 64
     """Channels on the way back to stride 4."""
     head_width: int = 48
@@ -89,21 +93,45 @@ class _Block(nn.Module):
         return functional.relu(x + self.norm(self.second(self.first(x))))
 
 
+class PlainBackbone(nn.Module):
+    """Residual blocks at strides 4 to 32, to begin from random weights."""
+
+    def __init__(self, widths: tuple[int, ...], blocks: tuple[int, ...]) -> None:
+        super().__init__()
+        stages: list[nn.Module] = []
+        previous = 12
+        for width, count in zip(widths, blocks, strict=True):
+            stages.append(
+                nn.Sequential(_conv(previous, width, stride=2), *(_Block(width) for _ in range(count)))
+            )
+            previous = width
+        self.stages = nn.ModuleList(stages)
+
+    def forward(self, image: Tensor) -> list[Tensor]:
+        """Features of images of colours from 0 to 255, of shape (B, 3, H, W), at strides 4, 8, 16 and 32."""
+        x = functional.pixel_unshuffle((image - 110.0) / 64.0, 2).contiguous(
+            memory_format=torch.channels_last
+        )
+        features = []
+        for stage in self.stages:
+            x = stage(x)
+            features.append(x)
+        return features
+
+
 class FruitNetwork(nn.Module):
     """Image to `FruitMaps`."""
 
     def __init__(self, config: FruitNetworkConfig | None = None) -> None:
         super().__init__()
         self.config = config or FruitNetworkConfig()
-        widths, neck = self.config.widths, self.config.neck_width
-        stages: list[nn.Module] = []
-        previous = 12
-        for width, blocks in zip(widths, self.config.blocks, strict=True):
-            stages.append(
-                nn.Sequential(_conv(previous, width, stride=2), *(_Block(width) for _ in range(blocks)))
-            )
-            previous = width
-        self.stages = nn.ModuleList(stages)
+        neck = self.config.neck_width
+        self.backbone: PlainBackbone | EfficientNetLite0
+        if self.config.backbone == "plain":
+            self.backbone = PlainBackbone(self.config.widths, self.config.blocks)
+            widths: tuple[int, ...] = self.config.widths
+        else:
+            self.backbone, widths = EfficientNetLite0(), FEATURE_WIDTHS
         self.laterals = nn.ModuleList(nn.Conv2d(width, neck, 1) for width in widths)
         self.smooths = nn.ModuleList(_conv(neck, neck) for _ in widths[:-1])
         self.context = nn.Sequential(nn.AdaptiveAvgPool2d(1), nn.Conv2d(widths[-1], neck, 1))
@@ -130,14 +158,8 @@ class FruitNetwork(nn.Module):
             image: Red, green, blue from 0 to 255, as floats. Height and width are multiples of `SIZE_MULTIPLE`.
                 Shape (B, 3, H, W).
         """
-        x = functional.pixel_unshuffle((image - 110.0) / 64.0, 2).contiguous(
-            memory_format=torch.channels_last
-        )
-        features = []
-        for stage in self.stages:
-            x = stage(x)
-            features.append(x)
-        y = self.laterals[-1](x) + self.context(x)
+        features = self.backbone(image)
+        y = self.laterals[-1](features[-1]) + self.context(features[-1])
         for i in (2, 1, 0):
             y = functional.interpolate(y, scale_factor=2.0, mode="nearest")
             y = self.smooths[i](y + self.laterals[i](features[i]))

@@ -19,6 +19,7 @@ from maniskill_tomato.perception.fruit_network import (
     FruitNetworkConfig,
     place_centres,
 )
+from maniskill_tomato.perception.fruit_session import FruitSession
 from maniskill_tomato.perception.instances import (
     FRUIT_CATEGORIES,
     TOMATO,
@@ -57,7 +58,7 @@ class LightSegmenter:
         """Takes a trained network.
 
         Args:
-            network: It is set to evaluation mode.
+            network: As it is now; it is set to evaluation mode.
             boxes_only: It was trained on boxes alone: its masks are the ellipses in its boxes, its fruits are all
                 `tomato`, and it tells no whole boxes.
             score_threshold: Fruits below this are left out.
@@ -76,7 +77,8 @@ class LightSegmenter:
             raise InvalidInputError(f"longest_side must be at least {SIZE_MULTIPLE} px, got {longest_side}")
         if not scales or min(scales) <= 0 or list(scales) != sorted(scales, reverse=True):
             raise InvalidInputError(f"scales must be positive and fall, got {scales}")
-        self.network = network.eval().requires_grad_(False).to(memory_format=torch.channels_last)
+        self.network = network
+        self._session = FruitSession(network)
         self.boxes_only = boxes_only
         self.score_threshold = score_threshold
         self.overlap_threshold = overlap_threshold
@@ -111,7 +113,7 @@ class LightSegmenter:
         if size != (height, width):
             x = functional.interpolate(x, size, mode="bilinear", antialias=True, align_corners=False)
         padding = [-size[1] % SIZE_MULTIPLE, -size[0] % SIZE_MULTIPLE]
-        maps = self.network(functional.pad(x, (0, padding[0], 0, padding[1]), value=PADDING_COLOUR))
+        maps = self._session(functional.pad(x, (0, padding[0], 0, padding[1]), value=PADDING_COLOUR))
         found = find_fruits(maps, self.score_threshold, self.overlap_threshold)
         scale = torch.tensor([width / size[1], height / size[0]] * 2)
         limit = torch.tensor([width, height] * 2, dtype=torch.float32)

@@ -15,6 +15,7 @@ from torch import Tensor, nn
 from maniskill_tomato.errors import CheckpointError, InvalidInputError
 from maniskill_tomato.perception.annotations import AnnotatedImage
 from maniskill_tomato.perception.augmentation import AugmentationConfig, augmented
+from maniskill_tomato.perception.efficientnet_lite import EfficientNetLite0
 from maniskill_tomato.perception.fruit_network import FruitNetwork, FruitNetworkConfig
 from maniskill_tomato.perception.fruit_targets import (
     LOSS_WEIGHTS,
@@ -47,6 +48,10 @@ class LightTrainConfig:
     """Share of the averaged weights, which are those that are kept, that stays at each step."""
     bfloat16: bool = True
     """Multiply in 16 bits, which processors with AMX or AVX-512 BF16 do several times faster."""
+    backbone_rate: float = 0.3
+    """Learning rate of a backbone with ImageNet weights, as a share of the others'."""
+    fixed_blocks: int = 3
+    """First blocks of a backbone with ImageNet weights that stay as they are, with the stem."""
     plain_share: float = 0.0
     """Last share of the steps without mosaics, so that the last pictures look like those to come."""
     seed: int = 0
@@ -101,12 +106,24 @@ class LightTraining(ResumableTraining):
         self.rng = np.random.default_rng(config.seed)
         self.draw = PictureDraw(sets=sets, shares=shares, rng=self.rng)
         self.network = FruitNetwork(config.network).to(memory_format=torch.channels_last)
+        groups: list[dict[str, Any]] = [{"params": list(self.network.parameters()), "share": 1.0}]
+        backbone = self.network.backbone
+        if isinstance(backbone, EfficientNetLite0):
+            if start_from is None:
+                backbone.load_imagenet()
+            backbone.keep_fixed(config.fixed_blocks)
+            known = {id(p) for p in backbone.parameters()}
+            groups = [
+                {"params": [p for p in self.network.parameters() if id(p) not in known], "share": 1.0},
+                {
+                    "params": [p for p in backbone.parameters() if p.requires_grad],
+                    "share": config.backbone_rate,
+                },
+            ]
         if start_from is not None:
             _load_into(self.network, start_from)
         self.averaged = copy.deepcopy(self.network).requires_grad_(False)
-        self.optimizer = torch.optim.AdamW(
-            self.network.parameters(), config.learning_rate, weight_decay=config.weight_decay
-        )
+        self.optimizer = torch.optim.AdamW(groups, config.learning_rate, weight_decay=config.weight_decay)
         self.validation = _fixed_batches(validation, config) if validation else []
 
     def train_step(self) -> dict[str, float]:
@@ -117,7 +134,7 @@ class LightTraining(ResumableTraining):
             variation = AugmentationConfig(**{**asdict(variation), "mosaic_probability": 0.0})
         pictures = [augmented(self.draw, variation, self.rng) for _ in range(config.batch_size)]
         for group in self.optimizer.param_groups:
-            group["lr"] = learning_rate(config, self.step)
+            group["lr"] = group["share"] * learning_rate(config, self.step)
         self.network.train()
         terms = self._losses(self.network, pictures)
         loss = torch.stack([LOSS_WEIGHTS[name] * term for name, term in terms.items()]).sum()

@@ -101,12 +101,15 @@ def filled_depth(depth_m: Float64) -> Float64:
     A D435's holes beside an edge are the shadow of the nearer side, so that they show the farther one.
     """
     valid = depth_m > 0
-    columns = np.arange(depth_m.shape[1])[None]
-    left = np.maximum.accumulate(np.where(valid, columns, -1), axis=1)
-    right = np.minimum.accumulate(np.where(valid, columns, depth_m.shape[1])[:, ::-1], axis=1)[:, ::-1]
-    rows = np.arange(depth_m.shape[0])[:, None]
-    from_left = np.where(left >= 0, depth_m[rows, np.maximum(left, 0)], 0.0)
-    from_right = np.where(
-        right < depth_m.shape[1], depth_m[rows, np.minimum(right, depth_m.shape[1] - 1)], 0.0
+    width = depth_m.shape[1]
+    columns = np.arange(width, dtype=np.int32)[None]
+    left = np.maximum.accumulate(np.where(valid, columns, np.int32(-1)), axis=1)
+    right = np.minimum.accumulate(np.where(valid, columns, np.int32(width))[:, ::-1], axis=1)[:, ::-1]
+    filled = np.array(depth_m, dtype=np.float64)
+    rows, holes = np.nonzero(~valid)
+    from_left, from_right = left[rows, holes], right[rows, holes]
+    filled[rows, holes] = np.maximum(
+        np.where(from_left >= 0, depth_m[rows, np.maximum(from_left, 0)], 0.0),
+        np.where(from_right < width, depth_m[rows, np.minimum(from_right, width - 1)], 0.0),
     )
-    return np.asarray(np.where(valid, depth_m, np.maximum(from_left, from_right)))
+    return filled
