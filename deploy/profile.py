@@ -14,7 +14,7 @@ from maniskill_tomato.deploy.errors import ProfileError
 from maniskill_tomato.deploy.fields import parse_table
 from maniskill_tomato.deploy.fruits import TruthFinder
 from maniskill_tomato.deploy.interface import Float64
-from maniskill_tomato.deploy.loop import LoopConfig
+from maniskill_tomato.deploy.loop_config import LoopConfig
 from maniskill_tomato.deploy.perceive import Sight
 from maniskill_tomato.deploy.safety_config import SafetyConfig
 from maniskill_tomato.errors import InvalidInputError

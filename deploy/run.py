@@ -10,7 +10,7 @@ from typing import Any
 from maniskill_tomato import __version__
 from maniskill_tomato.deploy.clock import Clock
 from maniskill_tomato.deploy.errors import ProfileError, RecordingError
-from maniskill_tomato.deploy.loop import Mode, Proposal
+from maniskill_tomato.deploy.loop_config import Mode, Proposal
 from maniskill_tomato.deploy.policies import default_policy, open_policy
 from maniskill_tomato.deploy.profile import Profile
 from maniskill_tomato.deploy.recording import McapRecorder

@@ -72,6 +72,8 @@ def write_report(out: Path, result: RunResult, facts: dict[str, Any], contact: C
     content = {**result.to_json(), **facts, "steps": contact.steps}
     for name in ("seconds", "device_seconds", "visible_fraction", "best_visible_fraction"):
         content[name] = round(content[name], 4)
+    if result.true_visible_fraction is not None:
+        content["true_visible_fraction"] = round(result.true_visible_fraction, 4)
     title = (
         f"{facts.get('profile')}, seed {facts.get('seed')}, {facts.get('policy_name')}: {result.reason}, "
         f"V_f {result.visible_fraction:.2f} after {result.moves} moves"

@@ -14,7 +14,8 @@ from maniskill_tomato.deploy.errors import ProfileError
 from maniskill_tomato.deploy.fruits import open_finder
 from maniskill_tomato.deploy.guarded_arm import GuardedArm
 from maniskill_tomato.deploy.interface import Arm, Camera, Float64
-from maniskill_tomato.deploy.loop import Loop, Mode, Proposal
+from maniskill_tomato.deploy.loop import Loop
+from maniskill_tomato.deploy.loop_config import Mode, Proposal
 from maniskill_tomato.deploy.perceive import ImagePerception, Perception, TruthPerception
 from maniskill_tomato.deploy.profile import Profile
 from maniskill_tomato.deploy.safety import Safety
@@ -122,7 +123,7 @@ def make_station(profile: Profile, seed: int = 0, clock: Clock | None = None) ->
         clock=checked,
         arm=arm,
         camera=camera,
-        guarded_arm=GuardedArm(arm, Safety(profile.safety), checked),
+        guarded_arm=GuardedArm(arm, Safety(profile.safety, profile.T_flange_camera), checked),
         perception=make_perception(profile),
     )
 

@@ -12,7 +12,8 @@ from maniskill_tomato.deploy.clock import MonotonicClock
 from maniskill_tomato.deploy.drivers import DriverContext, make_arm, make_camera
 from maniskill_tomato.deploy.guarded_arm import GuardedArm
 from maniskill_tomato.deploy.interface import Float64
-from maniskill_tomato.deploy.loop import Loop, LoopConfig
+from maniskill_tomato.deploy.loop import Loop
+from maniskill_tomato.deploy.loop_config import LoopConfig
 from maniskill_tomato.deploy.mock.episode import load_episode
 from maniskill_tomato.deploy.mock.options import twin_options, twin_world
 from maniskill_tomato.deploy.perceive import TruthPerception

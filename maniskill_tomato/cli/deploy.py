@@ -12,7 +12,7 @@ from maniskill_tomato.cli.calibrate import DeployCalibrate
 from maniskill_tomato.errors import InvalidInputError
 
 if TYPE_CHECKING:
-    from maniskill_tomato.deploy.loop import Proposal
+    from maniskill_tomato.deploy.loop_config import Proposal
 
 FAULT_STATUS = 3
 """Exit status of a run that a fault ended."""
@@ -46,7 +46,7 @@ class DeployRun:
 
     def run(self) -> None:
         """Runs, and says how it ended."""
-        from maniskill_tomato.deploy.loop import Mode
+        from maniskill_tomato.deploy.loop_config import Mode
         from maniskill_tomato.deploy.profile import load_profile
         from maniskill_tomato.deploy.run import RunConfig, run
 
