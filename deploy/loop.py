@@ -300,7 +300,12 @@ class Loop:
             told = "safety would let it through" if refusal is None else f"safety would refuse it: {refusal}"
             turns = ", ".join(f"{v:.1f}" for v in np.rad2deg(move.joint_positions))
             self._end(step, "dry_run", f"nothing was sent; the first move would go to ({turns}) deg; {told}")
-        if refusal is None and not self._confirm(proposal):
+        if refusal is not None:
+            return
+        with self._stops.waiting_for_a_person():
+            confirmed = self._confirm(proposal)
+        self._check_stops()
+        if not confirmed:
             self._end(step, "declined", "the move was not confirmed")
 
     def _refuse(self, step: Step, why: str) -> None:

@@ -80,7 +80,12 @@ def open_policy(name_or_path: str, seed: int = 0) -> Planner:
 
 
 def _onnx(path: Path) -> Planner:
-    policy = OnnxPolicy.load(path, TASK)
+    policy = OnnxPolicy.load(path)
+    trained_on = policy.description.env_id
+    if trained_on != TASK:
+        raise PolicyError(
+            f"{path} was trained on {trained_on}; the loop has the observations and moves of {TASK} only"
+        )
     return LearnedPolicy(_OnnxActor(policy))
 
 

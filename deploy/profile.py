@@ -137,8 +137,13 @@ def load_profile(name_or_file: str) -> Profile:
     return parse_profile(text, path)
 
 
-def parse_profile(text: str, path: Path) -> Profile:
-    """The profile that a text describes; `path` names it and is where relative paths in it begin.
+def parse_profile(text: str, path: Path, T_flange_camera: Any = None) -> Profile:
+    """The profile that a text describes.
+
+    Args:
+        text: As TOML.
+        path: Names it in messages, and is where relative paths in it begin.
+        T_flange_camera: What was read from the calibration file that it names, as nested lists; None to read that.
 
     Raises:
         ProfileError: Something in it is wrong.
@@ -159,7 +164,10 @@ def parse_profile(text: str, path: Path) -> Profile:
         if not isinstance(driver, str):
             raise ProfileError(f"{where}: {key}.driver is missing; name a driver, such as mock")
         drivers.append(driver)
-    T_flange_camera, calibrated = _calibration(_table(data, "calibration", where), path)
+    calibration = _table(data, "calibration", where)
+    if "file" in calibration and T_flange_camera is not None:
+        calibration = {"T_flange_camera": T_flange_camera}
+    mount, calibrated = _calibration(calibration, path)
 
     def read(key: str, kind: Any) -> Any:
         return parse_table(kind, _table(data, key, where), f"{where}: {key}")
@@ -172,7 +180,7 @@ def parse_profile(text: str, path: Path) -> Profile:
         arm_options=twin if drivers[0] == "mock" else arm,
         camera_driver=drivers[1],
         camera_options=twin if drivers[1] == "mock" else camera,
-        T_flange_camera=T_flange_camera,
+        T_flange_camera=mount,
         calibrated=calibrated,
         perception=read("perception", PerceptionConfig),
         target=read("target", TargetConfig),

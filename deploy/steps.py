@@ -90,3 +90,17 @@ class Recorder(Protocol):
             RecordingError: It cannot.
         """
         ...
+
+
+class KeptSteps:
+    """A recorder that keeps the steps in memory, for programs that look at them afterwards."""
+
+    def __init__(self) -> None:
+        self.steps: list[Step] = []
+        self.events: list[str] = []
+
+    def step(self, step: Step) -> None:
+        self.steps.append(step)
+
+    def event(self, stamp: float, text: str) -> None:
+        self.events.append(text)

@@ -20,14 +20,16 @@ from maniskill_tomato.deploy.guarded_arm import GuardedArm
 from maniskill_tomato.deploy.interface import Frame
 from maniskill_tomato.deploy.loop import Loop
 from maniskill_tomato.deploy.loop_config import Proposal
+from maniskill_tomato.deploy.observing import Observing
 from maniskill_tomato.deploy.perceive import ImagePerception, View
 from maniskill_tomato.deploy.policies import default_policy, open_policy
 from maniskill_tomato.deploy.profile import Profile, load_profile, parse_profile, profile_names
 from maniskill_tomato.deploy.station import Station, make_station
-from maniskill_tomato.deploy.steps import RunResult, Step
+from maniskill_tomato.deploy.steps import KeptSteps, RunResult
 from maniskill_tomato.deploy.stops import Stops
 from maniskill_tomato.errors import PolicyError
 from maniskill_tomato.planners.base import Planner
+from maniskill_tomato.robot.d435 import T_flange_camera_color_optical
 from maniskill_tomato.visibility.situation import Situation
 
 EPISODE = 9
@@ -67,19 +69,6 @@ class Towards(Planner):
     def act(self, situation: Situation) -> Tensor:
         self.asked += 1
         return torch.tensor([self.action])
-
-
-class Kept:
-    """A recorder that keeps the steps."""
-
-    def __init__(self) -> None:
-        self.steps: list[Step] = []
-
-    def step(self, step: Step) -> None:
-        self.steps.append(step)
-
-    def event(self, stamp: float, text: str) -> None:
-        pass
 
 
 def go(
@@ -135,7 +124,7 @@ def test_a_camera_that_fails_ends_the_run_before_the_next_move(fault: str, reaso
 def test_without_depth_the_arm_goes_back_once_and_no_farther() -> None:
     """A leaf may cover the lens; a camera that gives no depth where it gave some before is broken."""
     faults = 'faults = { camera = "zero_depth", camera_from_read = 2%s }'
-    kept = Kept()
+    kept = KeptSteps()
     broken, station = go(profile(faults % ""), recorder=kept)
     assert (broken.reason, broken.is_fault, broken.moves) == ("bad_picture", True, 3), broken.detail
     assert [step.outcome for step in kept.steps] == ["moved"] * 3 and kept.steps[2].action is None
@@ -209,6 +198,13 @@ class Swapped(TruthFinder):
         return found[self.looks % len(found) :] + found[: self.looks % len(found)] if found else found
 
 
+class Withheld(TruthFinder):
+    """A segmenter that never finds the target, only its neighbours."""
+
+    def find(self, frame: Any) -> Any:
+        return [fruit for fruit in super().find(frame) if fruit.visible_fraction is None]
+
+
 def with_perception(of: Profile, perception: Any, policy: Planner) -> RunResult:
     station = replace(make_station(of, EPISODE), perception=perception)
     with station.arm, station.camera, Stops() as stops:
@@ -225,6 +221,20 @@ def test_fruits_that_change_places_in_the_list_change_nothing() -> None:
     swapped = with_perception(profile(), ImagePerception(Swapped()), open_policy("nbv"))
     assert swapped.visible_fractions == plain.visible_fractions
     assert swapped.reason == plain.reason
+
+
+def test_a_neighbour_is_never_taken_for_the_target() -> None:
+    """Two trusses side by side, and the one that is looked for is not found: V_f stays 0, also where others show."""
+    result = with_perception(profile(), ImagePerception(Withheld()), open_policy("nbv"))
+    assert result.visible_fractions == (0.0,) * len(result.visible_fractions)
+    assert (result.success, result.reason) == (False, "budget")
+    station = make_station(profile(), EPISODE)
+    with station.arm, station.camera:
+        frame = station.camera.read()
+        pose = Observing(T_flange_camera_color_optical, 6).camera_pose(station.arm.read().joint_positions)
+    assert frame.truth is not None
+    view = ImagePerception(Withheld()).look(frame, pose, frame.truth.target_position)
+    assert view.fruits_seen > 0 and not view.mask.any() and view.visible_fraction == 0.0
 
 
 def test_without_a_given_target_the_largest_fruit_in_the_picture_is_taken() -> None:
@@ -330,6 +340,25 @@ def test_a_loop_that_stands_still_loses_its_heartbeat_and_stops_the_arm() -> Non
     result, _ = go(profile(), Sleepy(), stops=stops)
     assert (result.reason, result.is_fault) == ("heartbeat", True)
     assert len(stopped) == 1
+
+
+def test_people_may_take_longer_than_the_heartbeat_to_confirm_and_can_stop_instead() -> None:
+    def slowly(proposal: Proposal) -> bool:
+        time.sleep(1.0)
+        return proposal.number == 0
+
+    stops = Stops(heartbeat_s=0.6)
+    result, _ = go(profile(), stops=stops, mode="confirm", confirm=slowly)
+    assert (result.reason, result.moves) == ("declined", 2)
+    stops = Stops()
+
+    def stopping(proposal: Proposal) -> bool:
+        stops.request("SIGINT")
+        return True
+
+    result, station = go(profile(), stops=stops, mode="confirm", confirm=stopping)
+    arm: Any = station.arm
+    assert result.reason == "stopped" and arm._commands == 0, "a yes does not outweigh a stop"
 
 
 def test_a_dry_run_shows_the_first_move_and_sends_nothing() -> None:

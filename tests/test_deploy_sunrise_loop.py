@@ -102,6 +102,12 @@ def test_the_loop_moves_the_arm_over_the_socket_through_safety_and_guarded_moves
         (Fault(kind="drop", command="doPTP", seconds=0.05), "not_connected", "emergency stop"),
         (Fault(kind="jump", command="getJointsPositions", count=3, radians=0.5), "fault", "turned by"),
         (Fault(kind="contact", command="doPTP"), "fault", "touched something"),
+        (Fault(kind="silent", command="doPTP"), "timeout", "emergency stop"),
+        (Fault(kind="slow", command="getJointsPositions", count=4, seconds=4.0), "timeout", "answer"),
+        (Fault(kind="garbage", command="getJointsPositions", count=4), "protocol", ""),
+        (Fault(kind="partial", command="getJointsPositions", count=4), "timeout", ""),
+        (Fault(kind="nan", command="getJointsPositions", count=4), "protocol", ""),
+        (Fault(kind="nak", command="doPTP", count=2), "fault", "nak"),
     ],
 )
 def test_a_fault_of_the_controller_ends_the_run_with_its_reason(fault: Fault, reason: str, word: str) -> None:

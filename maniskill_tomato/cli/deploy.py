@@ -1,6 +1,5 @@
 """`maniskill-tomato deploy`: the policy on an arm and a camera, or on their digital twin."""
 
-import signal
 import sys
 from dataclasses import dataclass
 from pathlib import Path
@@ -8,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
-from maniskill_tomato.cli.calibrate import DeployCalibrate
+from maniskill_tomato.cli.calibrate import DeployCalibrate, end_by_signal
 from maniskill_tomato.errors import InvalidInputError
 
 if TYPE_CHECKING:
@@ -79,8 +78,8 @@ class DeployRun:
         if result.is_fault:
             print(f"error: {result.detail}", file=sys.stderr)
             raise SystemExit(FAULT_STATUS)
-        if result.reason == "stopped" and result.detail in signal.Signals.__members__:
-            raise SystemExit(128 + signal.Signals[result.detail])
+        if result.reason == "stopped":
+            end_by_signal(result.detail)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -118,7 +117,10 @@ class DeployReplay:
         """Compares."""
         from maniskill_tomato.deploy.replay import each_difference, load_recording, replay
 
-        found = replay(load_recording(self.recording), self.policy)
+        recorded = load_recording(self.recording)
+        if recorded.is_cut_off:
+            print(f"the recording is cut off; its first {len(recorded.steps)} looks are whole")
+        found = replay(recorded, self.policy)
         for line in each_difference(found):
             print(line)
         if found.differences:
