@@ -20,6 +20,7 @@ from maniskill_tomato.deploy.capture import Capture
 from maniskill_tomato.deploy.clock import Clock
 from maniskill_tomato.deploy.errors import (
     DeployError,
+    FaultError,
     HeartbeatLostError,
     PerceptionError,
     RecordingError,
@@ -276,11 +277,13 @@ class Loop:
                     self._check_stops()
                 self._clock.sleep(self._config.settle)
             except (_End, DeployError) as error:
+                if isinstance(error, RefusedError):
+                    error = FaultError(f"the arm broke its move off: {error}")
                 broken = replace(
                     step, commanded=sent.joint_positions, outcome="broken off", detail=str(error)
                 )
                 self._record(broken)
-                raise
+                raise error
         self._settled_at = self._clock.now()
         self._record(replace(step, commanded=sent.joint_positions, outcome="moved"))
 

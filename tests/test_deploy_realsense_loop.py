@@ -49,6 +49,8 @@ segmenter = "{segmenter}"
 [target]
 source = "{source}"
 {position}
+[safety]
+max_frame_age = 100.0
 [loop]
 max_moves = 2
 threshold = 0.99
@@ -70,9 +72,9 @@ class Waving(Planner):
 
 
 class FastClock:
-    """Runs twenty times as fast as the machine's, so that moves at a tenth of the speed take no minutes."""
+    """Runs ten times as fast as the machine's, so that moves at a tenth of the speed take no minutes."""
 
-    FACTOR = 20.0
+    FACTOR = 10.0
 
     def now(self) -> float:
         return self.FACTOR * time.monotonic()
@@ -156,7 +158,8 @@ def test_pictures_of_a_recording_guide_the_arm_as_the_twins_own_do(tmp_path: Pat
     assert len(steps) == len(twin_steps) == 3
     for step, twin_step in zip(steps, twin_steps, strict=True):
         np.testing.assert_allclose(step.joint_positions, twin_step.joint_positions, atol=2e-3)
-        assert step.view.visible_fraction == pytest.approx(twin_step.view.visible_fraction, abs=0.15)
+        mine, known = step.view.mask, twin_step.view.mask
+        assert (mine & known).sum() > 0.5 * min(mine.sum(), known.sum()) > 20, "the same fruit, by its colour"
         both = (step.frame.depth > 0.0) & (twin_step.frame.depth > 0.0)
         assert both.mean() > 0.3
         assert float(np.median(np.abs(step.frame.depth - twin_step.frame.depth)[both])) < 0.004

@@ -50,12 +50,14 @@ class CarriedBy:
         pass
 
 
-def run(faults: Sequence[Fault] = (), moves: int = 2) -> tuple[RunResult, LoopbackController]:
+def run(
+    faults: Sequence[Fault] = (), moves: int = 2, speedup: float = 5.0
+) -> tuple[RunResult, LoopbackController]:
     clock = MonotonicClock()
     context = DriverContext(clock=clock, seed=SEED)
     start = load_episode("held_out", SEED).start_joints
     with LoopbackController(
-        qpos=start.tolist(), speedup=5.0, media_flange_m=0.026, faults=faults
+        qpos=start.tolist(), speedup=speedup, media_flange_m=0.026, faults=faults
     ) as controller:
         host, port = controller.address
         options: dict[str, Any] = {"host": host, "port": port, "flange_xyz": [0.0, 0.0, 0.026]}
@@ -113,7 +115,32 @@ def test_the_loop_moves_the_arm_over_the_socket_through_safety_and_guarded_moves
 def test_a_fault_of_the_controller_ends_the_run_with_its_reason(fault: Fault, reason: str, word: str) -> None:
     began = time.monotonic()
     result, controller = run([fault], moves=3)
-    assert result.is_fault and result.reason == reason and word in result.detail
+    assert result.is_fault and result.reason == reason and word in result.detail, result.detail
+    if reason != "fault":
+        # What is said about the arm agrees with whether a move was sent that nobody saw the end of.
+        assert ("emergency stop" in result.detail) == ("may still be under way" in result.end_state)
     before = len([line for line in controller.received if line.startswith("doPTP")])
     assert before <= 2
     assert time.monotonic() - began < 120.0
+
+
+@pytest.mark.parametrize(
+    ("kind", "reason"),
+    [
+        ("silent", "timeout"),
+        ("slow", "timeout"),
+        ("garbage", "protocol"),
+        ("partial", "timeout"),
+        ("nan", "protocol"),
+    ],
+)
+def test_after_a_connection_lost_in_a_move_nobody_claims_that_the_arm_stands(kind: Any, reason: str) -> None:
+    """The seventh reading of the joints falls into the first move."""
+    fault = Fault(kind=kind, command="getJointsPositions", count=7, seconds=4.0)
+    result, controller = run([fault], moves=3, speedup=0.5)
+    assert (result.is_fault, result.reason) == (True, reason), result.detail
+    assert "The arm may be in a move, which goes on" in result.detail and "emergency stop" in result.detail
+    assert (
+        result.end_state.startswith("a move may still be under way") and "emergency stop" in result.end_state
+    )
+    assert len([line for line in controller.received if line.startswith("doPTP")]) == 1
