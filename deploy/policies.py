@@ -63,7 +63,9 @@ def open_policy(name_or_path: str, seed: int = 0) -> Planner:
     path = Path(name_or_path)
     if not path.is_file():
         allowed = ", ".join(name for name in PLANNERS if name not in PRIVILEGED)
-        raise PolicyError(f"no policy at {path}; give a .pt or .onnx file, or one of the planners {allowed}")
+        raise PolicyError(
+            f"no policy at {name_or_path!r}; give a .pt or .onnx file, or one of the planners {allowed}"
+        )
     if path.suffix.lower() == ".onnx":
         return _onnx(path)
     try:

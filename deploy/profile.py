@@ -39,6 +39,10 @@ TABLES: Final = (
 """What a profile may have."""
 
 
+FARTHEST_TARGET: Final = 1.6
+"""An arm that reaches 0.82 m cannot look closely at what is farther from its base, in [m]."""
+
+
 @dataclass(frozen=True, kw_only=True)
 class PerceptionConfig:
     """What turns pictures into views."""
@@ -67,6 +71,11 @@ class TargetConfig:
     def __post_init__(self) -> None:
         if (self.source == "given") != (self.position is not None):
             raise InvalidInputError("position goes with source = 'given', and only with it")
+        if self.position is not None and not np.linalg.norm(self.position) <= FARTHEST_TARGET:
+            raise InvalidInputError(
+                f"position must lie within {FARTHEST_TARGET} m of the base, where the arm can look at it; got "
+                f"{self.position}, in metres"
+            )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -130,10 +139,12 @@ def load_profile(name_or_file: str) -> Profile:
     path = PROFILES / f"{name_or_file}.toml" if name_or_file in profile_names() else Path(name_or_file)
     try:
         text = path.read_text(encoding="utf-8")
-    except (OSError, UnicodeDecodeError) as error:
+    except (FileNotFoundError, IsADirectoryError) as error:
         raise ProfileError(
             f"no profile {name_or_file!r}: give the path of a TOML file or one of {', '.join(profile_names())}"
         ) from error
+    except (OSError, ValueError) as error:  # A name with a null byte, for one.
+        raise ProfileError(f"the profile {name_or_file!r} cannot be read as text: {error}") from error
     return parse_profile(text, path)
 
 

@@ -80,7 +80,7 @@ def run(
         RecordingError: The folder or the recording cannot be begun.
     """
     profile = config.profile
-    name = config.policy or default_policy()
+    name = default_policy() if config.policy is None else config.policy
     policy = open_policy(name, config.seed)
     station = make_station(profile, config.seed, clock)
     mode: Mode = config.mode or ("unattended" if station.simulated else "dry_run")
