@@ -17,9 +17,10 @@ from maniskill_tomato.deploy.clock import SimulatedClock
 from maniskill_tomato.deploy.errors import ProfileError
 from maniskill_tomato.deploy.fruits import TruthFinder
 from maniskill_tomato.deploy.guarded_arm import GuardedArm
-from maniskill_tomato.deploy.interface import Frame
+from maniskill_tomato.deploy.interface import Frame, JointMove
 from maniskill_tomato.deploy.loop import Loop
 from maniskill_tomato.deploy.loop_config import Proposal
+from maniskill_tomato.deploy.mock.episode import load_episode
 from maniskill_tomato.deploy.perceive import ImagePerception, View
 from maniskill_tomato.deploy.policies import default_policy, open_policy
 from maniskill_tomato.deploy.profile import Profile, load_profile, parse_profile, profile_names
@@ -28,6 +29,8 @@ from maniskill_tomato.deploy.steps import KeptSteps, RunResult
 from maniskill_tomato.deploy.stops import Stops
 from maniskill_tomato.errors import PolicyError
 from maniskill_tomato.planners.base import Planner
+from maniskill_tomato.robot.d435 import T_flange_camera_color_optical
+from maniskill_tomato.robot.kinematics import forward_kinematics
 from maniskill_tomato.visibility.situation import Situation
 
 EPISODE = 9
@@ -411,6 +414,27 @@ def test_every_shipped_profile_can_be_read_and_errors_name_the_key(tmp_path: Pat
     (tmp_path / "binary.toml").write_bytes(b"\xff\xfe\x00")
     with pytest.raises(ProfileError, match="cannot be read as text"):
         load_profile(str(tmp_path / "binary.toml"))
+
+
+def test_safety_has_the_camera_where_the_profile_says_that_it_was_measured() -> None:
+    """A wall at the lens of a camera that sits 60 mm farther out than in the drawings."""
+    mount = np.array(T_flange_camera_color_optical)
+    mount[2, 3] += 0.06
+    start = load_episode("held_out", EPISODE).start_joints
+    lens = (forward_kinematics(torch.as_tensor(start[None]))[0].numpy() @ mount)[:3, 3]
+    wall = (
+        f"[safety]\nobstacles = [{{ low = {(lens - 0.005).tolist()}, high = {(lens + 0.005).tolist()} }}]\n"
+        "obstacle_clearance = 0.01\n"
+    )
+    stay = JointMove(joint_positions=start, speed_fraction=0.1)
+    for calibration, reason in (
+        ("", None),
+        (f"[calibration]\nT_flange_camera = {mount.tolist()}\n", "obstacle"),
+    ):
+        station = make_station(profile(more=wall + calibration), EPISODE)
+        with station.arm:
+            refusal = station.guarded_arm.safety.check(stay, station.guarded_arm.read(), station.clock.now())
+        assert (refusal.reason if refusal else None) == reason
 
 
 def test_only_the_guarded_arm_commands_an_arm() -> None:

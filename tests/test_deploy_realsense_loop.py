@@ -163,5 +163,5 @@ def test_pictures_of_a_recording_guide_the_arm_as_the_twins_own_do(tmp_path: Pat
         both = (step.frame.depth > 0.0) & (twin_step.frame.depth > 0.0)
         assert both.mean() > 0.3
         assert float(np.median(np.abs(step.frame.depth - twin_step.frame.depth)[both])) < 0.004
-    for seen, known in zip(policy.situations, expected_policy.situations, strict=True):
-        assert float((seen - known).abs().median()) < 0.01
+    for seen, wanted in zip(policy.situations, expected_policy.situations, strict=True):
+        assert float((seen - wanted).abs().median()) < 0.01

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 def end_by_signal(reason: str | None) -> None:
     """Ends with the exit status of a signal if that is what stopped a run; `reason` is its name."""
-    if reason in signal.Signals.__members__:
+    if reason is not None and reason in signal.Signals.__members__:
         raise SystemExit(128 + signal.Signals[reason])
 
 
