@@ -48,8 +48,16 @@ class Capture:
         self._clock = clock
         self._last_number: int | None = None
 
-    def take(self, after: float) -> Frame:
+    def is_blind(self, frame: Frame) -> bool:
+        """Whether hardly any pixel has depth."""
+        return float((frame.depth > 0.0).mean()) < self._config.min_depth_share
+
+    def take(self, after: float, may_be_blind: bool = False) -> Frame:
         """A picture that was begun after a moment, in [s]; tried again if something is wrong with it.
+
+        Args:
+            after: In [s].
+            may_be_blind: Whether the last attempt's picture is taken although it has hardly any depth.
 
         Raises:
             DeployError: What was wrong with the last attempt.
@@ -58,6 +66,12 @@ class Capture:
             try:
                 frame = self._camera.read(self._config.max_age, after)
                 self._check(frame, after)
+                if self.is_blind(frame) and not (may_be_blind and attempt + 1 == self._config.attempts):
+                    raise PerceptionError(
+                        f"{(frame.depth > 0.0).mean():.2%} of the pixels have depth, at least "
+                        f"{self._config.min_depth_share:.2%} are needed; is the infrared projector on, is anything "
+                        "within 0.1 to 3 m, or does a leaf cover the lens?"
+                    )
                 self._last_number = frame.number
                 return frame
             except NotConnectedError:
@@ -86,9 +100,5 @@ class Capture:
             )
         if np.percentile(frame.color[::4, ::4], 99) <= BLACK:
             raise PerceptionError("the picture is black; is the lens covered, or the exposure wrong?")
-        share = float((frame.depth > 0.0).mean())
-        if share < self._config.min_depth_share or not np.isfinite(frame.depth).all():
-            raise PerceptionError(
-                f"{share:.2%} of the pixels have depth, at least {self._config.min_depth_share:.2%} are needed; "
-                "is the infrared projector on, is anything within 0.1 to 3 m, or does a leaf cover the lens?"
-            )
+        if not np.isfinite(frame.depth).all():
+            raise PerceptionError("the depth image has values that are not finite")

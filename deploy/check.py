@@ -45,7 +45,7 @@ def check(profile: Profile, policy: str | None, seed: int, out: Path | None) -> 
         A finding each; after a device that cannot be used no more of it.
     """
     yield Finding(what="profile", good=True, detail=f"{profile.name}: {profile.description}")
-    name = policy or default_policy()
+    name = default_policy() if policy is None else policy
     opened: Any = None
     try:
         opened = open_policy(name, seed)

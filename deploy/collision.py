@@ -8,7 +8,9 @@ import numpy as np
 
 from maniskill_tomato.deploy.interface import Float64
 from maniskill_tomato.deploy.safety_config import Box
+from maniskill_tomato.robot.d435 import T_flange_camera_color_optical, camera_link_pose
 from maniskill_tomato.robot.description import urdf_path
+from maniskill_tomato.robot.urdf import CAMERA_LINK_NAME
 
 mj: Any = mujoco
 
@@ -41,6 +43,7 @@ class CollisionChecker:
         self_clearance: float = 0.01,
         obstacles: tuple[Box, ...] = (),
         obstacle_clearance: float = 0.05,
+        T_flange_camera: Float64 = T_flange_camera_color_optical,
     ) -> None:
         """Compiles the model.
 
@@ -50,8 +53,13 @@ class CollisionChecker:
             self_clearance: How far links stay from each other, in [m].
             obstacles: Boxes to stay clear of.
             obstacle_clearance: By so much, in [m].
+            T_flange_camera: The camera's optical frame in `link_ee`, which its body goes with. Shape (4, 4).
         """
         spec = mj.MjSpec.from_file(urdf_path())
+        pose = camera_link_pose(T_flange_camera)
+        camera = spec.body(CAMERA_LINK_NAME)
+        camera.pos = pose[:3, 3]
+        mj.mju_mat2Quat(camera.quat, np.ascontiguousarray(pose[:3, :3]).ravel())
         world = spec.worldbody
         world.add_geom(
             name=TABLE, type=mj.mjtGeom.mjGEOM_PLANE, size=[2.0, 2.0, 0.1], pos=[0.0, 0.0, table_height]

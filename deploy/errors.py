@@ -64,7 +64,17 @@ class RecordingError(DeployError):
     reason = "recording"
 
 
+class CutOffError(RecordingError):
+    """A recording ends in the middle: the disk was full, or the program was killed. What came before is whole."""
+
+
 class HeartbeatLostError(DeployError):
     """The loop itself stood still for too long."""
 
     reason = "heartbeat"
+
+
+class StoppedError(DeployError):
+    """Somebody asked to stop; the message says how."""
+
+    reason = "stopped"

@@ -8,36 +8,38 @@ has not moved and tries something else.
 
 import logging
 import time
-from collections import defaultdict
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager, suppress
-from dataclasses import dataclass, replace
-from itertools import islice
-from typing import Final, Literal
+from collections.abc import Callable
+from contextlib import suppress
+from dataclasses import replace
+from typing import Final
 
 import numpy as np
 import torch
 
 from maniskill_tomato.deploy.capture import Capture
 from maniskill_tomato.deploy.clock import Clock
-from maniskill_tomato.deploy.errors import DeployError, HeartbeatLostError, RecordingError, RefusedError
+from maniskill_tomato.deploy.errors import (
+    DeployError,
+    FaultError,
+    HeartbeatLostError,
+    PerceptionError,
+    RecordingError,
+    RefusedError,
+)
 from maniskill_tomato.deploy.guarded_arm import GuardedArm
 from maniskill_tomato.deploy.interface import Camera, Float64, Frame, JointMove
+from maniskill_tomato.deploy.loop_config import LoopConfig, Mode, Proposal
+from maniskill_tomato.deploy.move_choice import MoveChooser, Wish
 from maniskill_tomato.deploy.observing import Observing
 from maniskill_tomato.deploy.perceive import Perception
 from maniskill_tomato.deploy.plant_points import PlantPoints
 from maniskill_tomato.deploy.policies import decide
-from maniskill_tomato.deploy.postures import Postures
 from maniskill_tomato.deploy.safety import Refusal
+from maniskill_tomato.deploy.stage_times import StageTimes
 from maniskill_tomato.deploy.steps import Recorder, RunResult, Step
 from maniskill_tomato.deploy.stops import Stops
-from maniskill_tomato.errors import InvalidInputError, PolicyError, TomatoError
+from maniskill_tomato.errors import PolicyError, TomatoError
 from maniskill_tomato.planners.base import Planner
-from maniskill_tomato.robot.inverse_kinematics import Reach
-from maniskill_tomato.robot.look_at_move import LookAtMover, moved_position
-
-Mode = Literal["dry_run", "confirm", "unattended"]
-"""Show the first move and end; ask before every move; go on alone."""
 
 WAIT_SLICE: Final = 0.1
 """While the arm moves, stops are looked for this often, in [s]."""
@@ -45,53 +47,7 @@ WAIT_SLICE: Final = 0.1
 STOP_TIME: Final = 2.0
 """An arm that was told to stop stands after so long, in [s]."""
 
-OTHERS_TRIED: Final = 16
-"""So many other postures are held against `safety` before a move counts as refused."""
-
 _logger = logging.getLogger(__name__)
-
-
-@dataclass(frozen=True, kw_only=True)
-class LoopConfig:
-    """When a run ends."""
-
-    threshold: float = 0.8
-    """The target is fully visible when V_f is above this."""
-    max_moves: int = 20
-    """Moves in which it must be."""
-    lost_after: int = 12
-    """Looks without any of the target in a row after which it counts as lost."""
-    refused_after: int = 8
-    """Refused moves in a row after which the run ends."""
-    settle: float = 0.2
-    """Between the end of a move and the next picture, in [s]."""
-
-    def __post_init__(self) -> None:
-        if not 0.0 < self.threshold < 1.0:
-            raise InvalidInputError(f"threshold must be between 0 and 1, got {self.threshold}")
-        for name in ("max_moves", "lost_after", "refused_after"):
-            if getattr(self, name) < 1:
-                raise InvalidInputError(f"{name} must be at least 1, got {getattr(self, name)}")
-        if not 0.0 <= self.settle <= 10.0:
-            raise InvalidInputError(f"settle must be from 0 to 10 s, got {self.settle}")
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class Proposal:
-    """A move that a person is asked about."""
-
-    number: int
-    """How many moves there were before."""
-    visible_fraction: float
-    """V_f now."""
-    joint_positions: Float64
-    """Where the arm would go, in [rad]. Shape (7,)."""
-    turn: Float64
-    """How far each joint would turn, in [rad]. Shape (7,)."""
-    camera_step: float
-    """How far the camera would move, in [m]."""
-    refusal: str | None
-    """Why `safety` would refuse it, if it would."""
 
 
 class _End(Exception):
@@ -146,14 +102,14 @@ class Loop:
         self._recorder, self._mode, self._confirm = recorder, mode, confirm
         self._target = target_position
         self._observing = Observing(T_flange_camera, config.max_moves)
-        self._mover = LookAtMover(T_flange_camera=np.array(T_flange_camera, dtype=np.float64))
-        self._postures = Postures(T_flange_camera, arm.safety.config.joint_margin)
-        self._points = PlantPoints()
+        self._chooser = MoveChooser(arm.safety, T_flange_camera)
+        self._points = PlantPoints(T_flange_camera)
         self._fractions: list[float] = []
         self._moves = self._refused = self._refused_in_a_row = self._lost_in_a_row = 0
         self._settled_at = clock.now()
-        self._times: dict[str, list[float]] = defaultdict(list)
-        self._step_times: dict[str, float] = {}
+        self._way_back: Float64 | None = None
+        self._true_fraction: float | None = None
+        self._times = StageTimes()
 
     @property
     def points(self) -> PlantPoints:
@@ -188,10 +144,11 @@ class Loop:
             refused_moves=self._refused,
             visible_fraction=self._fractions[-1] if self._fractions else 0.0,
             best_visible_fraction=max(self._fractions, default=0.0),
+            true_visible_fraction=self._true_fraction,
             visible_fractions=tuple(round(v, 4) for v in self._fractions),
             seconds=time.perf_counter() - began,
             device_seconds=0.0 if np.isnan(device_seconds) else device_seconds,
-            stage_ms={name: round(float(np.mean(values)), 2) for name, values in self._times.items()},
+            stage_ms=self._times.mean_ms,
             end_state=end_state,
         )
         self._log(f"end: {reason}: {detail} ({end_state})")
@@ -201,12 +158,13 @@ class Loop:
 
     def _one_look(self) -> None:
         self._check_stops()
-        self._step_times = {}
+        self._times.begin_step()
         config = self._config
-        with self._timed("capture"):
+        with self._times.timed("capture"):
             self._camera.begin_view()
-            frame = self._capture.take(self._settled_at)
+            frame = self._capture.take(self._settled_at, may_be_blind=self._way_back is not None)
             joints = self._arm.read().joint_positions
+        blind = self._capture.is_blind(frame)
         step = self._look(frame, joints)
         view = step.view
         if view.visible_fraction > config.threshold:
@@ -218,7 +176,12 @@ class Loop:
             self._end(
                 step, "target_lost", f"{self._lost_in_a_row} looks in a row showed nothing of the target"
             )
-        with self._timed("policy"):
+        if blind:
+            self._moves += 1
+            self._go_back(step)
+            return
+        self._way_back = joints
+        with self._times.timed("policy"):
             action = decide(self._policy, self._situation)
         step = replace(step, action=(float(action[0]), float(action[1]), float(action[2])))
         self._moves += 1
@@ -227,7 +190,7 @@ class Loop:
     def _look(self, frame: Frame, joints: Float64) -> Step:
         T_world_camera = self._observing.camera_pose(joints)
         first = self._observing.target_position is None
-        with self._timed("perceive"):
+        with self._times.timed("perceive"):
             if first:
                 target = self._target
                 if target is None:
@@ -240,14 +203,15 @@ class Loop:
                 self._observing.begin(self._target)
             assert self._target is not None
             view = self._perception.look(frame, T_world_camera, self._target)
-        with self._timed("observe"):
+        with self._times.timed("observe"):
             moves_left = self._config.max_moves - self._moves
             self._situation = self._observing.observe(joints, view, moves_left)
-        with self._timed("plant points"):
+        with self._times.timed("plant points"):
             self._points.add(frame, T_world_camera, joints)
         if first:
             self._policy.begin(self._situation, torch.zeros(1, dtype=torch.int64))
         self._fractions.append(view.visible_fraction)
+        self._true_fraction = None if frame.truth is None else frame.truth.visible_fraction
         return Step(
             number=len(self._fractions) - 1,
             frame=frame,
@@ -261,80 +225,67 @@ class Loop:
     def _act(self, step: Step, frame: Frame) -> None:
         """Solves the move, has it checked and carried out, or counts it as refused."""
         assert step.action is not None and self._target is not None
-        with self._timed("kinematics"):
-            joints = torch.tensor(step.joint_positions[None], dtype=torch.float32)
-            position = torch.as_tensor(self._observing.camera_position(step.joint_positions)[None])
-            target = torch.as_tensor(self._target[None])
-            solved = self._mover.move(joints, position, target, torch.tensor([step.action]))
-        reachable = int(solved.reach[0]) != int(Reach.UNREACHABLE)
-        goal = solved.qpos[0].float().double().numpy()
-        with self._timed("safety"):
-            move, refusal = self._safe_move(step, goal if reachable else None, frame)
-        if move is None:
+        wish = Wish(
+            joint_positions=step.joint_positions,
+            camera_position=self._observing.camera_position(step.joint_positions),
+            target_position=self._target,
+            action=step.action,
+        )
+        points = self._points.points_w
+        with self._times.timed("kinematics"):
+            own_goal = self._chooser.own_goal(wish)
+        with self._times.timed("safety"):
+            state = self._arm.read()
+            chosen = self._chooser.choose(wish, own_goal, state, self._clock.now(), frame.stamp, points)
+        if chosen.move is None:
             self._refuse(step, "out of reach")
             return
         if self._mode != "unattended":
-            self._ask(step, move, refusal)
-        if refusal is not None:
-            self._refuse(step, str(refusal))
+            self._ask(step, chosen.move, chosen.refusal)
+        if chosen.refusal is not None:
+            self._refuse(step, str(chosen.refusal))
             return
         try:
-            sent = self._arm.command(move, frame.stamp, self._points.points_w)
+            sent = self._arm.command(chosen.move, frame.stamp, points)
         except RefusedError as error:
             self._refuse(step, str(error))
             return
-        self._refused_in_a_row = 0
-        with self._timed("move"):
-            try:
-                self._follow()
-            except (_End, DeployError) as error:
-                detail = str(error)
-                self._record(
-                    replace(step, commanded=sent.joint_positions, outcome="broken off", detail=detail)
-                )
-                raise
-        self._record(replace(step, commanded=sent.joint_positions, outcome="moved"))
+        self._follow(step, sent)
 
-    def _follow(self) -> None:
+    def _go_back(self, step: Step) -> None:
+        """Without depth nobody knows what is near, a leaf over the lens for one: back to where there was some."""
+        way_back, self._way_back = self._way_back, None
+        assert way_back is not None
+        step = replace(step, detail="no depth here: back to the last view that had some")
+        move = JointMove(joint_positions=way_back, speed_fraction=self._arm.safety.config.speed_fraction)
+        if self._mode != "unattended":
+            self._ask(step, move, None)
+        try:
+            sent = self._arm.command(move, step.frame.stamp, self._points.points_w)
+        except RefusedError as error:
+            raise PerceptionError(
+                f"the picture has no depth, and the way back is refused: {error}"
+            ) from error
+        self._follow(step, sent)
+
+    def _follow(self, step: Step, sent: JointMove) -> None:
         """Waits until the arm stands and has settled, looking for stops all the while."""
-        while not self._arm.wait(WAIT_SLICE):
-            self._check_stops()
-        self._clock.sleep(self._config.settle)
+        self._refused_in_a_row = 0
+        with self._times.timed("move"):
+            try:
+                while not self._arm.wait(WAIT_SLICE):
+                    self._check_stops()
+                self._clock.sleep(self._config.settle)
+            except (_End, DeployError) as error:
+                if isinstance(error, RefusedError):
+                    error = FaultError(f"the arm broke its move off: {error}")
+                broken = replace(
+                    step, commanded=sent.joint_positions, outcome="broken off", detail=str(error)
+                )
+                self._record(broken)
+                raise error
         self._settled_at = self._clock.now()
-
-    def _safe_move(
-        self, step: Step, goal: Float64 | None, frame: Frame
-    ) -> tuple[JointMove | None, Refusal | None]:
-        """The task's own posture, or another one of the same or a shorter move that `safety` accepts.
-
-        If there is none: the task's own (None where it has none either), and why it is refused.
-        """
-        assert step.action is not None and self._target is not None
-        safety, state = self._arm.safety, self._arm.read()
-        speed = safety.config.speed_fraction
-        points, now = self._points.points_w, self._clock.now()
-        own: JointMove | None = None
-        refusal: Refusal | None = None
-        if goal is not None:
-            own = JointMove(joint_positions=goal, speed_fraction=speed)
-            refusal = safety.check(own, state, now, frame.stamp, points)
-            if refusal is None:
-                return own, None
-        position = step.T_world_camera[:3, 3]
-        aim = moved_position(
-            torch.as_tensor(position),
-            torch.as_tensor(self._target),
-            torch.tensor(step.action, dtype=torch.float64),
-        )
-        others = self._postures.of_move(
-            state.joint_positions, position, aim.numpy(), self._target, safety.config.max_joint_step
-        )
-        for posture in islice(others, OTHERS_TRIED):
-            move = JointMove(joint_positions=posture, speed_fraction=speed)
-            if safety.check(move, state, now, frame.stamp, points) is None:
-                _logger.info("move %d in another posture, because %s", self._moves, refusal or "out of reach")
-                return move, None
-        return own, refusal
+        self._record(replace(step, commanded=sent.joint_positions, outcome="moved"))
 
     def _ask(self, step: Step, move: JointMove, refusal: Refusal | None) -> None:
         """Shows the move; goes on only if a person wants it."""
@@ -352,7 +303,12 @@ class Loop:
             told = "safety would let it through" if refusal is None else f"safety would refuse it: {refusal}"
             turns = ", ".join(f"{v:.1f}" for v in np.rad2deg(move.joint_positions))
             self._end(step, "dry_run", f"nothing was sent; the first move would go to ({turns}) deg; {told}")
-        if refusal is None and not self._confirm(proposal):
+        if refusal is not None:
+            return
+        with self._stops.waiting_for_a_person():
+            confirmed = self._confirm(proposal)
+        self._check_stops()
+        if not confirmed:
             self._end(step, "declined", "the move was not confirmed")
 
     def _refuse(self, step: Step, why: str) -> None:
@@ -393,7 +349,7 @@ class Loop:
 
     def _record(self, step: Step) -> None:
         if self._recorder is not None:
-            self._recorder.step(replace(step, timing_ms=dict(self._step_times)))
+            self._recorder.step(replace(step, timing_ms=self._times.step_ms))
 
     def _log(self, text: str) -> None:
         _logger.info("%s", text)
@@ -402,13 +358,3 @@ class Loop:
                 self._recorder.event(self._clock.now(), text)
             except (RecordingError, DeployError) as error:
                 _logger.warning("%s", error)
-
-    @contextmanager
-    def _timed(self, stage: str) -> Iterator[None]:
-        began = time.perf_counter()
-        try:
-            yield
-        finally:
-            taken = 1e3 * (time.perf_counter() - began)
-            self._times[stage].append(taken)
-            self._step_times[stage] = round(taken, 3)

@@ -6,6 +6,7 @@ import numpy as np
 import torch
 
 from maniskill_tomato.deploy.interface import Float64, Frame
+from maniskill_tomato.robot.d435 import T_flange_camera_color_optical
 from maniskill_tomato.robot.kinematics import link_transforms
 from maniskill_tomato.robot.spheres import sphere_table
 
@@ -31,7 +32,14 @@ JUMP_SHARE: Final = 0.03
 class PlantPoints:
     """A cloud of occupied cells in the base frame that grows with every view."""
 
-    def __init__(self, cell: float = CELL) -> None:
+    def __init__(self, T_flange_camera: Float64 = T_flange_camera_color_optical, cell: float = CELL) -> None:
+        """Begins with nothing.
+
+        Args:
+            T_flange_camera: The camera's optical frame in `link_ee`. Shape (4, 4).
+            cell: Edge of a cell, in [m].
+        """
+        self._T_flange_camera = T_flange_camera
         self._cell = cell
         self._cells: dict[tuple[int, int, int], int] = {}
         self._points: Float64 | None = np.zeros((0, 3))
@@ -60,7 +68,8 @@ class PlantPoints:
         """
         points = depth_points(frame, T_world_camera)
         if len(points):
-            points = points[sphere_distances(joint_positions[None], points)[0] > SELF_MARGIN]
+            distances = sphere_distances(joint_positions[None], points, self._T_flange_camera)
+            points = points[distances[0] > SELF_MARGIN]
         before = len(self._cells)
         for cell in np.unique(np.floor(points / self._cell).astype(np.int64), axis=0):
             key = (int(cell[0]), int(cell[1]), int(cell[2]))
@@ -90,17 +99,20 @@ def depth_points(frame: Frame, T_world_camera: Float64) -> Float64:
     return points
 
 
-def sphere_distances(joint_positions: Float64, points_w: Float64) -> Float64:
+def sphere_distances(
+    joint_positions: Float64, points_w: Float64, T_flange_camera: Float64 = T_flange_camera_color_optical
+) -> Float64:
     """Distances between points and the nearest of the arm's spheres (`robot.spheres`).
 
     Args:
         joint_positions: In [rad]. Shape (N, 7).
         points_w: In the base frame, in [m]. Shape (P, 3).
+        T_flange_camera: The camera's optical frame in `link_ee`. Shape (4, 4).
 
     Returns:
         In [m], negative inside a sphere. Shape (N, P).
     """
-    links, spheres = sphere_table()
+    links, spheres = sphere_table(T_flange_camera)
     T = link_transforms(torch.as_tensor(np.array(joint_positions), dtype=torch.float64)).numpy()
     centres_l = np.concatenate([spheres[:, :3], np.ones((len(spheres), 1))], axis=1).astype(np.float64)
     centres = np.einsum("nsij,sj->nsi", T[:, links], centres_l)[..., :3]

@@ -63,7 +63,9 @@ def open_policy(name_or_path: str, seed: int = 0) -> Planner:
     path = Path(name_or_path)
     if not path.is_file():
         allowed = ", ".join(name for name in PLANNERS if name not in PRIVILEGED)
-        raise PolicyError(f"no policy at {path}; give a .pt or .onnx file, or one of the planners {allowed}")
+        raise PolicyError(
+            f"no policy at {name_or_path!r}; give a .pt or .onnx file, or one of the planners {allowed}"
+        )
     if path.suffix.lower() == ".onnx":
         return _onnx(path)
     try:
@@ -80,7 +82,12 @@ def open_policy(name_or_path: str, seed: int = 0) -> Planner:
 
 
 def _onnx(path: Path) -> Planner:
-    policy = OnnxPolicy.load(path, TASK)
+    policy = OnnxPolicy.load(path)
+    trained_on = policy.description.env_id
+    if trained_on != TASK:
+        raise PolicyError(
+            f"{path} was trained on {trained_on}; the loop has the observations and moves of {TASK} only"
+        )
     return LearnedPolicy(_OnnxActor(policy))
 
 

@@ -14,7 +14,7 @@ from maniskill_tomato.deploy.errors import ProfileError
 from maniskill_tomato.deploy.fields import parse_table
 from maniskill_tomato.deploy.fruits import TruthFinder
 from maniskill_tomato.deploy.interface import Float64
-from maniskill_tomato.deploy.loop import LoopConfig
+from maniskill_tomato.deploy.loop_config import LoopConfig
 from maniskill_tomato.deploy.perceive import Sight
 from maniskill_tomato.deploy.safety_config import SafetyConfig
 from maniskill_tomato.errors import InvalidInputError
@@ -37,6 +37,10 @@ TABLES: Final = (
     "stop",
 )
 """What a profile may have."""
+
+
+FARTHEST_TARGET: Final = 1.6
+"""An arm that reaches 0.82 m cannot look closely at what is farther from its base, in [m]."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -67,6 +71,11 @@ class TargetConfig:
     def __post_init__(self) -> None:
         if (self.source == "given") != (self.position is not None):
             raise InvalidInputError("position goes with source = 'given', and only with it")
+        if self.position is not None and not np.linalg.norm(self.position) <= FARTHEST_TARGET:
+            raise InvalidInputError(
+                f"position must lie within {FARTHEST_TARGET} m of the base, where the arm can look at it; got "
+                f"{self.position}, in metres"
+            )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -130,15 +139,22 @@ def load_profile(name_or_file: str) -> Profile:
     path = PROFILES / f"{name_or_file}.toml" if name_or_file in profile_names() else Path(name_or_file)
     try:
         text = path.read_text(encoding="utf-8")
-    except (OSError, UnicodeDecodeError) as error:
+    except (FileNotFoundError, IsADirectoryError) as error:
         raise ProfileError(
             f"no profile {name_or_file!r}: give the path of a TOML file or one of {', '.join(profile_names())}"
         ) from error
+    except (OSError, ValueError) as error:  # A name with a null byte, for one.
+        raise ProfileError(f"the profile {name_or_file!r} cannot be read as text: {error}") from error
     return parse_profile(text, path)
 
 
-def parse_profile(text: str, path: Path) -> Profile:
-    """The profile that a text describes; `path` names it and is where relative paths in it begin.
+def parse_profile(text: str, path: Path, T_flange_camera: Any = None) -> Profile:
+    """The profile that a text describes.
+
+    Args:
+        text: As TOML.
+        path: Names it in messages, and is where relative paths in it begin.
+        T_flange_camera: What was read from the calibration file that it names, as nested lists; None to read that.
 
     Raises:
         ProfileError: Something in it is wrong.
@@ -159,7 +175,10 @@ def parse_profile(text: str, path: Path) -> Profile:
         if not isinstance(driver, str):
             raise ProfileError(f"{where}: {key}.driver is missing; name a driver, such as mock")
         drivers.append(driver)
-    T_flange_camera, calibrated = _calibration(_table(data, "calibration", where), path)
+    calibration = _table(data, "calibration", where)
+    if "file" in calibration and T_flange_camera is not None:
+        calibration = {"T_flange_camera": T_flange_camera}
+    mount, calibrated = _calibration(calibration, path)
 
     def read(key: str, kind: Any) -> Any:
         return parse_table(kind, _table(data, key, where), f"{where}: {key}")
@@ -172,7 +191,7 @@ def parse_profile(text: str, path: Path) -> Profile:
         arm_options=twin if drivers[0] == "mock" else arm,
         camera_driver=drivers[1],
         camera_options=twin if drivers[1] == "mock" else camera,
-        T_flange_camera=T_flange_camera,
+        T_flange_camera=mount,
         calibrated=calibrated,
         perception=read("perception", PerceptionConfig),
         target=read("target", TargetConfig),

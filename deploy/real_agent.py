@@ -13,6 +13,7 @@ from maniskill_tomato.deploy.capture import Capture
 from maniskill_tomato.deploy.errors import NotConnectedError, RefusedError
 from maniskill_tomato.deploy.interface import Float64, Frame, JointMove
 from maniskill_tomato.deploy.picture_fit import depth_in_mm, fit_color, fit_depth
+from maniskill_tomato.deploy.plant_points import PlantPoints
 from maniskill_tomato.deploy.station import Station
 from maniskill_tomato.errors import InvalidInputError
 from maniskill_tomato.robot.d435 import CameraIntrinsics
@@ -46,6 +47,7 @@ class IiwaRealAgent(BaseRealAgent):  # type: ignore[misc]
         super().__init__()
         self.station = station
         self._camera_name = camera_name
+        self._points = PlantPoints(station.profile.T_flange_camera)
         self._capture = Capture(station.camera, station.profile.capture, station.clock)
         self._settled_at = -math.inf
         self._frame: Frame | None = None
@@ -113,6 +115,7 @@ class IiwaRealAgent(BaseRealAgent):  # type: ignore[misc]
             self.station.camera.begin_view()
             self._frame = self._capture.take(self._settled_at)
             self._frame_joints = self.station.guarded_arm.read().joint_positions
+            self._points.add(self._frame, self.camera_pose(self._frame_joints), self._frame_joints)
         return self._frame, self._frame_joints
 
     def capture_sensor_data(self, sensor_names: Sequence[str] | None = None) -> None:
@@ -172,7 +175,7 @@ class IiwaRealAgent(BaseRealAgent):  # type: ignore[misc]
     def _go(self, joints: Float64, frame_stamp: float | None) -> None:
         arm = self.station.guarded_arm
         move = JointMove(joint_positions=joints, speed_fraction=arm.safety.config.speed_fraction)
-        arm.command(move, frame_stamp)
+        arm.command(move, frame_stamp, self._points.points_w)
         self._frame = self._frame_joints = None
         while not arm.wait(0.2):
             pass

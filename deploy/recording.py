@@ -8,6 +8,7 @@ as they were), `/truth` (simulated cameras only), `/log` (`foxglove.Log`).
 import base64
 import json
 import logging
+import struct
 import zlib
 from collections.abc import Iterator
 from contextlib import suppress
@@ -18,7 +19,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from maniskill_tomato.deploy.errors import RecordingError
+from maniskill_tomato.deploy.errors import CutOffError, RecordingError
 from maniskill_tomato.deploy.interface import Frame
 from maniskill_tomato.deploy.steps import Step
 
@@ -170,16 +171,15 @@ def read_messages(path: Path) -> Iterator[tuple[str, dict[str, Any]]]:
     """Topic and content of every message of a recording, in the order in which they were written.
 
     Raises:
+        CutOffError: The file ends early; everything before that was given.
         RecordingError: The file is missing, damaged, or no recording of ours.
     """
     try:
-        from mcap.exceptions import McapError
-        from mcap.reader import make_reader
+        from mcap.exceptions import EndOfFile, McapError
+        from mcap.records import Channel, Message
         from mcap.stream_reader import StreamReader
     except ImportError as error:
         raise RecordingError("recordings need the package mcap: install maniskill-tomato[deploy]") from error
-    del make_reader
-    from mcap.records import Channel, Message
 
     if not path.is_file():
         raise RecordingError(f"no recording at {path}; `deploy run` writes run.mcap into its --out folder")
@@ -194,7 +194,11 @@ def read_messages(path: Path) -> Iterator[tuple[str, dict[str, Any]]]:
                     if not isinstance(content, dict):
                         raise ValueError("a message is no object")
                     yield topics[record.channel_id], content
-        except (McapError, ValueError, KeyError, EOFError, OSError, zlib.error) as error:
+        except (McapError, ValueError, KeyError, EOFError, OSError, struct.error, zlib.error) as error:
+            if isinstance(error, EndOfFile | EOFError | struct.error) and not file.read(1):
+                raise CutOffError(
+                    f"{path} is cut off; `deploy replay` plays the looks that are whole"
+                ) from error
             raise RecordingError(
                 f"{path} is no readable recording ({type(error).__name__}: {error}); it may have been cut off"
             ) from error

@@ -14,7 +14,7 @@ import torch
 
 from maniskill_tomato.deploy.capture import Capture
 from maniskill_tomato.deploy.clock import SimulatedClock
-from maniskill_tomato.deploy.errors import NotConnectedError, RecordingError
+from maniskill_tomato.deploy.errors import CutOffError, NotConnectedError, RecordingError
 from maniskill_tomato.deploy.guarded_arm import GuardedArm
 from maniskill_tomato.deploy.interface import Arm, ArmState, Camera, Float64, Frame, FrameTruth, JointMove
 from maniskill_tomato.deploy.loop import Loop
@@ -52,6 +52,8 @@ class RecordedRun:
     """What was run."""
     profile: Profile
     steps: tuple[RecordedStep, ...]
+    is_cut_off: bool
+    """Whether the file ends early; `steps` are those that are whole."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -80,32 +82,38 @@ class Replay:
 
 
 def load_recording(path: Path) -> RecordedRun:
-    """Reads a recording of `deploy run`.
+    """Reads a recording of `deploy run`; of one that was cut off, the looks that are whole.
 
     Raises:
-        RecordingError: It is missing, damaged or of another kind.
+        RecordingError: It is missing, damaged, of another kind, or holds no whole look.
     """
     info: dict[str, Any] | None = None
     steps: list[RecordedStep] = []
     parts: dict[str, dict[str, Any]] = {}
-    for topic, message in read_messages(path):
-        if topic == "/info":
-            info = message
-        elif topic == "/step":
-            try:
-                steps.append(RecordedStep(frame=_frame(parts, message), facts=message))
-            except (KeyError, TypeError, ValueError) as error:
-                raise RecordingError(f"{path}: look {len(steps)} is incomplete ({error})") from error
-            parts = {}
-        elif topic != "/log":
-            parts[topic] = message
+    is_cut_off = False
+    try:
+        for topic, message in read_messages(path):
+            if topic == "/info":
+                info = message
+            elif topic == "/step":
+                try:
+                    steps.append(RecordedStep(frame=_frame(parts, message), facts=message))
+                except (KeyError, TypeError, ValueError) as error:
+                    raise RecordingError(f"{path}: look {len(steps)} is incomplete ({error})") from error
+                parts = {}
+            elif topic != "/log":
+                parts[topic] = message
+    except CutOffError:
+        is_cut_off = True
     if info is None or info.get("format") != FORMAT:
         raise RecordingError(f"{path} is no recording of `deploy run` ({FORMAT})")
     if not steps:
-        raise RecordingError(f"{path} holds no look; the run ended before its first")
+        why = "it is cut off" if is_cut_off else "the run ended"
+        raise RecordingError(f"{path} holds no look; {why} before its first")
     name = Path(f"{info.get('profile', 'recorded')}.toml")
-    profile = parse_profile(str(info["profile_text"]), path.parent / name)
-    return RecordedRun(info=info, profile=profile, steps=tuple(steps))
+    mount = info.get("T_flange_camera")
+    profile = parse_profile(str(info["profile_text"]), path.parent / name, mount)
+    return RecordedRun(info=info, profile=profile, steps=tuple(steps), is_cut_off=is_cut_off)
 
 
 def replay(recorded: RecordedRun, policy: str | None = None) -> Replay:
@@ -126,9 +134,10 @@ def replay(recorded: RecordedRun, policy: str | None = None) -> Replay:
     arm, camera = _PlayedArm(playback), _PlayedCamera(playback)
     comparison = _Comparison(recorded.steps)
     loop = Loop(
-        arm=GuardedArm(arm, Safety(safety), clock),
+        arm=GuardedArm(arm, Safety(safety, profile.T_flange_camera), clock),
         camera=camera,
-        capture=Capture(camera, profile.capture, clock),
+        # A look's other attempts were not recorded.
+        capture=Capture(camera, replace(profile.capture, attempts=1), clock),
         perception=make_perception(profile),
         policy=open_policy(policy or str(recorded.info["policy"]), int(recorded.info["seed"])),
         T_flange_camera=profile.T_flange_camera,

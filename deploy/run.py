@@ -10,12 +10,12 @@ from typing import Any
 from maniskill_tomato import __version__
 from maniskill_tomato.deploy.clock import Clock
 from maniskill_tomato.deploy.errors import ProfileError, RecordingError
-from maniskill_tomato.deploy.loop import Mode, Proposal
+from maniskill_tomato.deploy.loop_config import Mode, Proposal
 from maniskill_tomato.deploy.policies import default_policy, open_policy
 from maniskill_tomato.deploy.profile import Profile
 from maniskill_tomato.deploy.recording import McapRecorder
 from maniskill_tomato.deploy.run_report import Contact, write_report
-from maniskill_tomato.deploy.station import make_station, stop_file
+from maniskill_tomato.deploy.station import make_station, prepare_folder
 from maniskill_tomato.deploy.steps import Recorder, RunResult, Step
 from maniskill_tomato.deploy.stops import Stops
 
@@ -80,7 +80,7 @@ def run(
         RecordingError: The folder or the recording cannot be begun.
     """
     profile = config.profile
-    name = config.policy or default_policy()
+    name = default_policy() if config.policy is None else config.policy
     policy = open_policy(name, config.seed)
     station = make_station(profile, config.seed, clock)
     mode: Mode = config.mode or ("unattended" if station.simulated else "dry_run")
@@ -101,11 +101,7 @@ def run(
         "simulated": station.simulated,
         "version": __version__,
     }
-    try:
-        config.out.mkdir(parents=True, exist_ok=True)
-        stop_file(profile, config.out).unlink(missing_ok=True)
-    except OSError as error:
-        raise RecordingError(f"cannot use the folder {config.out}: {error.strerror or error}") from error
+    stop_file = prepare_folder(profile, config.out)
     contact = Contact()
     with ExitStack() as stack:
         arm = stack.enter_context(station.arm)
@@ -113,11 +109,12 @@ def run(
         devices = {"arm": arm.describe(), "camera": camera.describe()}
         recorders: list[Recorder] = [contact]
         if config.record:
-            info = {**facts, "profile_text": profile.text, "devices": devices}
+            mount = profile.T_flange_camera.tolist()
+            info = {**facts, "profile_text": profile.text, "T_flange_camera": mount, "devices": devices}
             recorders.append(stack.enter_context(McapRecorder(config.out / RECORDING, info)))
         stops = stack.enter_context(
             Stops(
-                stop_file=stop_file(profile, config.out),
+                stop_file=stop_file,
                 keyboard=keyboard,
                 heartbeat_s=profile.stop.heartbeat,
                 on_lost_heartbeat=station.guarded_arm.stop,

@@ -19,7 +19,7 @@ TILE: Final = (320, 240)
 BAR: Final = 34
 """Height of the caption below it, in [px]."""
 COLUMNS: Final = 5
-INK, PAPER, MARK = (40, 40, 40), (255, 255, 255), (255, 0, 220)
+INK, PAPER, MARK = (40, 40, 40), (255, 255, 255), (0, 230, 255)
 """Text, background, outline of the target; RGB."""
 
 
@@ -72,6 +72,8 @@ def write_report(out: Path, result: RunResult, facts: dict[str, Any], contact: C
     content = {**result.to_json(), **facts, "steps": contact.steps}
     for name in ("seconds", "device_seconds", "visible_fraction", "best_visible_fraction"):
         content[name] = round(content[name], 4)
+    if result.true_visible_fraction is not None:
+        content["true_visible_fraction"] = round(result.true_visible_fraction, 4)
     title = (
         f"{facts.get('profile')}, seed {facts.get('seed')}, {facts.get('policy_name')}: {result.reason}, "
         f"V_f {result.visible_fraction:.2f} after {result.moves} moves"
@@ -92,7 +94,7 @@ def _tile(step: Step) -> NDArray[np.uint8]:
     small: Any = cv2.resize(color, size, interpolation=cv2.INTER_AREA)
     mask: Any = cv2.resize(step.view.mask.astype(np.uint8), size, interpolation=cv2.INTER_NEAREST)
     outlines, _ = cv2.findContours(mask, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
-    cv2.drawContours(small, outlines, -1, MARK, 1)
+    cv2.drawContours(small, outlines, -1, MARK, 2)
     centre = step.T_world_camera[:3, :3].T @ (step.target_position - step.T_world_camera[:3, 3])
     if centre[2] > 0.0:
         i = step.frame.intrinsics

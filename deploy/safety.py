@@ -58,8 +58,20 @@ class Refusal:
 class Safety:
     """The checks of one envelope."""
 
-    def __init__(self, config: SafetyConfig | None = None) -> None:
+    def __init__(
+        self,
+        config: SafetyConfig | None = None,
+        T_flange_camera: Float64 = T_flange_camera_color_optical,
+    ) -> None:
+        """Prepares the checks.
+
+        Args:
+            config: The envelope; the usual one if None.
+            T_flange_camera: Where the camera's optical frame was measured to be in `link_ee`; its housing goes with
+                it. Shape (4, 4).
+        """
         self.config = config or SafetyConfig()
+        self._T_flange_camera = T_flange_camera
         c = self.config
         self._collisions = CollisionChecker(
             table_height=c.table_height,
@@ -67,6 +79,7 @@ class Safety:
             self_clearance=c.self_clearance,
             obstacles=c.obstacles,
             obstacle_clearance=c.obstacle_clearance,
+            T_flange_camera=T_flange_camera,
         )
 
     def check(
@@ -150,7 +163,7 @@ class Safety:
         c = self.config
         T_w_flange = forward_kinematics(torch.as_tensor(path)).numpy()
         flange = T_w_flange[:, :3, 3]
-        camera = flange + T_w_flange[:, :3, :3] @ T_flange_camera_color_optical[:3, 3]
+        camera = flange + T_w_flange[:, :3, :3] @ self._T_flange_camera[:3, 3]
         # The start is where the arm is already: a move may lead out of a wrong place, not into it.
         outside = ~_within(flange[1:], c.workspace)
         if outside.any():
@@ -196,7 +209,7 @@ class Safety:
         c = self.config
         if c.plant_clearance is None or points_w is None or len(points_w) < c.plant_points_needed:
             return None
-        distances = sphere_distances(path, points_w)
+        distances = sphere_distances(path, points_w, self._T_flange_camera)
         # Where the arm is near a leaf already, it may go away from it but not nearer.
         near = (distances[1:] < c.plant_clearance) & (distances[1:] < distances[0] - 1e-3)
         touched = near.any(axis=0)

@@ -10,11 +10,12 @@ import numpy as np
 from maniskill_tomato.deploy.capture import Capture
 from maniskill_tomato.deploy.clock import CheckedClock, Clock, MonotonicClock, SimulatedClock
 from maniskill_tomato.deploy.drivers import DriverContext, make_arm, make_camera
-from maniskill_tomato.deploy.errors import ProfileError
+from maniskill_tomato.deploy.errors import ProfileError, RecordingError
 from maniskill_tomato.deploy.fruits import open_finder
 from maniskill_tomato.deploy.guarded_arm import GuardedArm
 from maniskill_tomato.deploy.interface import Arm, Camera, Float64
-from maniskill_tomato.deploy.loop import Loop, Mode, Proposal
+from maniskill_tomato.deploy.loop import Loop
+from maniskill_tomato.deploy.loop_config import Mode, Proposal
 from maniskill_tomato.deploy.perceive import ImagePerception, Perception, TruthPerception
 from maniskill_tomato.deploy.profile import Profile
 from maniskill_tomato.deploy.safety import Safety
@@ -109,7 +110,8 @@ def make_station(profile: Profile, seed: int = 0, clock: Clock | None = None) ->
         ProfileError: A driver or an option is wrong.
     """
     if clock is None:
-        twin = profile.arm_driver == "mock" and not profile.arm_options.get("real_time", False)
+        drivers = {profile.arm_driver, profile.camera_driver}
+        twin = drivers == {"mock"} and not profile.arm_options.get("real_time", False)
         clock = SimulatedClock(TWIN_START) if twin else MonotonicClock()
     checked = CheckedClock(clock)
     context = DriverContext(clock=checked, seed=seed)
@@ -122,11 +124,23 @@ def make_station(profile: Profile, seed: int = 0, clock: Clock | None = None) ->
         clock=checked,
         arm=arm,
         camera=camera,
-        guarded_arm=GuardedArm(arm, Safety(profile.safety), checked),
+        guarded_arm=GuardedArm(arm, Safety(profile.safety, profile.T_flange_camera), checked),
         perception=make_perception(profile),
     )
 
 
-def stop_file(profile: Profile, out: Path) -> Path:
-    """The file whose appearance stops a run with the output folder `out`."""
-    return out / profile.stop.file
+def prepare_folder(profile: Profile, out: Path) -> Path:
+    """Makes an output folder; the file in it whose appearance stops the run, which an earlier run may have left.
+
+    Raises:
+        RecordingError: It cannot be made or written to.
+    """
+    stop_file = out / profile.stop.file
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+        stop_file.unlink(missing_ok=True)
+    except OSError as error:
+        raise RecordingError(
+            f"cannot use the folder {out}: {error.strerror or error}; choose another --out"
+        ) from error
+    return stop_file

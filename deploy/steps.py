@@ -23,7 +23,7 @@ class Step:
     """In [m]. Shape (3,)."""
     moves_left: int
     action: tuple[float, float, float] | None = None
-    """Right, up, forward; None where the run ended with this look."""
+    """Right, up, forward; None where the run ended with this look, or went back because it had no depth."""
     commanded: Float64 | None = None
     """Joint positions that went out, in [rad]; None if none did. Shape (7,)."""
     outcome: str = ""
@@ -54,6 +54,8 @@ class RunResult:
     """V_f of the last look."""
     best_visible_fraction: float
     """Of all looks."""
+    true_visible_fraction: float | None
+    """V_f of the last look by ray casting; None where the camera is real."""
     visible_fractions: tuple[float, ...]
     """Of each look."""
     seconds: float
@@ -88,3 +90,17 @@ class Recorder(Protocol):
             RecordingError: It cannot.
         """
         ...
+
+
+class KeptSteps:
+    """A recorder that keeps the steps in memory, for programs that look at them afterwards."""
+
+    def __init__(self) -> None:
+        self.steps: list[Step] = []
+        self.events: list[str] = []
+
+    def step(self, step: Step) -> None:
+        self.steps.append(step)
+
+    def event(self, stamp: float, text: str) -> None:
+        self.events.append(text)

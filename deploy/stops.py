@@ -5,7 +5,8 @@ import signal
 import sys
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from types import FrameType, TracebackType
 from typing import Any, Self
@@ -39,6 +40,7 @@ class Stops:
         self._on_lost = on_lost_heartbeat
         self._reason: str | None = None
         self._last_beat = time.monotonic()
+        self._waiting = False
         self._ended = threading.Event()
         self._handlers: dict[signal.Signals, Any] = {}
 
@@ -75,6 +77,16 @@ class Stops:
                 self.request("key")
         return self._reason
 
+    @contextmanager
+    def waiting_for_a_person(self) -> Iterator[None]:
+        """While inside, nobody expects a beat: people take their time."""
+        self._waiting = True
+        try:
+            yield
+        finally:
+            self._last_beat = time.monotonic()
+            self._waiting = False
+
     @property
     def reason(self) -> str | None:
         """Why to stop, without a beat."""
@@ -85,7 +97,7 @@ class Stops:
 
     def _watch_heartbeat(self) -> None:
         while not self._ended.wait(min(1.0, self._heartbeat_s / 4)):
-            if time.monotonic() - self._last_beat > self._heartbeat_s:
+            if not self._waiting and time.monotonic() - self._last_beat > self._heartbeat_s:
                 self.request("heartbeat")
                 if self._on_lost is not None:
                     self._on_lost()

@@ -40,11 +40,13 @@ from maniskill_tomato.deploy.calibration.view_folder import (
     write_views,
 )
 from maniskill_tomato.deploy.clock import SimulatedClock
+from maniskill_tomato.deploy.errors import StoppedError
 from maniskill_tomato.deploy.guarded_arm import GuardedArm
 from maniskill_tomato.deploy.interface import Arm, ArmState, Camera, Float64, Frame, JointMove
 from maniskill_tomato.deploy.profile import parse_profile
 from maniskill_tomato.deploy.safety import Safety
 from maniskill_tomato.deploy.safety_config import SafetyConfig
+from maniskill_tomato.deploy.stops import Stops
 from maniskill_tomato.errors import InvalidInputError
 from maniskill_tomato.robot import d435
 from maniskill_tomato.robot.d435 import CameraIntrinsics
@@ -504,6 +506,36 @@ def test_nothing_moves_when_the_operator_says_no_or_the_board_is_not_seen(
     with pytest.raises(CalibrationError, match="not in the picture"):
         capture_views(guarded, BoardCamera(arm), other, tmp_path, clock, lambda question: True)
     assert arm.moves == []
+
+
+def test_a_stop_ends_the_taking_of_views_and_keeps_those_taken(tmp_path: Path) -> None:
+    clock = SimulatedClock()
+    arm = StillArm(clock)
+    guarded = GuardedArm(arm, Safety(SafetyConfig()), clock)
+    folder, file = tmp_path / "views", tmp_path / "STOP"
+
+    def confirm(question: str) -> bool:
+        if len(arm.moves) == 2:
+            file.touch()
+        return True
+
+    with pytest.raises(StoppedError, match=r"stop file .*STOP\) after 3 views; the arm holds its position"):
+        capture_views(guarded, BoardCamera(arm), BOARD, folder, clock, confirm, stops=Stops(stop_file=file))
+    assert len(arm.moves) == 2, "the stop outweighs the yes"
+    assert len(read_views(folder)[0]) == 3
+    # While the arm moves, too: it never arrives here.
+    moving = StillArm(clock)
+    stops = Stops()
+
+    def wait(timeout_s: float) -> bool:
+        stops.request("SIGTERM")
+        return False
+
+    moving.wait = wait  # type: ignore[method-assign]
+    guarded = GuardedArm(moving, Safety(SafetyConfig()), clock)
+    with pytest.raises(StoppedError, match="SIGTERM"):
+        capture_views(guarded, BoardCamera(moving), BOARD, tmp_path / "b", clock, lambda q: True, stops=stops)
+    assert len(moving.moves) == 1
 
 
 def test_capture_poses_look_at_the_middle_of_the_board_from_its_front() -> None:

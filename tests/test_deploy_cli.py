@@ -11,6 +11,7 @@ from pathlib import Path
 import pytest
 
 from maniskill_tomato.cli import main, parse
+from maniskill_tomato.deploy.stops import Stops
 
 BLOCKED = """
 import sys
@@ -74,6 +75,23 @@ def test_sigterm_ends_a_run_in_a_defined_state(tmp_path: Path) -> None:
     assert "holds its position" in content["end_state"]
 
 
+def test_ctrl_c_while_views_of_a_calibration_are_taken_ends_it_with_its_status(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    listen = Stops.__enter__
+
+    def listen_and_press(self: Stops) -> Stops:
+        listen(self)
+        os.kill(os.getpid(), signal.SIGINT)
+        return self
+
+    monkeypatch.setattr(Stops, "__enter__", listen_and_press)
+    with pytest.raises(SystemExit) as end:
+        main(["deploy", "calibrate", "--profile", "mock", "--unattended", "--out", str(tmp_path)])
+    assert end.value.code == 128 + signal.SIGINT
+    assert "stopped (SIGINT) after 0 views; the arm holds its position" in capsys.readouterr().out
+
+
 def test_a_fault_has_its_own_exit_status(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     profile = tmp_path / "broken.toml"
     profile.write_text(
@@ -93,11 +111,16 @@ def test_a_fault_has_its_own_exit_status(tmp_path: Path, capsys: pytest.CaptureF
     ("arguments", "words"),
     [
         (["run", "--profile", "nothing"], "give the path of a TOML file or one of"),
-        (["run", "--policy", "missing.pt"], "no policy at missing.pt"),
+        (["run", "--policy", "missing.pt"], "no policy at 'missing.pt'"),
+        (["run", "--policy", ""], "no policy at ''"),
         (["run", "--policy", "oracle"], "in simulation only"),
         (["run", "--confirm", "--unattended"], "not several"),
         (["run", "--seed", "-1"], "the seed must be 0 or more"),
         (["run", "--out", "/dev/null/x"], "cannot use the folder"),
+        (["calibrate", "--profile", "mock", "--out", "/dev/null/x"], "cannot use the folder"),
+        (["calibrate", "--views", "missing"], "no views.json in missing"),
+        (["profiles", "--show", "missing"], "no profile 'missing'"),
+        (["replay", "/dev/null"], "no recording at /dev/null"),
         (["replay", "missing.mcap"], "no recording at missing.mcap"),
     ],
 )

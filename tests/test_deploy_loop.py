@@ -17,16 +17,20 @@ from maniskill_tomato.deploy.clock import SimulatedClock
 from maniskill_tomato.deploy.errors import ProfileError
 from maniskill_tomato.deploy.fruits import TruthFinder
 from maniskill_tomato.deploy.guarded_arm import GuardedArm
-from maniskill_tomato.deploy.interface import Frame
-from maniskill_tomato.deploy.loop import Loop, Proposal
+from maniskill_tomato.deploy.interface import Frame, JointMove
+from maniskill_tomato.deploy.loop import Loop
+from maniskill_tomato.deploy.loop_config import Proposal
+from maniskill_tomato.deploy.mock.episode import load_episode
 from maniskill_tomato.deploy.perceive import ImagePerception, View
 from maniskill_tomato.deploy.policies import default_policy, open_policy
 from maniskill_tomato.deploy.profile import Profile, load_profile, parse_profile, profile_names
 from maniskill_tomato.deploy.station import Station, make_station
-from maniskill_tomato.deploy.steps import RunResult
+from maniskill_tomato.deploy.steps import KeptSteps, RunResult
 from maniskill_tomato.deploy.stops import Stops
 from maniskill_tomato.errors import PolicyError
 from maniskill_tomato.planners.base import Planner
+from maniskill_tomato.robot.d435 import T_flange_camera_color_optical
+from maniskill_tomato.robot.kinematics import forward_kinematics
 from maniskill_tomato.visibility.situation import Situation
 
 EPISODE = 9
@@ -69,9 +73,14 @@ class Towards(Planner):
 
 
 def go(
-    of: Profile, policy: Planner | None = None, clock: Any = None, stops: Stops | None = None, **options: Any
+    of: Profile,
+    policy: Planner | None = None,
+    clock: Any = None,
+    stops: Stops | None = None,
+    seed: int = EPISODE,
+    **options: Any,
 ) -> tuple[RunResult, Station]:
-    station = make_station(of, EPISODE, clock)
+    station = make_station(of, seed, clock)
     options.setdefault("mode", "unattended")
     clock_works = not isinstance(clock, JumpingClock)
     with station.arm, station.camera, stops or Stops() as listening:
@@ -84,7 +93,7 @@ def go(
 
 
 def test_a_planner_finds_the_tomato_and_the_run_ends_with_success() -> None:
-    result, _ = go(profile(loop="threshold = 0.8"), open_policy("nbv"))
+    result, _ = go(profile(loop="threshold = 0.8"), open_policy("nbv"), seed=6)
     assert result.success and result.reason == "success" and not result.is_fault
     assert result.visible_fraction > 0.8 >= max(result.visible_fractions[:-1])
     assert result.moves == len(result.visible_fractions) - 1
@@ -104,7 +113,6 @@ def test_a_view_that_never_gets_better_ends_with_the_budget() -> None:
         ("frozen", "stale"),
         ("late", "stale"),
         ("black", "bad_picture"),
-        ("zero_depth", "bad_picture"),
         ("wrong_size", "bad_picture"),
         ("silent", "timeout"),
     ],
@@ -112,6 +120,21 @@ def test_a_view_that_never_gets_better_ends_with_the_budget() -> None:
 def test_a_camera_that_fails_ends_the_run_before_the_next_move(fault: str, reason: str) -> None:
     result, _ = go(profile(f'faults = {{ camera = "{fault}", camera_from_read = 2 }}'))
     assert (result.reason, result.is_fault, result.moves) == (reason, True, 2), result.detail
+
+
+def test_without_depth_the_arm_goes_back_once_and_no_farther() -> None:
+    """A leaf may cover the lens; a camera that gives no depth where it gave some before is broken."""
+    faults = 'faults = { camera = "zero_depth", camera_from_read = 2%s }'
+    kept = KeptSteps()
+    broken, station = go(profile(faults % ""), recorder=kept)
+    assert (broken.reason, broken.is_fault, broken.moves) == ("bad_picture", True, 3), broken.detail
+    assert [step.outcome for step in kept.steps] == ["moved"] * 3 and kept.steps[2].action is None
+    arm: Any = station.arm
+    np.testing.assert_allclose(arm._world.arm.joint_positions, kept.steps[1].joint_positions, atol=1e-6)
+    # Three attempts at one view fail, then there is depth again: the run goes on from the view before.
+    covered, _ = go(profile(faults % ", camera_reads = 3", "threshold = 0.99"))
+    assert not covered.is_fault and covered.moves == 6
+    assert covered.visible_fractions[1] == covered.visible_fractions[3]
 
 
 @pytest.mark.parametrize("fault", ["late", "black", "zero_depth", "wrong_size", "silent"])
@@ -176,6 +199,13 @@ class Swapped(TruthFinder):
         return found[self.looks % len(found) :] + found[: self.looks % len(found)] if found else found
 
 
+class Withheld(TruthFinder):
+    """A segmenter that never finds the target, only its neighbours."""
+
+    def find(self, frame: Any) -> Any:
+        return [fruit for fruit in super().find(frame) if fruit.visible_fraction is None]
+
+
 def with_perception(of: Profile, perception: Any, policy: Planner) -> RunResult:
     station = replace(make_station(of, EPISODE), perception=perception)
     with station.arm, station.camera, Stops() as stops:
@@ -192,6 +222,20 @@ def test_fruits_that_change_places_in_the_list_change_nothing() -> None:
     swapped = with_perception(profile(), ImagePerception(Swapped()), open_policy("nbv"))
     assert swapped.visible_fractions == plain.visible_fractions
     assert swapped.reason == plain.reason
+
+
+@pytest.mark.parametrize("seed", [7, 9])
+def test_a_neighbour_does_not_pass_for_a_target_that_is_not_found(seed: int) -> None:
+    """Fruits of one truss, and the segmenter never finds the one that is looked for: no success on another one."""
+    of = profile(loop="").text.replace("max_moves = 6", "max_moves = 11")
+    station = make_station(parse_profile(of, Path("longer.toml")), seed)
+    station = replace(station, perception=ImagePerception(Withheld()))
+    kept = KeptSteps()
+    with station.arm, station.camera, Stops() as stops:
+        result = station.loop(open_policy(default_policy()), stops, "unattended", kept).run()
+    assert not result.success and not result.is_fault
+    assert max(step.view.fruits_seen for step in kept.steps) > 1
+    assert result.best_visible_fraction < 0.3, "a sliver at most, where a fruit can hardly be located"
 
 
 def test_without_a_given_target_the_largest_fruit_in_the_picture_is_taken() -> None:
@@ -299,6 +343,25 @@ def test_a_loop_that_stands_still_loses_its_heartbeat_and_stops_the_arm() -> Non
     assert len(stopped) == 1
 
 
+def test_people_may_take_longer_than_the_heartbeat_to_confirm_and_can_stop_instead() -> None:
+    def slowly(proposal: Proposal) -> bool:
+        time.sleep(1.0)
+        return proposal.number == 0
+
+    stops = Stops(heartbeat_s=0.6)
+    result, _ = go(profile(), stops=stops, mode="confirm", confirm=slowly)
+    assert (result.reason, result.moves) == ("declined", 2)
+    stops = Stops()
+
+    def stopping(proposal: Proposal) -> bool:
+        stops.request("SIGINT")
+        return True
+
+    result, station = go(profile(), stops=stops, mode="confirm", confirm=stopping)
+    arm: Any = station.arm
+    assert result.reason == "stopped" and arm._commands == 0, "a yes does not outweigh a stop"
+
+
 def test_a_dry_run_shows_the_first_move_and_sends_nothing() -> None:
     result, station = go(profile(), mode="dry_run")
     assert (result.reason, result.is_fault) == ("dry_run", False)
@@ -335,10 +398,12 @@ def test_every_shipped_profile_can_be_read_and_errors_name_the_key(tmp_path: Pat
         ("[wheels]\n", "wheels is unknown"),
         ("[calibration]\nT_flange_camera = [[1, 2], [3, 4]]", "calibration.T_flange_camera must be a 4 x 4"),
         ("[calibration]\nfile = 'none.json'", "deploy calibrate"),
+        ("[target]\nsource = 'given'\nposition = [500.0, 0.0, 900.0]", "within 1.6 m of the base"),
         ("[capture]\nattempts = 1.5", "capture.attempts must be a whole number"),
     ):
         with pytest.raises(ProfileError) as error:
-            profile(more=wrong)
+            text = TEXT.replace('[target]\nsource = "twin"\n', "") if "[target]" in wrong else TEXT
+            parse_profile(text.format(twin="", loop="") + wrong, Path("test.toml"))
         assert words in str(error.value)
     with pytest.raises(ProfileError, match=r"arm\.driver is missing"):
         parse_profile("[camera]\ndriver = 'mock'", Path("x.toml"))
@@ -346,6 +411,30 @@ def test_every_shipped_profile_can_be_read_and_errors_name_the_key(tmp_path: Pat
         parse_profile("[arm", Path("x.toml"))
     with pytest.raises(ProfileError, match="give the path of a TOML file or one of"):
         load_profile("nothing")
+    (tmp_path / "binary.toml").write_bytes(b"\xff\xfe\x00")
+    with pytest.raises(ProfileError, match="cannot be read as text"):
+        load_profile(str(tmp_path / "binary.toml"))
+
+
+def test_safety_has_the_camera_where_the_profile_says_that_it_was_measured() -> None:
+    """A wall at the lens of a camera that sits 60 mm farther out than in the drawings."""
+    mount = np.array(T_flange_camera_color_optical)
+    mount[2, 3] += 0.06
+    start = load_episode("held_out", EPISODE).start_joints
+    lens = (forward_kinematics(torch.as_tensor(start[None]))[0].numpy() @ mount)[:3, 3]
+    wall = (
+        f"[safety]\nobstacles = [{{ low = {(lens - 0.005).tolist()}, high = {(lens + 0.005).tolist()} }}]\n"
+        "obstacle_clearance = 0.01\n"
+    )
+    stay = JointMove(joint_positions=start, speed_fraction=0.1)
+    for calibration, reason in (
+        ("", None),
+        (f"[calibration]\nT_flange_camera = {mount.tolist()}\n", "obstacle"),
+    ):
+        station = make_station(profile(more=wall + calibration), EPISODE)
+        with station.arm:
+            refusal = station.guarded_arm.safety.check(stay, station.guarded_arm.read(), station.clock.now())
+        assert (refusal.reason if refusal else None) == reason
 
 
 def test_only_the_guarded_arm_commands_an_arm() -> None:

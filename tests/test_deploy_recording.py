@@ -9,13 +9,15 @@ import cv2
 import numpy as np
 import pytest
 
+from maniskill_tomato.cli import main
 from maniskill_tomato.deploy.errors import RecordingError
 from maniskill_tomato.deploy.interface import Frame
-from maniskill_tomato.deploy.profile import Profile, parse_profile
+from maniskill_tomato.deploy.profile import Profile, load_profile, parse_profile
 from maniskill_tomato.deploy.recording import McapRecorder, decode_depth, encode_depth, read_messages
 from maniskill_tomato.deploy.replay import load_recording, replay
 from maniskill_tomato.deploy.run import RunConfig, run
 from maniskill_tomato.deploy.steps import RunResult
+from maniskill_tomato.robot.d435 import T_flange_camera_color_optical
 
 TEXT = """
 [arm]
@@ -136,12 +138,56 @@ def test_a_disk_that_is_full_from_the_start_is_told_before_anything_moves() -> N
         McapRecorder(Path("/dev/full"), {})
 
 
+def test_a_recording_that_was_cut_off_is_replayed_as_far_as_it_is_whole(
+    tmp_path: Path, finished: tuple[Path, RunResult], capsys: pytest.CaptureFixture[str]
+) -> None:
+    """As a full disk or a lost supply leaves it, at many places: looks are whole or not there, and none differs."""
+    content = (finished[0] / "run.mcap").read_bytes()
+    whole = len(finished[1].visible_fractions)
+    found = set()
+    for share in np.linspace(0.05, 0.999, 24):
+        cut = tmp_path / "cut.mcap"
+        cut.write_bytes(content[: int(share * len(content))])
+        try:
+            recorded = load_recording(cut)
+        except RecordingError as error:
+            assert "it is cut off before its first" in str(error) or "no recording of" in str(error)
+            found.add(0)
+            continue
+        assert recorded.is_cut_off or share > 0.9
+        assert len(recorded.steps) <= whole
+        if len(recorded.steps) not in found:
+            assert replay(recorded).differences == ()
+        found.add(len(recorded.steps))
+    assert {1, whole} <= found and min(found) == 0
+    cut.write_bytes(content[: int(0.6 * len(content))])
+    main(["deploy", "replay", str(cut)])
+    lines = capsys.readouterr().out.splitlines()
+    assert lines[0].startswith("the recording is cut off; its first ") and lines[1].startswith(
+        "the same in all"
+    )
+    assert not load_recording(finished[0] / "run.mcap").is_cut_off
+
+
+def test_a_recording_is_replayed_without_the_calibration_file_of_its_run(tmp_path: Path) -> None:
+    mount = np.array(T_flange_camera_color_optical)
+    mount[:3, 3] += [0.004, -0.003, 0.002]
+    (tmp_path / "calibration.json").write_text(json.dumps({"T_flange_camera": mount.tolist()}))
+    (tmp_path / "lab.toml").write_text(TEXT + '[calibration]\nfile = "calibration.json"\n')
+    out = tmp_path / "elsewhere" / "out"
+    run(RunConfig(profile=load_profile(str(tmp_path / "lab.toml")), out=out, policy="nbv", seed=9))
+    (tmp_path / "calibration.json").unlink()
+    recorded = load_recording(out / "run.mcap")
+    np.testing.assert_array_equal(recorded.profile.T_flange_camera, mount)
+    assert replay(recorded).differences == ()
+
+
 def test_damaged_and_foreign_files_are_errors_not_tracebacks(
     tmp_path: Path, finished: tuple[Path, RunResult]
 ) -> None:
     content = (finished[0] / "run.mcap").read_bytes()
     cut = tmp_path / "cut.mcap"
-    cut.write_bytes(content[: len(content) // 2])
+    cut.write_bytes(content[:2000])
     noise = tmp_path / "noise.mcap"
     noise.write_bytes(b"not a recording at all" * 10)
     flipped = tmp_path / "flipped.mcap"

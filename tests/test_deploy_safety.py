@@ -18,6 +18,7 @@ from maniskill_tomato.deploy.plant_points import sphere_distances
 from maniskill_tomato.deploy.safety import Safety, joint_path
 from maniskill_tomato.deploy.safety_config import Box, SafetyConfig
 from maniskill_tomato.errors import InvalidInputError
+from maniskill_tomato.robot.d435 import T_flange_camera_color_optical
 from maniskill_tomato.robot.description import urdf_path
 from maniskill_tomato.robot.iiwa14 import JOINT_AXES, JOINT_ORIGINS, JOINT_UPPER, READY_QPOS
 from maniskill_tomato.robot.kinematics import forward_kinematics
@@ -147,6 +148,37 @@ def test_the_plant_that_was_seen_is_kept_clear_of(safety: Safety) -> None:
     # Out of the leaves it may go: the same points at the start, and the move leads away.
     inside = turned(j1=0.15)
     assert safety.check(move(turned(j1=-0.2)), state(inside), 10.0, points_w=cluster) is None
+
+
+def test_the_camera_is_where_the_calibration_puts_it() -> None:
+    """A camera 60 mm farther out and turned by 90 degrees: zone, collision shape and spheres go with it."""
+    mount = np.array(T_flange_camera_color_optical)
+    mount[:3, :3] = mount[:3, :3] @ np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
+    mount[:3, 3] += [0.0, 0.0, 0.06]
+    goal = turned(j1=0.2)
+    T = forward_kinematics(torch.as_tensor(goal[None]))[0].numpy() @ mount
+    lens = T[:3, 3]
+    zone = Box(low=tuple(lens - 0.01), high=tuple(lens + 0.01))
+    config = SafetyConfig(forbidden=(zone,))
+    assert Safety(config).check(move(goal), state(), 10.0) is None
+    refusal = Safety(config, mount).check(move(goal), state(), 10.0)
+    assert refusal is not None and refusal.reason == "forbidden_zone" and "camera" in refusal.detail
+    # A wall 10 mm before the glass: only the moved housing reaches it.
+    ahead = lens + 0.03 * T[:3, 2]
+    wall = SafetyConfig(
+        obstacles=(Box(low=tuple(ahead - 0.01), high=tuple(ahead + 0.01)),), obstacle_clearance=0.02
+    )
+    assert Safety(wall).check(move(goal), state(), 10.0) is None
+    refusal = Safety(wall, mount).check(move(goal), state(), 10.0)
+    assert refusal is not None and refusal.reason == "obstacle" and "camera_link" in refusal.detail
+    # The bar is 90 mm long, its middle 32.5 mm right of the colour lens; the spheres hold both ends where it is now.
+    ends = np.array(
+        [lens + share * T[:3, 0] - 0.008 * T[:3, 2] for share in (0.0325 - 0.044, 0.0325 + 0.044)]
+    )
+    assert (sphere_distances(goal[None], ends, mount)[0] < 0.0).all()
+    assert (sphere_distances(goal[None], ends)[0] > 0.0).all()
+    refusal = Safety(None, mount).check(move(goal), state(), 10.0, points_w=np.repeat(lens[None], 20, axis=0))
+    assert refusal is not None and refusal.reason == "plant"
 
 
 def test_sphere_distances_never_exceed_those_of_mujocos_shapes() -> None:

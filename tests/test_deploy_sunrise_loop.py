@@ -12,7 +12,8 @@ from maniskill_tomato.deploy.clock import MonotonicClock
 from maniskill_tomato.deploy.drivers import DriverContext, make_arm, make_camera
 from maniskill_tomato.deploy.guarded_arm import GuardedArm
 from maniskill_tomato.deploy.interface import Float64
-from maniskill_tomato.deploy.loop import Loop, LoopConfig
+from maniskill_tomato.deploy.loop import Loop
+from maniskill_tomato.deploy.loop_config import LoopConfig
 from maniskill_tomato.deploy.mock.episode import load_episode
 from maniskill_tomato.deploy.mock.options import twin_options, twin_world
 from maniskill_tomato.deploy.perceive import TruthPerception
@@ -49,12 +50,14 @@ class CarriedBy:
         pass
 
 
-def run(faults: Sequence[Fault] = (), moves: int = 2) -> tuple[RunResult, LoopbackController]:
+def run(
+    faults: Sequence[Fault] = (), moves: int = 2, speedup: float = 5.0
+) -> tuple[RunResult, LoopbackController]:
     clock = MonotonicClock()
     context = DriverContext(clock=clock, seed=SEED)
     start = load_episode("held_out", SEED).start_joints
     with LoopbackController(
-        qpos=start.tolist(), speedup=5.0, media_flange_m=0.026, faults=faults
+        qpos=start.tolist(), speedup=speedup, media_flange_m=0.026, faults=faults
     ) as controller:
         host, port = controller.address
         options: dict[str, Any] = {"host": host, "port": port, "flange_xyz": [0.0, 0.0, 0.026]}
@@ -101,12 +104,43 @@ def test_the_loop_moves_the_arm_over_the_socket_through_safety_and_guarded_moves
         (Fault(kind="drop", command="doPTP", seconds=0.05), "not_connected", "emergency stop"),
         (Fault(kind="jump", command="getJointsPositions", count=3, radians=0.5), "fault", "turned by"),
         (Fault(kind="contact", command="doPTP"), "fault", "touched something"),
+        (Fault(kind="silent", command="doPTP"), "timeout", "emergency stop"),
+        (Fault(kind="slow", command="getJointsPositions", count=4, seconds=4.0), "timeout", "answer"),
+        (Fault(kind="garbage", command="getJointsPositions", count=4), "protocol", ""),
+        (Fault(kind="partial", command="getJointsPositions", count=4), "timeout", ""),
+        (Fault(kind="nan", command="getJointsPositions", count=4), "protocol", ""),
+        (Fault(kind="nak", command="doPTP", count=2), "fault", "nak"),
     ],
 )
 def test_a_fault_of_the_controller_ends_the_run_with_its_reason(fault: Fault, reason: str, word: str) -> None:
     began = time.monotonic()
     result, controller = run([fault], moves=3)
-    assert result.is_fault and result.reason == reason and word in result.detail
+    assert result.is_fault and result.reason == reason and word in result.detail, result.detail
+    if reason != "fault":
+        # What is said about the arm agrees with whether a move was sent that nobody saw the end of.
+        assert ("emergency stop" in result.detail) == ("may still be under way" in result.end_state)
     before = len([line for line in controller.received if line.startswith("doPTP")])
     assert before <= 2
     assert time.monotonic() - began < 120.0
+
+
+@pytest.mark.parametrize(
+    ("kind", "reason"),
+    [
+        ("silent", "timeout"),
+        ("slow", "timeout"),
+        ("garbage", "protocol"),
+        ("partial", "timeout"),
+        ("nan", "protocol"),
+    ],
+)
+def test_after_a_connection_lost_in_a_move_nobody_claims_that_the_arm_stands(kind: Any, reason: str) -> None:
+    """The seventh reading of the joints falls into the first move."""
+    fault = Fault(kind=kind, command="getJointsPositions", count=7, seconds=4.0)
+    result, controller = run([fault], moves=3, speedup=0.5)
+    assert (result.is_fault, result.reason) == (True, reason), result.detail
+    assert "The arm may be in a move, which goes on" in result.detail and "emergency stop" in result.detail
+    assert (
+        result.end_state.startswith("a move may still be under way") and "emergency stop" in result.end_state
+    )
+    assert len([line for line in controller.received if line.startswith("doPTP")]) == 1

@@ -19,8 +19,10 @@ from maniskill_tomato.deploy.calibration.hand_eye import (
 from maniskill_tomato.deploy.calibration.rigid import inverse, rotation_from_vector, transform
 from maniskill_tomato.deploy.calibration.view_folder import RecordedView, board_view, flange_pose, write_views
 from maniskill_tomato.deploy.clock import Clock
+from maniskill_tomato.deploy.errors import StoppedError
 from maniskill_tomato.deploy.guarded_arm import GuardedArm
 from maniskill_tomato.deploy.interface import ArmState, Camera, Float64, JointMove
+from maniskill_tomato.deploy.stops import Stops
 from maniskill_tomato.errors import InvalidInputError
 from maniskill_tomato.robot.d435 import T_flange_camera_color_optical
 from maniskill_tomato.robot.inverse_kinematics import InverseKinematics, Reach
@@ -109,6 +111,7 @@ def capture_views(
     plan: CapturePlan | None = None,
     T_flange_camera: Float64 = T_flange_camera_color_optical,
     serial: str = "",
+    stops: Stops | None = None,
 ) -> list[RecordedView]:
     """Moves the arm round the board and takes pictures, which it writes as they come.
 
@@ -122,19 +125,29 @@ def capture_views(
         plan: From where to look.
         T_flange_camera: A first guess of what is looked for. Shape (4, 4).
         serial: Of the camera.
+        stops: Asked before and during every move.
 
     Returns:
         The views in which the board was found.
 
     Raises:
         CalibrationError: The board is not in the first picture.
+        StoppedError: Somebody asked to stop; what was taken so far is written.
         DeployError: A device fails; what was taken so far is written.
     """
-    plan = plan or CapturePlan()
+    plan, stops = plan or CapturePlan(), stops or Stops()
     kinematics = InverseKinematics()
     views: list[RecordedView] = []
 
+    def check_stops() -> None:
+        reason = stops.beat()
+        if reason is not None:
+            halted = arm.stop()
+            state = "the arm holds its position" if halted else "a move under way goes on to its end"
+            raise StoppedError(f"stopped ({reason}) after {len(views)} views; {state}")
+
     def look() -> BoardView | None:
+        check_stops()
         clock.sleep(plan.settle_s)
         camera.begin_view()
         frame = camera.read(after=clock.now())
@@ -170,13 +183,16 @@ def capture_views(
             break
         at_start = going_back
         what = "back to the start" if going_back else f"view {len(views) + 1} of {plan.views}"
-        if not confirm(f"{what}: {_in_words(move, state)}"):
+        with stops.waiting_for_a_person():
+            confirmed = confirm(f"{what}: {_in_words(move, state)}")
+        check_stops()
+        if not confirmed:
             if going_back:
                 break
             continue
         arm.command(move)
         while not arm.wait(0.2):
-            pass
+            check_stops()
         if not going_back and look() is None:
             logger.info("the board is not in this picture; it is left out")
     return views

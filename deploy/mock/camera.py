@@ -4,16 +4,18 @@ from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from maniskill_tomato.deploy.drivers import DriverContext
 from maniskill_tomato.deploy.errors import DeviceTimeoutError, NotConnectedError
 from maniskill_tomato.deploy.interface import Camera, Frame
-from maniskill_tomato.deploy.mock.depth import measured_depth
 from maniskill_tomato.deploy.mock.faults import CameraFault
 from maniskill_tomato.deploy.mock.options import TwinOptions, twin_options, twin_world
 from maniskill_tomato.deploy.mock.painter import Painter, make_painter
 from maniskill_tomato.deploy.mock.world import TwinWorld
-from maniskill_tomato.robot.d435 import CameraIntrinsics
+from maniskill_tomato.robot.d435 import CameraIntrinsics, min_depth
+from maniskill_tomato.robot.depth_noise import DepthNoise, measure_depth
+from maniskill_tomato.visibility.view_rays import DEPTH_MODE
 
 EXPOSURE = 1.0 / 30.0
 """Between two pictures, in [s]."""
@@ -80,12 +82,21 @@ class MockCamera(Camera):
         exact = np.where(picture.labels == 0, np.float32(BACKGROUND), picture.depth)
         return Frame(
             color=self._painter.paint(self._world, picture),
-            depth=measured_depth(exact, self._options.depth_noise, rng),
+            depth=self._measured(exact, rng),
             intrinsics=self._world.intrinsics,
             stamp=stamp,
             number=number,
             truth=self._world.truth(picture),
         )
+
+    def _measured(self, exact: NDArray[np.float32], rng: np.random.Generator) -> NDArray[np.float32]:
+        """What the D435's 424 x 240 mode makes of true depths [m]; without noise what it could make. Shape (H, W)."""
+        factor = self._options.depth_noise
+        if factor == 0.0:
+            return np.where(exact >= min_depth(DEPTH_MODE), exact, np.float32(0.0))
+        noise = DepthNoise().times(factor)
+        depth = measure_depth(exact.astype(np.float64), self._world.intrinsics, noise, rng, stereo=DEPTH_MODE)
+        return depth.astype(np.float32)
 
     def _fault(self) -> CameraFault | None:
         faults = self._options.faults

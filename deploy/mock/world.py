@@ -104,5 +104,5 @@ class TwinWorld:
 
     def _poses(self, joints: Float64) -> tuple[Tensor, Tensor]:
         """Poses of the optical frame and of the links, in single precision as in the simulated task."""
-        links = link_transforms(torch.as_tensor(joints[None], dtype=torch.float32))
+        links = link_transforms(torch.tensor(joints[None], dtype=torch.float32))
         return links[:, -1] @ self._mount, links

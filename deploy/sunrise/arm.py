@@ -99,7 +99,7 @@ class SunriseArm(Arm):
     def disconnect(self) -> None:
         if self._client is None:
             return
-        if self._client.is_moving:
+        if self._piece is not None:
             logger.warning("disconnecting in a move, which goes on to its end: %s", ONLY_SMARTPAD)
         self._client.close("the driver disconnected")
         self._client = None
@@ -146,7 +146,8 @@ class SunriseArm(Arm):
         count = max(1, math.ceil(float(np.max(np.abs(target - start))) / self._config.largest_segment - 1e-9))
         self._pieces = [start + (target - start) * (i / count) for i in range(1, count)] + [target]
         self._speed = move.speed_fraction
-        self._next_piece(client)
+        with self._telling_of_a_move():
+            self._next_piece(client)
         if self._piece is None:
             raise RefusedError("stopped before the move began")
         return JointMove(joint_positions=target, speed_fraction=float(f"{self._speed:.9f}"))
@@ -188,8 +189,14 @@ class SunriseArm(Arm):
         self._pieces = []
         if self._stop_asked:
             return
-        client.start_move(target.tolist(), self._speed, windows.tolist())
-        self._piece, self._pieces = target, rest
+        # Until the controller refuses it, a move that was sent counts as under way, answered or not.
+        self._piece = target
+        try:
+            client.start_move(target.tolist(), self._speed, windows.tolist())
+        except RefusedError:
+            self._piece = None
+            raise
+        self._pieces = rest
         change = np.abs(target - start)
         seconds = float(np.max(change / (iiwa14.VELOCITY_LIMITS * self._speed)))
         ramp = self._speed * float(np.max(iiwa14.VELOCITY_LIMITS / iiwa14.ACCELERATION_LIMITS))
@@ -236,7 +243,7 @@ class SunriseArm(Arm):
         except (NotConnectedError, DeviceTimeoutError, ProtocolError) as error:
             if self._piece is None:
                 raise
-            raise type(error)(f"{error}. A move was under way and goes on: {ONLY_SMARTPAD}") from error
+            raise type(error)(f"{error}. The arm may be in a move, which goes on: {ONLY_SMARTPAD}") from error
 
     def _connected(self) -> SunriseClient:
         if self._client is None:

@@ -1,5 +1,6 @@
 """`maniskill-tomato deploy calibrate`: where the camera sits on the flange."""
 
+import signal
 import sys
 from contextlib import ExitStack
 from dataclasses import dataclass
@@ -13,6 +14,12 @@ if TYPE_CHECKING:
     from maniskill_tomato.deploy.calibration.board import CharucoBoard
 
 
+def end_by_signal(reason: str | None) -> None:
+    """Ends with the exit status of a signal if that is what stopped a run; `reason` is its name."""
+    if reason is not None and reason in signal.Signals.__members__:
+        raise SystemExit(128 + signal.Signals[reason])
+
+
 @dataclass(frozen=True, kw_only=True)
 class DeployCalibrate:
     """Measure where the camera sits on the flange, with a printed ChArUco board that stands still.
@@ -20,7 +27,8 @@ class DeployCalibrate:
     Print the board (--print-board board.pdf), measure a square, fix the board in front of the arm, bring the camera
     to about 0.35 m from it, and start with --profile FILE --confirm: the arm goes round the board and takes pictures.
     Without --confirm or --unattended nothing moves: it takes one picture and shows the first move. --views FOLDER
-    calculates from pictures taken before.
+    calculates from pictures taken before. Ctrl-C, SIGTERM, the key q with Enter and the file STOP in the output folder
+    stop it; the pictures taken so far stay.
     """
 
     profile: str | None = None
@@ -95,8 +103,10 @@ class DeployCalibrate:
         """Takes pictures with the devices of a profile; whether there are enough to calculate."""
         from maniskill_tomato.deploy.calibration.capture import CapturePlan, capture_views
         from maniskill_tomato.deploy.calibration.hand_eye import MIN_VIEWS
+        from maniskill_tomato.deploy.errors import StoppedError
         from maniskill_tomato.deploy.profile import load_profile
-        from maniskill_tomato.deploy.station import make_station
+        from maniskill_tomato.deploy.station import make_station, prepare_folder
+        from maniskill_tomato.deploy.stops import Stops
 
         if self.confirm and self.unattended:
             raise InvalidInputError("give --confirm or --unattended, not both")
@@ -110,22 +120,37 @@ class DeployCalibrate:
         profile = load_profile(name)
         station = make_station(profile)
         plan = CapturePlan(views=self.count)
+        stop_file = prepare_folder(profile, self.out)
         with ExitStack() as stack:
             if not moves:
                 folder = Path(stack.enter_context(TemporaryDirectory()))
             stack.enter_context(station.arm)
             camera = stack.enter_context(station.camera)
-            taken = capture_views(
-                station.guarded_arm,
-                camera,
-                self._board(),
-                folder,
-                station.clock,
-                _Operator(asks=self.confirm, goes=self.unattended),
-                plan,
-                profile.T_flange_camera,
-                str(camera.describe().get("serial", "")),
+            stops = stack.enter_context(
+                Stops(
+                    stop_file=stop_file,
+                    keyboard=not self.confirm,
+                    heartbeat_s=profile.stop.heartbeat,
+                    on_lost_heartbeat=station.guarded_arm.stop,
+                )
             )
+            try:
+                taken = capture_views(
+                    station.guarded_arm,
+                    camera,
+                    self._board(),
+                    folder,
+                    station.clock,
+                    _Operator(asks=self.confirm, goes=self.unattended),
+                    plan,
+                    profile.T_flange_camera,
+                    str(camera.describe().get("serial", "")),
+                    stops,
+                )
+            except StoppedError as error:
+                print(str(error))
+                end_by_signal(stops.reason)
+                return False
         if not moves:
             print("dry run: the board is in the picture; nothing moved; --confirm asks before every move")
             return False

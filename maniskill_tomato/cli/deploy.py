@@ -1,6 +1,5 @@
 """`maniskill-tomato deploy`: the policy on an arm and a camera, or on their digital twin."""
 
-import signal
 import sys
 from dataclasses import dataclass
 from pathlib import Path
@@ -8,11 +7,11 @@ from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
-from maniskill_tomato.cli.calibrate import DeployCalibrate
+from maniskill_tomato.cli.calibrate import DeployCalibrate, end_by_signal
 from maniskill_tomato.errors import InvalidInputError
 
 if TYPE_CHECKING:
-    from maniskill_tomato.deploy.loop import Proposal
+    from maniskill_tomato.deploy.loop_config import Proposal
 
 FAULT_STATUS = 3
 """Exit status of a run that a fault ended."""
@@ -46,7 +45,7 @@ class DeployRun:
 
     def run(self) -> None:
         """Runs, and says how it ended."""
-        from maniskill_tomato.deploy.loop import Mode
+        from maniskill_tomato.deploy.loop_config import Mode
         from maniskill_tomato.deploy.profile import load_profile
         from maniskill_tomato.deploy.run import RunConfig, run
 
@@ -79,8 +78,8 @@ class DeployRun:
         if result.is_fault:
             print(f"error: {result.detail}", file=sys.stderr)
             raise SystemExit(FAULT_STATUS)
-        if result.reason == "stopped" and result.detail in signal.Signals.__members__:
-            raise SystemExit(128 + signal.Signals[result.detail])
+        if result.reason == "stopped":
+            end_by_signal(result.detail)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -118,7 +117,10 @@ class DeployReplay:
         """Compares."""
         from maniskill_tomato.deploy.replay import each_difference, load_recording, replay
 
-        found = replay(load_recording(self.recording), self.policy)
+        recorded = load_recording(self.recording)
+        if recorded.is_cut_off:
+            print(f"the recording is cut off; its first {len(recorded.steps)} looks are whole")
+        found = replay(recorded, self.policy)
         for line in each_difference(found):
             print(line)
         if found.differences:

@@ -303,5 +303,19 @@ T_flange_camera_depth_optical: Final = _product(T_flange_camera_depth, T_frame_o
 T_flange_camera_color_optical: Final = _product(T_flange_camera_color, T_frame_optical)
 """The colour camera's optical frame (z forward, x right, y down) in `link_ee`."""
 
+
+def camera_link_pose(T_flange_camera: npt.ArrayLike) -> FloatArray:
+    """Where the housing is that carries a colour camera.
+
+    Args:
+        T_flange_camera: The colour camera's optical frame in `link_ee`, as measured. Shape (4, 4).
+
+    Returns:
+        `camera_link` in `link_ee`. Shape (4, 4).
+    """
+    T = np.asarray(T_flange_camera, dtype=np.float64)
+    return np.asarray(T @ np.linalg.inv(_product(T_camera_color, T_frame_optical)))
+
+
 T_color_optical_depth_optical: Final = _transform((0.015, 0.0, 0.0), _EYE)
 """From the depth camera's optical frame to the colour camera's (nominal)."""

@@ -4,7 +4,7 @@ The image is the depth aligned to the colour stream, as `rs.align` gives it. See
 imagers sit to the right, 15 and 65 mm away; a point is measured only if both see it.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Final
 
 import cv2
@@ -46,6 +46,15 @@ class DepthNoise:
     """Share of the image that is lost in blobs, where nothing matches."""
     max_depth_m: float = 6.0
     """Beyond it nothing is measured, in [m]."""
+
+    def times(self, factor: float) -> "DepthNoise":
+        """Errors, flying pixels and holes so many times as strong; shares end at 1."""
+        return replace(
+            self,
+            subpixel_rms=factor * self.subpixel_rms,
+            flying_share=min(1.0, factor * self.flying_share),
+            hole_share=min(1.0, factor * self.hole_share),
+        )
 
 
 def measure_depth(

@@ -11,9 +11,22 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
+from maniskill_tomato.robot.d435 import T_flange_camera_color_optical
 from maniskill_tomato.robot.iiwa14 import LINK_NAMES
 
-LINK_SPHERES: Final[dict[str, tuple[tuple[float, float, float, float], ...]]] = {
+Sphere = tuple[float, float, float, float]
+
+CAMERA_SPHERES: Final[tuple[Sphere, ...]] = (
+    (0.0, -0.0345, 0.0385, 0.0195),
+    (0.0, -0.0207, 0.0385, 0.0195),
+    (0.0, -0.0069, 0.0385, 0.0195),
+    (0.0, 0.0069, 0.0385, 0.0195),
+    (0.0, 0.0207, 0.0385, 0.0195),
+    (0.0, 0.0345, 0.0385, 0.0195),
+)
+"""The camera's bar in `link_ee` where the drawings have it; the last spheres of `LINK_SPHERES`."""
+
+LINK_SPHERES: Final[dict[str, tuple[Sphere, ...]]] = {
     "link_5": (
         (0.0, 0.0, 0.012, 0.0689),
         (0.0, -0.004, 0.045, 0.0688),
@@ -32,25 +45,26 @@ LINK_SPHERES: Final[dict[str, tuple[tuple[float, float, float, float], ...]]] = 
         (0.0, 0.08, 0.03, 0.0759),
     ),
     "link_7": ((0.0, 0.0, 0.012, 0.0514),),
-    "link_ee": (
-        (0.0, 0.0, 0.008, 0.038),
-        (0.0, -0.0345, 0.0385, 0.0195),
-        (0.0, -0.0207, 0.0385, 0.0195),
-        (0.0, -0.0069, 0.0385, 0.0195),
-        (0.0, 0.0069, 0.0385, 0.0195),
-        (0.0, 0.0207, 0.0385, 0.0195),
-        (0.0, 0.0345, 0.0385, 0.0195),
-    ),
+    "link_ee": ((0.0, 0.0, 0.008, 0.038), *CAMERA_SPHERES),
 }
 """Centre x, y, z in the link's frame and radius of each sphere, in [m]; `link_ee` carries bracket and camera."""
 
 
-def sphere_table() -> tuple[npt.NDArray[np.int32], npt.NDArray[np.float32]]:
+def sphere_table(
+    T_flange_camera: npt.NDArray[np.float64] = T_flange_camera_color_optical,
+) -> tuple[npt.NDArray[np.int32], npt.NDArray[np.float32]]:
     """All spheres in one table.
+
+    Args:
+        T_flange_camera: The colour camera's optical frame in `link_ee`, which its bar goes with. Shape (4, 4).
 
     Returns:
         Index of each sphere's link in `LINK_NAMES`, shape (S,), and centre and radius in [m], shape (S, 4).
     """
     links = [LINK_NAMES.index(name) for name, spheres in LINK_SPHERES.items() for _ in spheres]
-    rows = [sphere for spheres in LINK_SPHERES.values() for sphere in spheres]
-    return np.array(links, dtype=np.int32), np.array(rows, dtype=np.float32)
+    rows = np.array([sphere for spheres in LINK_SPHERES.values() for sphere in spheres])
+    if T_flange_camera is not T_flange_camera_color_optical:
+        moved = T_flange_camera @ np.linalg.inv(T_flange_camera_color_optical)
+        camera = slice(-len(CAMERA_SPHERES), None)
+        rows[camera, :3] = rows[camera, :3] @ moved[:3, :3].T + moved[:3, 3]
+    return np.array(links, dtype=np.int32), rows.astype(np.float32)
