@@ -11,7 +11,7 @@ import json
 import sys
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 import gymnasium as gym
 import numpy as np
@@ -23,8 +23,9 @@ import maniskill_tomato  # noqa: F401  (registers the tasks)
 from maniskill_tomato.errors import InvalidInputError, TomatoError
 from maniskill_tomato.evaluation.benchmark_policies import parse_policies
 from maniskill_tomato.files import write_atomically
+from maniskill_tomato.tasks.camera_perception import RENDERED, Perception
 
-PERCEPTIONS = ("ground_truth", "occlusion_model")
+PERCEPTIONS = get_args(Perception)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -39,8 +40,8 @@ class Args:
     """The first of them."""
     episode_list: str = "held_out"
     """Which fixed list."""
-    perceptions: tuple[str, ...] = PERCEPTIONS
-    """What the policies see through."""
+    perceptions: tuple[str, ...] = ("ground_truth", "occlusion_model")
+    """What the policies see through; `segmenter` and the thesis's models need a renderer and seconds for a move."""
     out: Path = Path("runs/perception")
     """Folder of the results."""
 
@@ -129,7 +130,7 @@ def main(args: Args) -> None:
             "TomatoViewpoint-v1",
             episodes=args.episode_list,
             obs_mode="state",
-            render_backend="none",
+            render_backend="auto" if perception in RENDERED else "none",
             perception=perception,
         )
         for spec in parse_policies(args.policies):

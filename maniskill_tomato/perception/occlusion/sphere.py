@@ -9,7 +9,7 @@ lie outside the image, so that a tomato that is not quite round but wholly visib
 
 from dataclasses import dataclass, replace
 from functools import lru_cache
-from typing import Final
+from typing import Any, Final
 
 import cv2
 import numpy as np
@@ -24,6 +24,8 @@ from maniskill_tomato.perception.occlusion.estimate import (
     filled_depth,
     fruit_depth,
 )
+
+Floats = NDArray[np.floating[Any]]
 
 SAMPLES: Final = 64
 """Points of each kind that a circle is judged by."""
@@ -71,10 +73,10 @@ class SphereConfig:
 
 @dataclass(frozen=True, kw_only=True)
 class _Evidence:
-    edge: Float64
-    mask: Float64
-    background: Float64
-    mask_depth: Float64
+    edge: Floats
+    mask: Floats
+    background: Floats
+    mask_depth: Floats
 
     def single(self) -> "_Evidence":
         """The same in 32 bits."""
@@ -289,11 +291,11 @@ def _fit(evidence: _Evidence, own: float, focal: float, c: SphereConfig) -> Floa
     return np.asarray(best)
 
 
-def _cost(circles: Float64, evidence: _Evidence, own: float, focal: float, c: SphereConfig) -> Float64:
+def _cost(circles: Floats, evidence: _Evidence, own: float, focal: float, c: SphereConfig) -> Float64:
     """Negative log likelihood of circles. Shape (N,)."""
     radius = circles[:, 2:3]
 
-    def away(points: Float64) -> Float64:
+    def away(points: Floats) -> Floats:
         # Several times as quick as np.hypot.
         across, down = points[:, 0] - circles[:, 0:1], points[:, 1] - circles[:, 1:2]
         across *= across
@@ -322,7 +324,7 @@ def _cost(circles: Float64, evidence: _Evidence, own: float, focal: float, c: Sp
     return np.asarray(cost)
 
 
-def _centre_depth(points: Float64, circle: Float64, own: float, focal: float) -> float:
+def _centre_depth(points: Floats, circle: Float64, own: float, focal: float) -> float:
     """Depth of a sphere's centre from points of its surface: x, y in [px] and depth in [m]. Shape (N, 3)."""
     radius_m = circle[2] * own / focal
     if not len(points):
@@ -343,7 +345,7 @@ def _noise() -> NDArray[np.float64]:
     return np.asarray(np.random.default_rng(5).standard_normal((ROUNDS, DRAWS, 3)))
 
 
-def _circles(edge: Float64) -> Float64:
+def _circles(edge: Floats) -> Floats:
     """Circles through triples of outline points, well apart. Shape (N, 3)."""
     n = len(edge)
     if n < 12:
