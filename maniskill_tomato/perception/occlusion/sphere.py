@@ -288,7 +288,7 @@ def _fit(evidence: _Evidence, own: float, focal: float, c: SphereConfig) -> Floa
             best, best_cost = drawn[order[0]], float(cost[order[0]])
         start = drawn[order].mean(0)
         spread = np.maximum(drawn[order].std(0), 0.004 * size)
-    return np.asarray(best)
+    return np.asarray(best, np.float64)
 
 
 def _cost(circles: Floats, evidence: _Evidence, own: float, focal: float, c: SphereConfig) -> Float64:
