@@ -3,6 +3,7 @@
 Usage:
     maniskill-tomato dataset --count 1000 --split held_out --no-vary-crop --out runs/held_out
     python scripts/judge_occlusion.py --data runs/held_out --out runs/occlusion
+    python scripts/judge_occlusion.py --data runs/held_out --figure images/000003.jpg --out runs/occlusion
 """
 
 import json
@@ -17,8 +18,9 @@ from maniskill_tomato.errors import InvalidInputError, TomatoError
 from maniskill_tomato.files import write_atomically
 from maniskill_tomato.perception.formats import read_annotated
 from maniskill_tomato.perception.occlusion.estimate import OcclusionModel
+from maniskill_tomato.perception.occlusion.figure import draw_steps
 from maniskill_tomato.perception.occlusion.improved import ImprovedModel
-from maniskill_tomato.perception.occlusion.judge import judge, markdown
+from maniskill_tomato.perception.occlusion.judge import annotated_fruits, judge, make_view, markdown
 from maniskill_tomato.perception.occlusion.sphere import SphereModel
 from maniskill_tomato.perception.occlusion.thesis import ThesisModel
 
@@ -41,6 +43,27 @@ class Args:
     """Tomatoes seen in fewer pixels are left out."""
     min_total: int = 400
     """Tomatoes whose whole silhouette has fewer pixels are left out: those of the rows behind."""
+    figure: str | None = None
+    """Draw every step on this image of the folder (steps.png, as Fig. 4-28) instead of judging."""
+
+
+def draw_figure(args: Args, known: dict[str, OcclusionModel]) -> None:
+    """Draws the steps of the thesis's model on one image, and what the others make of it."""
+    images = read_annotated(args.data).images
+    named = [image for image in images if image.file_name == args.figure]
+    if not named:
+        raise InvalidInputError.choice("--figure", str(args.figure), [i.file_name for i in images[:20]])
+    area = [
+        f for f in annotated_fruits(named[0]) if f.visible_mask and f.visible_mask.area >= args.min_visible
+    ]
+    view = make_view(named[0], area)
+    if view is None:
+        raise InvalidInputError(
+            f"{args.figure} has no depth or camera; take a folder of `maniskill-tomato dataset`"
+        )
+    others = {name: list(known[name](view)) for name in args.models if name != "thesis"}
+    draw_steps(view, ThesisModel().run(view), args.out / "steps.png", others)
+    print(f"figure {args.out / 'steps.png'}")
 
 
 def main(args: Args) -> None:
@@ -53,6 +76,9 @@ def main(args: Args) -> None:
     for name in args.models:
         if name not in known:
             raise InvalidInputError.choice("--models", name, known)
+    if args.figure is not None:
+        draw_figure(args, known)
+        return
     images = read_annotated(args.data).images[: args.count]
     with tqdm(total=len(images), unit="image", disable=None) as bar:
         judged, milliseconds = judge(

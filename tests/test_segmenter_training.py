@@ -1,8 +1,7 @@
 """Mask R-CNN, YOLO's files and the two scripts, on drawn pictures."""
 
-import importlib.util
 import json
-import sys
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from types import ModuleType
@@ -65,17 +64,6 @@ def drawn_set(folder: Path, masks: bool = True) -> tuple[AnnotatedImage, ...]:
     return tuple(images)
 
 
-def script(name: str) -> ModuleType:
-    """A script as a module."""
-    path = Path(__file__).resolve().parent.parent / "scripts" / f"{name}.py"
-    spec = importlib.util.spec_from_file_location(name, path)
-    assert spec is not None and spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    sys.modules[name] = module
-    spec.loader.exec_module(module)
-    return module
-
-
 def test_mask_rcnn_trains_goes_on_and_opens_as_a_segmenter(tmp_path: Path) -> None:
     images = drawn_set(tmp_path / "set")
     training = MaskRcnnTraining(TINY, [images], [1.0], images[:1])
@@ -134,7 +122,7 @@ def test_yolo_labels_are_shares_of_the_image(tmp_path: Path) -> None:
 
 
 def test_the_training_script_writes_weights_and_curves(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], load_script: Callable[[str], ModuleType]
 ) -> None:
     drawn_set(tmp_path / "set")
     network = (
@@ -153,7 +141,7 @@ def test_the_training_script_writes_weights_and_curves(
     )
     options = ("--config.steps", "2", "--config.log-every", "1", "--config.batch-size", "2", *network)
     arguments = ["light", "--data", str(tmp_path / "set"), "--validation", str(tmp_path / "set"), *options]
-    script("train_segmenter").main([*arguments, "--out", str(tmp_path / "run")])
+    load_script("train_segmenter").main([*arguments, "--out", str(tmp_path / "run")])
     assert "weights" in capsys.readouterr().out
     assert {p.name for p in (tmp_path / "run").iterdir()} == {
         "checkpoint.pt",
@@ -162,15 +150,15 @@ def test_the_training_script_writes_weights_and_curves(
         "weights.pt",
     }
     with pytest.raises(SystemExit) as exit_info:
-        script("train_segmenter").main(["light", "--data", str(tmp_path / "nowhere")])
+        load_script("train_segmenter").main(["light", "--data", str(tmp_path / "nowhere")])
     assert exit_info.value.code == 2 and "no data set" in capsys.readouterr().err
 
 
 def test_the_evaluation_script_finds_a_perfect_segmenter_perfect(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], load_script: Callable[[str], ModuleType]
 ) -> None:
     drawn_set(tmp_path / "set")
-    script("evaluate_segmenter").main(
+    load_script("evaluate_segmenter").main(
         ["--data", str(tmp_path / "set"), "--segmenter", "colour", "--out", str(tmp_path / "out")]
     )
     metrics = json.loads((tmp_path / "out" / "metrics.json").read_text())

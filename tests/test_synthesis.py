@@ -1,10 +1,13 @@
 """Rendered data sets: the parts as functions with known answers, and a small data set where a renderer is there."""
 
 import json
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from types import ModuleType
 from typing import Any
 
+import cv2
 import numpy as np
 import pytest
 import trimesh
@@ -142,7 +145,9 @@ def test_missing_photos_are_an_error_of_one_line(tmp_path: Path, capsys: pytest.
 
 @pytest.mark.render
 @pytest.mark.slow
-def test_a_small_data_set_is_whole_continued_and_the_same_again(tmp_path: Path) -> None:
+def test_a_small_data_set_is_whole_continued_and_the_same_again(
+    tmp_path: Path, load_script: Callable[[str], ModuleType]
+) -> None:
     from maniskill_tomato.perception.formats import read_annotated
     from maniskill_tomato.perception.synthesis.statistics import write_statistics
     from maniskill_tomato.rendering import rendering_available
@@ -164,10 +169,16 @@ def test_a_small_data_set_is_whole_continued_and_the_same_again(tmp_path: Path) 
             seen, whole = fruit.visible_mask.decode(), fruit.amodal_mask.decode()
             assert not (seen & ~whole).any()
             assert fruit.visible_fraction is not None and 0 < fruit.visible_fraction <= 1
-            assert (
-                fruit.visible_fraction <= seen.sum() / whole.sum() + 6e-6
-            )  # It is written with five decimals.
+            # V_f is written with five decimals.
+            assert fruit.visible_fraction <= seen.sum() / whole.sum() + 6e-6
     assert write_statistics(read, tmp_path / "a").is_file()
+    judge_script = load_script("judge_occlusion")
+    judge_script.main(
+        judge_script.Args(data=tmp_path / "a", figure="images/000000.jpg", out=tmp_path / "occ")
+    )
+    assert cv2.imread(str(tmp_path / "occ" / "steps.png")) is not None
+    with pytest.raises(InvalidInputError, match="--figure"):
+        judge_script.main(judge_script.Args(data=tmp_path / "a", figure="images/9.jpg", out=tmp_path / "occ"))
     # Continued to three images it keeps the first two, and made anew in one go it is the same.
     grown = make_dataset(replace(config, count=3), tmp_path / "a")
     again = make_dataset(replace(config, count=3), tmp_path / "b")
