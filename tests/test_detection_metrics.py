@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from maniskill_tomato.errors import InvalidInputError
 from maniskill_tomato.perception.annotations import Instance
-from maniskill_tomato.perception.coco_metrics import coco_metrics
+from maniskill_tomato.perception.coco_metrics import CocoScore
 from maniskill_tomato.perception.detection_metrics import (
     DetectionScore,
     ImageTruth,
@@ -138,7 +138,10 @@ def test_average_precision_agrees_with_coco(overlap: str) -> None:
     for found, truth in scenes:
         score.add(found, truth)
     average = score.precision_recall().average_precision
-    theirs = coco_metrics(scenes, overlap)["AP50"]  # type: ignore[arg-type]
+    coco = CocoScore(overlap)  # type: ignore[arg-type]
+    for found, truth in scenes:
+        coco.add(found, truth)
+    theirs = coco.metrics()["AP50"]
     assert 0.2 < average < 0.9
     assert theirs == pytest.approx(average, abs=0.01)
 

@@ -346,6 +346,16 @@ def test_weights_come_back_in_half_precision(tmp_path: Path) -> None:
         torch.testing.assert_close(opened.state_dict()[name].float(), tensor.float(), rtol=1e-3, atol=1e-3)
 
 
+def test_values_beyond_16_bits_survive_in_a_file(tmp_path: Path) -> None:
+    state = FruitNetwork(SMALL).state_dict()
+    state["smooths.2.1.running_var"][0] = 350_484.0
+    state["output.weight"][0, 0] = 70_000.0
+    save_weights(tmp_path / "w.pt", "light", SMALL.to_dict(), state)
+    opened = open_light(tmp_path / "w.pt").network.state_dict()
+    assert float(opened["smooths.2.1.running_var"][0]) == 350_484.0
+    assert float(opened["output.weight"][0, 0]) == 70_000.0
+
+
 def test_weights_that_do_not_fit_are_refused(tmp_path: Path) -> None:
     state = FruitNetwork(SMALL).state_dict()
     save_weights(tmp_path / "w.pt", "light", {**SMALL.to_dict(), "head_width": 9}, state)

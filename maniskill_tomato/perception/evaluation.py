@@ -8,16 +8,15 @@ import numpy as np
 
 from maniskill_tomato.errors import InvalidInputError
 from maniskill_tomato.perception.annotations import AnnotatedImage
-from maniskill_tomato.perception.coco_metrics import coco_metrics
+from maniskill_tomato.perception.coco_metrics import CocoScore
 from maniskill_tomato.perception.detection_metrics import (
     DetectionScore,
-    ImageTruth,
     Overlap,
     PrecisionRecall,
     image_truth,
 )
 from maniskill_tomato.perception.detection_plots import plot_precision_recall
-from maniskill_tomato.perception.instances import Image, Instances
+from maniskill_tomato.perception.instances import Image
 from maniskill_tomato.perception.pictures import contact_sheet, draw_instances, write_picture
 from maniskill_tomato.perception.segmenter import Segmenter
 from maniskill_tomato.perception.training_pictures import SMALLEST_SHARE
@@ -65,7 +64,7 @@ def evaluate_segmenter(
     with_masks = all(f.visible_mask is not None for image in images for f in image.fruits)
     overlaps: tuple[Overlap, ...] = ("box", "mask") if with_masks else ("box",)
     scores: dict[Overlap, DetectionScore] = {overlap: DetectionScore(overlap) for overlap in overlaps}
-    pairs: list[tuple[Instances, ImageTruth]] = []
+    coco = {overlap: CocoScore(overlap) for overlap in overlaps}
     seconds = []
     for number, image in enumerate(images):
         picture = image.load()
@@ -74,9 +73,9 @@ def evaluate_segmenter(
         found = segmenter(picture, None if depth is None else depth.astype(np.float32))
         seconds.append(time.perf_counter() - start)
         truth = image_truth(image, smallest_share)
-        for score in scores.values():
-            score.add(found, truth)
-        pairs.append((found, truth))
+        for overlap in overlaps:
+            scores[overlap].add(found, truth)
+            coco[overlap].add(found, truth)
         if number in sheet:
             drawn.append(draw_instances(picture, found, WORKING_SCORE))
     metrics: dict[str, float] = {"images": len(images), "fruits": scores["box"].fruits}
@@ -90,7 +89,7 @@ def evaluate_segmenter(
             f"{overlap}_precision": precision,
             f"{overlap}_recall": recall,
         }
-        metrics |= {f"coco_{overlap}_{k}": v for k, v in coco_metrics(pairs, overlap).items()}
+        metrics |= {f"coco_{overlap}_{k}": v for k, v in coco[overlap].metrics().items()}
     metrics["median_seconds"] = float(np.median(seconds))
     plot_precision_recall(curves, out / "precision_recall.png")
     write_picture(out / "pictures.jpg", contact_sheet(drawn))

@@ -31,12 +31,13 @@ def save_weights(
         config: What builds its network.
         state: The network's weights.
         training: How it was trained: data, pictures seen, measured results.
-        half: Keep floating-point tensors in 16 bits, for half the size.
+        half: Keep floating-point matrices in 16 bits, for half the size; vectors, such as a normalisation's variances,
+            are small and can be too large for it.
 
     Raises:
         CheckpointError: The file cannot be written.
     """
-    kept = {name: t.half() if half and t.is_floating_point() else t for name, t in state.items()}
+    kept = {name: _halved(t) if half else t for name, t in state.items()}
     buffer = io.BytesIO()
     data = {
         "format": FORMAT,
@@ -48,6 +49,14 @@ def save_weights(
     }
     torch.save(data, buffer)
     write_atomically(path, buffer.getvalue())
+
+
+def _halved(tensor: Tensor) -> Tensor:
+    """A matrix in 16 bits where its values allow that; anything else as it is."""
+    if not tensor.is_floating_point() or tensor.ndim < 2:
+        return tensor
+    half = tensor.half()
+    return half if bool(half.isfinite().all()) else tensor
 
 
 def load_weights(path: Path, kind: str) -> dict[str, Any]:
