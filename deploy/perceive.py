@@ -7,7 +7,7 @@ import numpy as np
 import torch
 
 from maniskill_tomato.deploy.errors import PerceptionError
-from maniskill_tomato.deploy.fruits import Fruit, FruitFinder, Mask, locate, silhouette_area
+from maniskill_tomato.deploy.fruits import RADIUS_RANGE, Fruit, FruitFinder, Mask, locate, silhouette_area
 from maniskill_tomato.deploy.interface import Float64, Frame
 from maniskill_tomato.visibility.view_rays import ViewRays, sample_view
 
@@ -163,7 +163,9 @@ class TruthPerception:
 def _visible_fraction(
     fruit: Fruit, centre: Float64, radius: float, frame: Frame, T_world_camera: Float64
 ) -> float:
-    if fruit.visible_fraction is not None:
-        return fruit.visible_fraction
-    total = silhouette_area(centre, radius, frame.intrinsics, T_world_camera)
-    return float(min(1.0, fruit.mask.sum() / total))
+    pixels = int(fruit.mask.sum())
+    if fruit.visible_fraction is None:
+        return float(min(1.0, pixels / silhouette_area(centre, radius, frame.intrinsics, T_world_camera)))
+    # A sliver that a segmenter takes for a small whole fruit: at its distance no fruit is that small.
+    smallest = silhouette_area(centre, RADIUS_RANGE[0], frame.intrinsics, T_world_camera)
+    return min(fruit.visible_fraction, pixels / smallest)
