@@ -19,6 +19,10 @@ GATE: Final = 0.035
 are 50 mm apart and more; the target itself is located to 25 mm where a sliver of it is seen, to 10 mm where half is."""
 
 
+SURE_SCORE: Final = 0.5
+"""A fruit with a lower score is not chosen as the target, only found again as such."""
+
+
 @dataclass(frozen=True, eq=False, kw_only=True)
 class View:
     """One look at the target."""
@@ -75,8 +79,9 @@ class ImagePerception:
         self.name = f"images, masks from {finder.name}"
 
     def find_target(self, frame: Frame, T_world_camera: Float64) -> Float64 | None:
-        """The largest ripe fruit that can be located."""
-        fruits = sorted(self._finder.find(frame), key=lambda fruit: -int(fruit.mask.sum()))
+        """The largest ripe fruit that is sure and can be located."""
+        sure = [fruit for fruit in self._finder.find(frame) if fruit.score >= SURE_SCORE]
+        fruits = sorted(sure, key=lambda fruit: -int(fruit.mask.sum()))
         for fruit in fruits:
             found = locate(fruit.mask, frame.depth, frame.intrinsics, T_world_camera)
             if found is not None:

@@ -158,6 +158,27 @@ def test_a_sliver_is_not_a_whole_fruit_whatever_a_segmenter_says() -> None:
     assert view.mask.any() and view.visible_fraction < 0.25
 
 
+def test_an_unsure_fruit_is_found_again_but_not_chosen_as_the_target() -> None:
+    arm, camera = devices(6, depth_noise=0.0)
+    frame = camera.read()
+    pose = Observing(T_flange_camera_color_optical, 20).camera_pose(arm.read().joint_positions)
+    sizes = {label: int((frame.truth.labels == label).sum()) for label in frame.truth.ripe_labels}
+    large, small = sorted(sizes, key=lambda label: -sizes[label])[:2]
+
+    class Wavering(TruthFinder):
+        def find(self, frame: Any) -> list[Fruit]:
+            masks = [(frame.truth.labels == large, 0.35), (frame.truth.labels == small, 0.8)]
+            return [Fruit(mask=mask, score=score) for mask, score in masks]
+
+    chosen = ImagePerception(Wavering()).find_target(frame, pose)
+    expected = locate(frame.truth.labels == small, frame.depth, frame.intrinsics, pose)
+    assert chosen is not None and expected is not None
+    np.testing.assert_allclose(chosen, expected[0])
+    known = locate(frame.truth.labels == large, frame.depth, frame.intrinsics, pose)
+    assert known is not None
+    assert ImagePerception(Wavering()).look(frame, pose, known[0]).visible_fraction > 0.0
+
+
 def test_fruits_are_located_to_a_centimetre_where_enough_is_seen() -> None:
     errors = []
     for seed in (4, 9):
