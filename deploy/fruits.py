@@ -21,6 +21,10 @@ RADIUS_RANGE: Final = (0.015, 0.05)
 USUAL_RADIUS: Final = 0.032
 """Taken where too little is seen to tell, in [m]."""
 
+LEAST_SCORE: Final = 0.3
+"""Less sure fruits are left out. Low, because fruits that are mostly hidden get low scores, and a target whose place is
+known is not easily mistaken for something else."""
+
 FEWEST_PIXELS: Final = 12
 """A fruit with fewer pixels with depth is not located."""
 
@@ -79,7 +83,7 @@ class TruthFinder:
 class SegmenterFinder:
     """A segmenter of `maniskill_tomato.perception` as a finder."""
 
-    def __init__(self, name: str, segmenter: Any, min_score: float = 0.5) -> None:
+    def __init__(self, name: str, segmenter: Any, min_score: float = LEAST_SCORE) -> None:
         """Wraps one.
 
         Args:

@@ -7,7 +7,7 @@ import numpy as np
 import torch
 
 from maniskill_tomato.deploy.errors import PerceptionError
-from maniskill_tomato.deploy.fruits import Fruit, FruitFinder, Mask, locate, silhouette_area
+from maniskill_tomato.deploy.fruits import RADIUS_RANGE, Fruit, FruitFinder, Mask, locate, silhouette_area
 from maniskill_tomato.deploy.interface import Float64, Frame
 from maniskill_tomato.visibility.view_rays import ViewRays, sample_view
 
@@ -17,6 +17,10 @@ Sight = Literal["images", "rays"]
 GATE: Final = 0.035
 """A fruit farther than this from where the target is known to be is another one, in [m]. Ripe neighbours in a truss
 are 50 mm apart and more; the target itself is located to 25 mm where a sliver of it is seen, to 10 mm where half is."""
+
+
+SURE_SCORE: Final = 0.5
+"""A fruit with a lower score is not chosen as the target, only found again as such."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -75,8 +79,9 @@ class ImagePerception:
         self.name = f"images, masks from {finder.name}"
 
     def find_target(self, frame: Frame, T_world_camera: Float64) -> Float64 | None:
-        """The largest ripe fruit that can be located."""
-        fruits = sorted(self._finder.find(frame), key=lambda fruit: -int(fruit.mask.sum()))
+        """The largest ripe fruit that is sure and can be located."""
+        sure = [fruit for fruit in self._finder.find(frame) if fruit.score >= SURE_SCORE]
+        fruits = sorted(sure, key=lambda fruit: -int(fruit.mask.sum()))
         for fruit in fruits:
             found = locate(fruit.mask, frame.depth, frame.intrinsics, T_world_camera)
             if found is not None:
@@ -163,7 +168,9 @@ class TruthPerception:
 def _visible_fraction(
     fruit: Fruit, centre: Float64, radius: float, frame: Frame, T_world_camera: Float64
 ) -> float:
-    if fruit.visible_fraction is not None:
-        return fruit.visible_fraction
-    total = silhouette_area(centre, radius, frame.intrinsics, T_world_camera)
-    return float(min(1.0, fruit.mask.sum() / total))
+    pixels = int(fruit.mask.sum())
+    if fruit.visible_fraction is None:
+        return float(min(1.0, pixels / silhouette_area(centre, radius, frame.intrinsics, T_world_camera)))
+    # A sliver that a segmenter takes for a small whole fruit: at its distance no fruit is that small.
+    smallest = silhouette_area(centre, RADIUS_RANGE[0], frame.intrinsics, T_world_camera)
+    return min(fruit.visible_fraction, pixels / smallest)

@@ -345,10 +345,11 @@ def test_a_loop_that_stands_still_loses_its_heartbeat_and_stops_the_arm() -> Non
 
 def test_people_may_take_longer_than_the_heartbeat_to_confirm_and_can_stop_instead() -> None:
     def slowly(proposal: Proposal) -> bool:
-        time.sleep(1.0)
+        if proposal.number == 0:
+            time.sleep(5.0)
         return proposal.number == 0
 
-    stops = Stops(heartbeat_s=0.6)
+    stops = Stops(heartbeat_s=4.0)
     result, _ = go(profile(), stops=stops, mode="confirm", confirm=slowly)
     assert (result.reason, result.moves) == ("declined", 2)
     stops = Stops()

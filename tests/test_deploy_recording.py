@@ -145,8 +145,8 @@ def test_a_recording_that_was_cut_off_is_replayed_as_far_as_it_is_whole(
     content = (finished[0] / "run.mcap").read_bytes()
     whole = len(finished[1].visible_fractions)
     found = set()
+    cut = tmp_path / "cut.mcap"
     for share in np.linspace(0.05, 0.999, 24):
-        cut = tmp_path / "cut.mcap"
         cut.write_bytes(content[: int(share * len(content))])
         try:
             recorded = load_recording(cut)

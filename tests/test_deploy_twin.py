@@ -11,7 +11,7 @@ import torch
 from maniskill_tomato.deploy.clock import SimulatedClock
 from maniskill_tomato.deploy.drivers import DriverContext, make_arm, make_camera
 from maniskill_tomato.deploy.errors import NotConnectedError, ProfileError
-from maniskill_tomato.deploy.fruits import TruthFinder, locate, silhouette_area
+from maniskill_tomato.deploy.fruits import Fruit, TruthFinder, locate, silhouette_area
 from maniskill_tomato.deploy.interface import JointMove
 from maniskill_tomato.deploy.mock.dynamics import ArmDynamics
 from maniskill_tomato.deploy.mock.episode import load_episode
@@ -25,7 +25,7 @@ from maniskill_tomato.robot.d435 import (
 )
 from maniskill_tomato.robot.iiwa14 import READY_QPOS, VELOCITY_LIMITS
 from maniskill_tomato.robot.look_at_move import LookAtMover
-from maniskill_tomato.visibility.picture_caster import ROBOT_LABEL
+from maniskill_tomato.visibility.picture_caster import FIRST_ORGAN_LABEL, ROBOT_LABEL
 from maniskill_tomato.visibility.view_rays import DEPTH_MODE, RayLabel
 
 SIZE = {"width": 424, "height": 240}
@@ -128,6 +128,55 @@ def test_a_picture_agrees_with_the_truth_that_comes_with_it() -> None:
     area = silhouette_area(truth.target_position, float(fruit.radius) * 0.95, frame.intrinsics, pose)
     assert visible / area == pytest.approx(truth.visible_fraction, abs=0.08)
     assert set(np.unique(truth.labels)) <= {0, ROBOT_LABEL, *range(2, 2 + len(episode.plant.organs))}
+
+
+def test_a_sliver_is_not_a_whole_fruit_whatever_a_segmenter_says() -> None:
+    """It says 0.9 of a fruit for a row of pixels; for the whole fruit its word counts."""
+    arm, camera = devices(6)
+    frame = camera.read()
+    pose = Observing(T_flange_camera_color_optical, 20).camera_pose(arm.read().joint_positions)
+    label = max(frame.truth.ripe_labels, key=lambda label: int((frame.truth.labels == label).sum()))
+    whole = frame.truth.labels == label
+    episode = load_episode("held_out", 6)
+    fruit = next(fruit for fruit in episode.plant.fruits if FIRST_ORGAN_LABEL + fruit.organ_index == label)
+    target = (episode.T_world_plant.double().numpy() @ [*fruit.centre, 1.0])[:3]
+    rows = np.flatnonzero(whole.any(axis=1))
+    sliver = whole.copy()
+    sliver[rows[0] + 1 :] = False
+    assert 0 < sliver.sum() < 0.06 * whole.sum()
+
+    class Boasting(TruthFinder):
+        mask = whole
+
+        def find(self, frame: Any) -> list[Fruit]:
+            return [Fruit(mask=self.mask, visible_fraction=0.9)]
+
+    finder = Boasting()
+    assert ImagePerception(finder).look(frame, pose, target).visible_fraction == 0.9
+    finder.mask = sliver
+    view = ImagePerception(finder).look(frame, pose, target)
+    assert view.mask.any() and view.visible_fraction < 0.25
+
+
+def test_an_unsure_fruit_is_found_again_but_not_chosen_as_the_target() -> None:
+    arm, camera = devices(6, depth_noise=0.0)
+    frame = camera.read()
+    pose = Observing(T_flange_camera_color_optical, 20).camera_pose(arm.read().joint_positions)
+    sizes = {label: int((frame.truth.labels == label).sum()) for label in frame.truth.ripe_labels}
+    large, small = sorted(sizes, key=lambda label: -sizes[label])[:2]
+
+    class Wavering(TruthFinder):
+        def find(self, frame: Any) -> list[Fruit]:
+            masks = [(frame.truth.labels == large, 0.35), (frame.truth.labels == small, 0.8)]
+            return [Fruit(mask=mask, score=score) for mask, score in masks]
+
+    chosen = ImagePerception(Wavering()).find_target(frame, pose)
+    expected = locate(frame.truth.labels == small, frame.depth, frame.intrinsics, pose)
+    assert chosen is not None and expected is not None
+    np.testing.assert_allclose(chosen, expected[0])
+    known = locate(frame.truth.labels == large, frame.depth, frame.intrinsics, pose)
+    assert known is not None
+    assert ImagePerception(Wavering()).look(frame, pose, known[0]).visible_fraction > 0.0
 
 
 def test_fruits_are_located_to_a_centimetre_where_enough_is_seen() -> None:
