@@ -53,8 +53,8 @@ class TomatoViewpointGeneralEnv(TomatoEnv):
 
     **Options** beside those of the thesis's tasks:
 
-    - `episodes`: `"validation"` or `"held_out"` (or `Episode` objects) takes the episodes of a fixed list,
-      `reset(seed=i)` its i-th (modulo its length).
+    - `episodes`: `"validation"`, `"held_out"`, a `.json` file of such a list, or `Episode` objects, takes the episodes
+      of a fixed list, `reset(seed=i)` its i-th (modulo its length).
     - `layout`: an `ObservationLayout`, or the parts' names, says what the observation holds.
     - `start_visibility`: range of V_f of the first view.
     - `contact_penalty`: what a move with plant contact costs.
@@ -108,9 +108,9 @@ class TomatoViewpointGeneralEnv(TomatoEnv):
         choice = PlantChoice.parse(plant, task.plant)
         self._episodes: tuple[Episode, ...] | None = None
         if isinstance(episodes, str):
-            options.check_choice("episodes", episodes, EPISODE_LISTS)
             self._episodes = load_episodes(episodes)
-            choice = replace(choice, seed=episodes, pool=None)
+            split = episodes if episodes in EPISODE_LISTS else "train"
+            choice = replace(choice, seed=split, pool=None)
         elif episodes is not None:
             self._episodes = tuple(episodes)
             if not self._episodes or not all(isinstance(e, Episode) for e in self._episodes):
@@ -245,8 +245,15 @@ class TomatoViewpointGeneralEnv(TomatoEnv):
 
     def _look_anew(self, env_idx: Tensor) -> None:
         """Forgets what was seen in some environments and takes a first look at their targets."""
+        self._forget(env_idx)
+        self._look_first(env_idx)
+
+    def _forget(self, env_idx: Tensor) -> None:
+        """Begins with other targets, of which nothing was seen yet."""
         if self._eyes is not None:
             self._eyes.forget(env_idx)
+
+    def _look_first(self, env_idx: Tensor) -> None:
         self._observer.begin(env_idx, self._known_target_position()[env_idx])
         self._view_count[env_idx] = 0
         self._views[env_idx] = 0.0
@@ -308,14 +315,29 @@ class TomatoViewpointGeneralEnv(TomatoEnv):
         batch = super()._step_action(action)
         if batch is None:
             return None
-        qpos = self.agent.robot.get_qpos()
-        self._clearance = self._plant_clearance.along(before, qpos, self.planting.T_world_plant)
+        self._path_length = self._path_length + self._pass_way(before, position, batch)
         self._moves = self._moves + 1
-        self._look(qpos, None)
-        self._path_length = self._path_length + (self._camera_position - position).norm(dim=-1)
+        self._look(self.agent.robot.get_qpos(), None)
         self._visible_fraction = self._measured_fraction().clone()
         self._gain = self._visible_fraction - fraction
         return batch
+
+    def _pass_way(self, before: Tensor, position: Tensor, action: Tensor) -> Tensor:
+        """Measures the clearance of the last move and how long the camera's way was.
+
+        Args:
+            before: Joint positions before it, in [rad]. Shape (num_envs, 7).
+            position: Where the camera stood then, in the world frame, in [m]. Shape (num_envs, 3).
+            action: What was asked for. Shape (num_envs, A).
+
+        Returns:
+            The way's length, in [m]. Shape (num_envs,).
+        """
+        qpos = self.agent.robot.get_qpos()
+        self._clearance = self._plant_clearance.along(before, qpos, self.planting.T_world_plant)
+        T_w_camera = link_transforms(qpos)[:, -1] @ self._T_ee_camera
+        length: Tensor = (T_w_camera[:, :3, 3] - position).norm(dim=-1)
+        return length
 
     def evaluate(self) -> dict[str, Tensor]:
         """What came of the last move: V_f, whether that is a success, and what the move touched."""

@@ -51,7 +51,7 @@ def env() -> Iterator[Any]:
 
 @pytest.fixture(scope="module")
 def row() -> Iterator[Any]:
-    env = make(ROW)
+    env = make(ROW, transits="none")
     yield env
     env.close()
 
