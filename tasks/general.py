@@ -1,5 +1,6 @@
 """The general viewpoint task: a tomato on a plant never seen before, hidden at the start, and a memory to look with."""
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any, get_args
@@ -12,7 +13,7 @@ from torch import Tensor
 from maniskill_tomato.errors import InvalidInputError
 from maniskill_tomato.plants.choice import PlantChoice
 from maniskill_tomato.plants.episode_list import EPISODE_LISTS, Episode, load_episodes
-from maniskill_tomato.plants.row import Row
+from maniskill_tomato.plants.row import Row, leaf_density_of
 from maniskill_tomato.robot.kinematics import link_transforms
 from maniskill_tomato.robot.look_at import camera_to_viewpoint
 from maniskill_tomato.tasks import MAX_GENERAL_STEPS, options
@@ -28,6 +29,7 @@ from maniskill_tomato.visibility.caster import Visibility
 from maniskill_tomato.visibility.clearance import PlantClearance
 from maniskill_tomato.visibility.observation import ObservationLayout, ViewpointObserver
 from maniskill_tomato.visibility.situation import Situation
+from maniskill_tomato.visibility.true_views import TrueViews
 from maniskill_tomato.visibility.view_rays import ViewRayCaster
 
 MAX_VIEWS = 64
@@ -63,6 +65,8 @@ class TomatoViewpointGeneralEnv(TomatoEnv):
     - `perception`: `"ground_truth"` or `"occlusion_model"`; with the latter V_f, success, reward, the target's position
       and the rays' labels come from a camera image (mask and noisy depth), and the info also has
       `true_visible_fraction` and `true_success`.
+    - `privileged`: whether the observation ends with the truth about the views around (`visibility.true_views`), for
+      critics; `situation` never has it.
 
     `reset(options=...)` takes `episode` (index in the list), `target` (index of a ripe fruit in `Plant.fruits`) and
     `camera_position` (x, y, z [m], world frame).
@@ -86,6 +90,7 @@ class TomatoViewpointGeneralEnv(TomatoEnv):
         contact_penalty: float | None = None,
         sensor_noise: SensorNoise | Mapping[str, float] | None = None,
         perception: Perception = "ground_truth",
+        privileged: bool = False,
         plant: PlantChoice | Mapping[str, object] | str | None = None,
         plant_pose_noise: Sequence[float] | None = None,
         control_mode: str | None = "pd_look_at",
@@ -99,6 +104,8 @@ class TomatoViewpointGeneralEnv(TomatoEnv):
                 "whose depth has noise of its own"
             )
         self.perception: Perception = perception
+        self._privileged = privileged
+        self._leaf_density_limit = math.inf
         task = task or GeneralTaskConfig()
         if start_visibility is not None:
             low, high = options.check_range("start_visibility", start_visibility)
@@ -143,6 +150,7 @@ class TomatoViewpointGeneralEnv(TomatoEnv):
         self._eyes = CameraPerception(self._caster) if self.perception == "occlusion_model" else None
         self.soft_starts = 0
         """Episodes so far that no drawn start made as hard as asked for."""
+        self._true_views = TrueViews(n, self._observer.lattice) if self._privileged else None
         self._views = torch.zeros(n, MAX_VIEWS, 7, device=device)
         self._view_count = torch.zeros(n, dtype=torch.int64, device=device)
         self._moves = torch.zeros(n, dtype=torch.int64, device=device)
@@ -178,7 +186,32 @@ class TomatoViewpointGeneralEnv(TomatoEnv):
 
     def _plant_seed(self, env_index: int, rng: np.random.RandomState, options: dict[str, Any]) -> int:
         episode = self.episode(env_index, options)
-        return self._choice.draw_seed(rng) if episode is None else episode.plant_seed
+        if episode is not None:
+            return episode.plant_seed
+        seed = self._choice.draw_seed(rng)
+        # A limit of the task's highest density, or of none, leaves the draws as they are.
+        while (leaf_density_of(self._choice.leaf_density, seed) or 0.0) > self._leaf_density_limit:
+            seed = self._choice.draw_seed(rng)
+        return seed
+
+    @property
+    def leaf_density_range(self) -> tuple[float, float]:
+        """Of the plants that are drawn without a limit; equal numbers where all plants have one density."""
+        density = self._choice.leaf_density
+        if isinstance(density, tuple):
+            return density
+        return (1.0, 1.0) if density is None else (density, density)
+
+    def limit_leaf_density(self, highest: float) -> None:
+        """From the next reset on, draws only plants whose leaf density is at most this.
+
+        Raises:
+            InvalidInputError: No plant of the range is as sparse as that.
+        """
+        low, _ = self.leaf_density_range
+        if highest <= low:
+            raise InvalidInputError(f"the highest leaf density must be above {low}, got {highest}")
+        self._leaf_density_limit = highest
 
     def _candidates(self, env_index: int) -> list[int]:
         """The fruits that can become targets."""
@@ -254,12 +287,18 @@ class TomatoViewpointGeneralEnv(TomatoEnv):
             self._eyes.forget(env_idx)
 
     def _look_first(self, env_idx: Tensor) -> None:
+        self._ask_truth(env_idx)
         self._observer.begin(env_idx, self._known_target_position()[env_idx])
         self._view_count[env_idx] = 0
         self._views[env_idx] = 0.0
         mask = torch.zeros(self.num_envs, dtype=torch.bool, device=self.device)
         mask[env_idx] = True
         self._look(self.agent.robot.get_qpos(), mask)
+
+    def _ask_truth(self, env_idx: Tensor) -> None:
+        if self._true_views is not None:
+            fraction = self.ground_truth.visible_fraction
+            self._true_views.begin(env_idx, self._target_position_w, fraction)
 
     # ------------------------------------------------------------------- step
 
@@ -379,7 +418,10 @@ class TomatoViewpointGeneralEnv(TomatoEnv):
         return self.compute_dense_reward(obs, action, info) / (1.0 + self.task.success_reward)
 
     def _get_obs_extra(self, info: dict[str, Tensor]) -> dict[str, Tensor]:
-        return {name: self._observation[:, part].clone() for name, part in self.layout.slices.items()}
+        seen = {str(name): self._observation[:, part].clone() for name, part in self.layout.slices.items()}
+        if self._true_views is not None:
+            seen["truth"] = self._true_views.describe(self._camera_position, self._target_position_w)
+        return seen
 
     # ------------------------------------------------------------------ state
 
@@ -400,6 +442,7 @@ class TomatoViewpointGeneralEnv(TomatoEnv):
         self._clearance, self._gain = self._clearance.clone(), self._gain.clone()
         self._path_length = self._path_length.clone()
         self._clearance[indices], self._gain[indices], self._path_length[indices] = last.unbind(-1)
+        self._ask_truth(indices)
         self._replay(indices)
 
     def _replay(self, indices: Tensor) -> None:

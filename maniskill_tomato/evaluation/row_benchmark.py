@@ -113,11 +113,12 @@ class SeeableTomatoes:
 
     def __init__(self, env: gym.Env[Any, Any]) -> None:
         """Follows an environment of `TomatoViewpointRow-v1`."""
-        self._world: Any = env.unwrapped
-        self._mover = LookAtMover(self._world.device)
-        self._ready = torch.tensor(READY_QPOS, device=self._world.device)
-        spread = shell_points(SAMPLES, MIN_DISTANCE, FARTHEST_VIEW).to(self._world.device)
-        self._offsets = torch.cat([ViewLattice(self._world.device).offsets, spread])
+        world: Any = env.unwrapped
+        self._world: Any = world
+        self._mover = LookAtMover(world.device)
+        self._ready = torch.tensor(READY_QPOS, device=world.device)
+        spread = shell_points(SAMPLES, MIN_DISTANCE, FARTHEST_VIEW).to(world.device)
+        self._offsets = torch.cat([ViewLattice(world.device).offsets, spread])
 
     def among(self, fruits: Sequence[int], env_index: int = 0) -> list[int]:
         """Those of some fruits that can be seen."""
