@@ -75,7 +75,11 @@ def main(args: Args) -> None:
         spec.label: [RowResult.from_json(stored["rows"][spec.label][str(seed)]) for seed in seeds]
         for spec in specs
     }
-    seeable = {seed: set(stored["seeable"][str(seed)]) for seed in seeds}
+    # What was seen can be seen, even where the samples missed the view.
+    seeable = {
+        seed: set(stored["seeable"][str(seed)]).union(*(rows[i].seen for rows in results.values()))
+        for i, seed in enumerate(seeds)
+    }
     text = rows_table(results, seeable) + "\n" + "\n".join(compare_rows(results, seeable)) + "\n"
     write_atomically(path.with_suffix(".md"), text.encode())
     print(text)

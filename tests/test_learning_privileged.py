@@ -121,6 +121,7 @@ def test_critics_learn_a_value_that_only_the_truth_tells() -> None:
     for privileged in (True, False):
         agent = make_agent(replace(config, privileged_critic=privileged), 12 + TRUE_VIEWS * privileged, 3)
         generator = torch.Generator().manual_seed(1)
+        logs: dict[str, Tensor] = {}
         for index in range(400):
             truth = torch.rand(128, TRUE_VIEWS, generator=generator)
             seen = torch.rand(128, 12, generator=generator)
