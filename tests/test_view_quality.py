@@ -421,4 +421,6 @@ def test_the_evaluation_of_a_row_counts_the_tomatoes_that_were_seen() -> None:
     figures = summarise([episode, episode])
     seen, wanted = episode.targets_seen
     assert 0 < seen <= wanted and figures["target_seen_share"] == pytest.approx(seen / wanted)
-    assert figures["moves_per_seen_target"] == pytest.approx(steps / seen)
+    moves = int(info["moves"])
+    assert episode.moves == moves >= steps == episode.steps
+    assert figures["moves_per_seen_target"] == pytest.approx(moves / seen)
