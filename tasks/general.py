@@ -35,6 +35,9 @@ from maniskill_tomato.visibility.view_rays import ViewRayCaster
 MAX_VIEWS = 64
 """Views of a target that are remembered; as many as the memory counts."""
 
+MAX_PLANT_DRAWS = 1000
+"""Plants drawn under a limit of leaf density before there is held to be none."""
+
 START_RPY = (0.0, torch.pi / 2, 0.0)
 """The angles that those of a first view are near to, in [rad]: along +x, upright."""
 
@@ -188,11 +191,15 @@ class TomatoViewpointGeneralEnv(TomatoEnv):
         episode = self.episode(env_index, options)
         if episode is not None:
             return episode.plant_seed
-        seed = self._choice.draw_seed(rng)
-        # A limit of the task's highest density, or of none, leaves the draws as they are.
-        while (leaf_density_of(self._choice.leaf_density, seed) or 0.0) > self._leaf_density_limit:
+        # Without a limit, or with that of the task's highest density, the first draw is taken.
+        for _ in range(MAX_PLANT_DRAWS):
             seed = self._choice.draw_seed(rng)
-        return seed
+            if (leaf_density_of(self._choice.leaf_density, seed) or 0.0) <= self._leaf_density_limit:
+                return seed
+        raise InvalidInputError(
+            f"none of {MAX_PLANT_DRAWS} drawn plants has a leaf density of {self._leaf_density_limit} or less; "
+            "raise the limit (leaf_density_start) or the plants' pool"
+        )
 
     @property
     def leaf_density_range(self) -> tuple[float, float]:

@@ -23,6 +23,7 @@ from maniskill_tomato.learning.replay import Batch
 from maniskill_tomato.learning.run import train
 from maniskill_tomato.plants.row import leaf_density_of
 from maniskill_tomato.robot.look_at import look_at_pose, look_frame
+from maniskill_tomato.tasks.general import TomatoViewpointGeneralEnv
 from maniskill_tomato.visibility.observation import MAP_SIDE, NEAR_MAP_SIDE, ObservationLayout
 from maniskill_tomato.visibility.true_views import TRUE_VIEWS, TrueViews, map_positions
 from maniskill_tomato.visibility.view_lattice import ViewLattice
@@ -192,6 +193,21 @@ def test_plants_keep_to_the_limit_of_leaf_density(env: Any) -> None:
     assert {_plant(env, seed) for seed in range(30)} == set(of_pool)
     with pytest.raises(InvalidInputError, match="above"):
         base.limit_leaf_density(0.5)
+    base.limit_leaf_density(0.5 * (0.8 + min(of_pool.values())))
+    with pytest.raises(InvalidInputError, match="raise the limit"):
+        env.reset(seed=0)
+    base.limit_leaf_density(1.8)
+
+
+def test_a_run_with_a_curriculum_meets_sparse_plants_first(tmp_path: Path, monkeypatch: Any) -> None:
+    asked: list[float] = []
+    monkeypatch.setattr(
+        TomatoViewpointGeneralEnv, "limit_leaf_density", lambda self, highest: asked.append(highest)
+    )
+    config = replace(SMALL, privileged_critic=False, leaf_density_start=1.3, leaf_density_steps=20)
+    train("TomatoViewpoint-v1", config, tmp_path / "run", 0, {"plant": {"pool": 2}}, show_progress=False)
+    # Before the first reset, then before each of the 40 steps.
+    assert asked == pytest.approx([1.3, *(1.3 + 0.5 * min(k / 20, 1.0) for k in range(40))])
 
 
 def _plant(env: Any, seed: int) -> int:
