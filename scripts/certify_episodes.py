@@ -6,6 +6,7 @@ episodes that were not asked about are; the list is written after every block, s
 Usage:
     python scripts/certify_episodes.py --list held_out --count 1000 --jobs 2
     python scripts/certify_episodes.py --list validation --count 200
+    python scripts/certify_episodes.py --list held_out --count 200 --fresh-seed 5000000 --out runs/fresh.json
 """
 
 import logging
@@ -28,8 +29,14 @@ from maniskill_tomato.errors import InvalidInputError, TomatoError
 from maniskill_tomato.learning.envs import make_env
 from maniskill_tomato.planners.env_truth import EnvironmentTruth
 from maniskill_tomato.planners.oracle import OracleSearch
-from maniskill_tomato.plants.episode_list import EPISODE_LISTS, Episode, read_episodes, write_episodes
-from maniskill_tomato.tasks.episode_draw import extend_episodes
+from maniskill_tomato.plants.episode_list import (
+    EPISODE_LISTS,
+    Episode,
+    load_episodes,
+    read_episodes,
+    write_episodes,
+)
+from maniskill_tomato.tasks.episode_draw import draw_episodes, extend_episodes
 
 logger = logging.getLogger("certify_episodes")
 
@@ -47,6 +54,8 @@ class Args:
     """How many episodes the list is to hold at least."""
     out: Path | None = None
     """File of the list; by default that of the package."""
+    fresh_seed: int | None = None
+    """Draw a new list instead, of plants of that split that no list of the package has, from this reset seed on."""
     jobs: int = 1
     """Processes at a time."""
     contact_free: bool = False
@@ -109,6 +118,8 @@ def main(args: Args) -> None:
         raise InvalidInputError.choice("--list", args.list, EPISODE_LISTS)
     if args.count < 1 or args.jobs < 1:
         raise InvalidInputError(f"--count and --jobs must be 1 or more, got {args.count} and {args.jobs}")
+    if args.fresh_seed is not None and args.out is None:
+        raise InvalidInputError("--fresh-seed draws a new list; say with --out where it goes")
     out = args.out or ASSETS_DIR / "episodes" / f"{args.list}.json"
     episodes = list(read_episodes(out)) if out.is_file() else []
 
@@ -116,7 +127,12 @@ def main(args: Args) -> None:
         write_episodes(out, longer)
         logger.info("%d of %d drawn", len(longer), args.count)
 
-    episodes = extend_episodes(args.list, episodes, args.count, keep)
+    if args.fresh_seed is None:
+        episodes = extend_episodes(args.list, episodes, args.count, keep)
+    elif len(episodes) < args.count:
+        taken = {episode.plant_seed for name in EPISODE_LISTS for episode in load_episodes(name)}
+        episodes = draw_episodes(args.list, args.count, args.fresh_seed, taken)
+        keep(episodes)
     started = time.monotonic()
     for known in certify_all(episodes, args):
         write_episodes(out, known)

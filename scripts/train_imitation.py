@@ -8,16 +8,12 @@ Examples:
     python scripts/train_imitation.py --out runs/recurrent --jobs 2 --config.student recurrent
 """
 
-import logging
-import sys
-import time
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 
-import tyro
-
-from maniskill_tomato.errors import TomatoError
 from maniskill_tomato.learning.imitation.training import ImitationConfig, train_imitation
+from maniskill_tomato.learning.script import parse_env_options, run_training
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -28,21 +24,21 @@ class Args:
     """Folder of the training."""
     jobs: int = 1
     """Processes that run episodes."""
+    env_options: dict[str, str] = field(default_factory=dict)
+    """Options of the task: names and values, these as JSON or plain words."""
     config: ImitationConfig = field(default_factory=ImitationConfig)
     """How to train."""
 
 
+def train(args: Args, report: Callable[[str], None]) -> Path:
+    """Trains as the options say."""
+    options = parse_env_options(args.env_options)
+    return train_imitation(args.out, args.config, args.jobs, options, report)
+
+
 def main(argv: list[str] | None = None) -> None:
     """Trains; errors made on purpose end with one line and exit status 2."""
-    logging.basicConfig(level=logging.WARNING, format="%(message)s", stream=sys.stderr)
-    args = tyro.cli(Args, args=argv, description=__doc__)
-    start = time.perf_counter()
-    try:
-        path = train_imitation(args.out, args.config, args.jobs, report=lambda line: print(line, flush=True))
-    except TomatoError as error:
-        print(f"error: {error}", file=sys.stderr)
-        raise SystemExit(2) from None
-    print(f"policy {path} after {time.perf_counter() - start:.0f} s")
+    run_training(Args, train, argv, __doc__)
 
 
 if __name__ == "__main__":

@@ -1,18 +1,16 @@
 """Trains a view-quality policy for the general task; a training that was stopped goes on where it was.
 
-Example:
+Examples:
     python scripts/train_view_quality.py --out runs/view-quality --jobs 2
+    python scripts/train_view_quality.py --out runs/tuned --start-from runs/view-quality/policy.pt \
+        --env-options perception occlusion_model --config.rounds 800 --config.fit.steps 1500
 """
 
-import logging
-import sys
-import time
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 
-import tyro
-
-from maniskill_tomato.errors import TomatoError
+from maniskill_tomato.learning.script import parse_env_options, run_training
 from maniskill_tomato.learning.view_quality.training import QualityTrainConfig, train_view_quality
 
 
@@ -24,23 +22,23 @@ class Args:
     """Folder of the training."""
     jobs: int = 1
     """Processes that run episodes."""
+    start_from: Path | None = None
+    """A policy to go on from instead of beginning with the planner."""
+    env_options: dict[str, str] = field(default_factory=dict)
+    """Options of the task: names and values, these as JSON or plain words."""
     config: QualityTrainConfig = field(default_factory=QualityTrainConfig)
     """How to train."""
 
 
+def train(args: Args, report: Callable[[str], None]) -> Path:
+    """Trains as the options say."""
+    options = parse_env_options(args.env_options)
+    return train_view_quality(args.out, args.config, args.jobs, options, report, args.start_from)
+
+
 def main(argv: list[str] | None = None) -> None:
     """Trains; errors made on purpose end with one line and exit status 2."""
-    logging.basicConfig(level=logging.WARNING, format="%(message)s", stream=sys.stderr)
-    args = tyro.cli(Args, args=argv, description=__doc__)
-    start = time.perf_counter()
-    try:
-        path = train_view_quality(
-            args.out, args.config, args.jobs, report=lambda line: print(line, flush=True)
-        )
-    except TomatoError as error:
-        print(f"error: {error}", file=sys.stderr)
-        raise SystemExit(2) from None
-    print(f"policy {path} after {time.perf_counter() - start:.0f} s")
+    run_training(Args, train, argv, __doc__)
 
 
 if __name__ == "__main__":

@@ -1,5 +1,6 @@
 """The general viewpoint task: a tomato on a plant never seen before, hidden at the start, and a memory to look with."""
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any, get_args
@@ -13,7 +14,7 @@ from torch import Tensor
 from maniskill_tomato.errors import InvalidInputError
 from maniskill_tomato.plants.choice import PlantChoice
 from maniskill_tomato.plants.episode_list import EPISODE_LISTS, Episode, load_episodes
-from maniskill_tomato.plants.row import Row
+from maniskill_tomato.plants.row import Row, leaf_density_of
 from maniskill_tomato.robot.kinematics import link_transforms
 from maniskill_tomato.robot.look_at import camera_to_viewpoint
 from maniskill_tomato.tasks import MAX_GENERAL_STEPS, options
@@ -29,10 +30,14 @@ from maniskill_tomato.visibility.caster import Visibility
 from maniskill_tomato.visibility.clearance import PlantClearance
 from maniskill_tomato.visibility.observation import ObservationLayout, ViewpointObserver
 from maniskill_tomato.visibility.situation import Situation
+from maniskill_tomato.visibility.true_views import TrueViews
 from maniskill_tomato.visibility.view_rays import ViewRayCaster
 
 MAX_VIEWS = 64
 """Views of a target that are remembered; as many as the memory counts."""
+
+MAX_PLANT_DRAWS = 1000
+"""Plants drawn under a limit of leaf density before there is held to be none."""
 
 START_RPY = (0.0, torch.pi / 2, 0.0)
 """The angles that those of a first view are near to, in [rad]: along +x, upright."""
@@ -54,8 +59,8 @@ class TomatoViewpointGeneralEnv(TomatoEnv):
 
     **Options** beside those of the thesis's tasks:
 
-    - `episodes`: `"validation"` or `"held_out"` (or `Episode` objects) takes the episodes of a fixed list,
-      `reset(seed=i)` its i-th (modulo its length).
+    - `episodes`: `"validation"`, `"held_out"`, a `.json` file of such a list, or `Episode` objects, takes the episodes
+      of a fixed list, `reset(seed=i)` its i-th (modulo its length).
     - `layout`: an `ObservationLayout`, or the parts' names, says what the observation holds.
     - `start_visibility`: range of V_f of the first view.
     - `contact_penalty`: what a move with plant contact costs.
@@ -64,6 +69,8 @@ class TomatoViewpointGeneralEnv(TomatoEnv):
     - `perception`: `"ground_truth"`, or a `Perception` with which V_f, success, reward, the target's position and the
       rays' labels come from a camera image with noisy depth; the info then also has `true_visible_fraction` and
       `true_success`. Those in `camera_perception.RENDERED` need a renderer, and `segmenter` the extra `perception`.
+    - `privileged`: whether the observation ends with the truth about the views around (`visibility.true_views`), for
+      critics; `situation` never has it.
 
     `reset(options=...)` takes `episode` (index in the list), `target` (index of a ripe fruit in `Plant.fruits`) and
     `camera_position` (x, y, z [m], world frame).
@@ -87,6 +94,7 @@ class TomatoViewpointGeneralEnv(TomatoEnv):
         contact_penalty: float | None = None,
         sensor_noise: SensorNoise | Mapping[str, float] | None = None,
         perception: Perception = "ground_truth",
+        privileged: bool = False,
         plant: PlantChoice | Mapping[str, object] | str | None = None,
         plant_pose_noise: Sequence[float] | None = None,
         control_mode: str | None = "pd_look_at",
@@ -108,6 +116,8 @@ class TomatoViewpointGeneralEnv(TomatoEnv):
         if self._takes_pictures:
             width, height = RENDERED_SIZE
             kwargs.setdefault("sensor_configs", {"width": width, "height": height})
+        self._privileged = privileged
+        self._leaf_density_limit = math.inf
         task = task or GeneralTaskConfig()
         if start_visibility is not None:
             low, high = options.check_range("start_visibility", start_visibility)
@@ -117,9 +127,9 @@ class TomatoViewpointGeneralEnv(TomatoEnv):
         choice = PlantChoice.parse(plant, task.plant)
         self._episodes: tuple[Episode, ...] | None = None
         if isinstance(episodes, str):
-            options.check_choice("episodes", episodes, EPISODE_LISTS)
             self._episodes = load_episodes(episodes)
-            choice = replace(choice, seed=episodes, pool=None)
+            split = episodes if episodes in EPISODE_LISTS else "train"
+            choice = replace(choice, seed=split, pool=None)
         elif episodes is not None:
             self._episodes = tuple(episodes)
             if not self._episodes or not all(isinstance(e, Episode) for e in self._episodes):
@@ -154,6 +164,7 @@ class TomatoViewpointGeneralEnv(TomatoEnv):
         )
         self.soft_starts = 0
         """Episodes so far that no drawn start made as hard as asked for."""
+        self._true_views = TrueViews(n, self._observer.lattice) if self._privileged else None
         self._views = torch.zeros(n, MAX_VIEWS, 7, device=device)
         self._view_count = torch.zeros(n, dtype=torch.int64, device=device)
         self._moves = torch.zeros(n, dtype=torch.int64, device=device)
@@ -189,7 +200,36 @@ class TomatoViewpointGeneralEnv(TomatoEnv):
 
     def _plant_seed(self, env_index: int, rng: np.random.RandomState, options: dict[str, Any]) -> int:
         episode = self.episode(env_index, options)
-        return self._choice.draw_seed(rng) if episode is None else episode.plant_seed
+        if episode is not None:
+            return episode.plant_seed
+        # Without a limit, or with that of the task's highest density, the first draw is taken.
+        for _ in range(MAX_PLANT_DRAWS):
+            seed = self._choice.draw_seed(rng)
+            if (leaf_density_of(self._choice.leaf_density, seed) or 0.0) <= self._leaf_density_limit:
+                return seed
+        raise InvalidInputError(
+            f"none of {MAX_PLANT_DRAWS} drawn plants has a leaf density of {self._leaf_density_limit} or less; "
+            "raise the limit (leaf_density_start) or the plants' pool"
+        )
+
+    @property
+    def leaf_density_range(self) -> tuple[float, float]:
+        """Of the plants that are drawn without a limit; equal numbers where all plants have one density."""
+        density = self._choice.leaf_density
+        if isinstance(density, tuple):
+            return density
+        return (1.0, 1.0) if density is None else (density, density)
+
+    def limit_leaf_density(self, highest: float) -> None:
+        """From the next reset on, draws only plants whose leaf density is at most this.
+
+        Raises:
+            InvalidInputError: No plant of the range is as sparse as that.
+        """
+        low, _ = self.leaf_density_range
+        if highest <= low:
+            raise InvalidInputError(f"the highest leaf density must be above {low}, got {highest}")
+        self._leaf_density_limit = highest
 
     def _candidates(self, env_index: int) -> list[int]:
         """The fruits that can become targets."""
@@ -256,14 +296,27 @@ class TomatoViewpointGeneralEnv(TomatoEnv):
 
     def _look_anew(self, env_idx: Tensor) -> None:
         """Forgets what was seen in some environments and takes a first look at their targets."""
+        self._forget(env_idx)
+        self._look_first(env_idx)
+
+    def _forget(self, env_idx: Tensor) -> None:
+        """Begins with other targets, of which nothing was seen yet."""
         if self._eyes is not None:
             self._eyes.forget(env_idx)
+
+    def _look_first(self, env_idx: Tensor) -> None:
+        self._ask_truth(env_idx)
         self._observer.begin(env_idx, self._known_target_position()[env_idx])
         self._view_count[env_idx] = 0
         self._views[env_idx] = 0.0
         mask = torch.zeros(self.num_envs, dtype=torch.bool, device=self.device)
         mask[env_idx] = True
         self._look(self.agent.robot.get_qpos(), mask)
+
+    def _ask_truth(self, env_idx: Tensor) -> None:
+        if self._true_views is not None:
+            fraction = self.ground_truth.visible_fraction
+            self._true_views.begin(env_idx, self._target_position_w, fraction)
 
     # ------------------------------------------------------------------- step
 
@@ -327,14 +380,29 @@ class TomatoViewpointGeneralEnv(TomatoEnv):
         batch = super()._step_action(action)
         if batch is None:
             return None
-        qpos = self.agent.robot.get_qpos()
-        self._clearance = self._plant_clearance.along(before, qpos, self.planting.T_world_plant)
+        self._path_length = self._path_length + self._pass_way(before, position, batch)
         self._moves = self._moves + 1
-        self._look(qpos, None)
-        self._path_length = self._path_length + (self._camera_position - position).norm(dim=-1)
+        self._look(self.agent.robot.get_qpos(), None)
         self._visible_fraction = self._measured_fraction().clone()
         self._gain = self._visible_fraction - fraction
         return batch
+
+    def _pass_way(self, before: Tensor, position: Tensor, action: Tensor) -> Tensor:
+        """Measures the clearance of the last move and how long the camera's way was.
+
+        Args:
+            before: Joint positions before it, in [rad]. Shape (num_envs, 7).
+            position: Where the camera stood then, in the world frame, in [m]. Shape (num_envs, 3).
+            action: What was asked for. Shape (num_envs, A).
+
+        Returns:
+            The way's length, in [m]. Shape (num_envs,).
+        """
+        qpos = self.agent.robot.get_qpos()
+        self._clearance = self._plant_clearance.along(before, qpos, self.planting.T_world_plant)
+        T_w_camera = link_transforms(qpos)[:, -1] @ self._T_ee_camera
+        length: Tensor = (T_w_camera[:, :3, 3] - position).norm(dim=-1)
+        return length
 
     def evaluate(self) -> dict[str, Tensor]:
         """What came of the last move: V_f, whether that is a success, and what the move touched."""
@@ -376,7 +444,10 @@ class TomatoViewpointGeneralEnv(TomatoEnv):
         return self.compute_dense_reward(obs, action, info) / (1.0 + self.task.success_reward)
 
     def _get_obs_extra(self, info: dict[str, Tensor]) -> dict[str, Tensor]:
-        return {name: self._observation[:, part].clone() for name, part in self.layout.slices.items()}
+        seen = {str(name): self._observation[:, part].clone() for name, part in self.layout.slices.items()}
+        if self._true_views is not None:
+            seen["truth"] = self._true_views.describe(self._camera_position, self._target_position_w)
+        return seen
 
     # ------------------------------------------------------------------ state
 
@@ -397,6 +468,7 @@ class TomatoViewpointGeneralEnv(TomatoEnv):
         self._clearance, self._gain = self._clearance.clone(), self._gain.clone()
         self._path_length = self._path_length.clone()
         self._clearance[indices], self._gain[indices], self._path_length[indices] = last.unbind(-1)
+        self._ask_truth(indices)
         self._replay(indices)
 
     def _replay(self, indices: Tensor) -> None:

@@ -35,21 +35,26 @@ class GroundTruth:
         self._target = target
 
     def visible_fraction(
-        self, T_world_camera: Tensor, env_index: int = 0, qpos: Tensor | None = None
+        self,
+        T_world_camera: Tensor,
+        env_index: int = 0,
+        qpos: Tensor | None = None,
+        fruit: int | None = None,
     ) -> Tensor:
-        """V_f of an environment's target from K viewpoints.
+        """V_f of an environment's target, or of another fruit, from K viewpoints.
 
         Args:
             T_world_camera: Poses of the optical frames, translation in [m]. Shape (K, 4, 4).
             env_index: Which environment.
             qpos: The arm's joint positions at each, in [rad], if it shall hide what it hides; None for no arm.
                 Shape (K, 7).
+            fruit: Index in `Plant.fruits`; the target if None.
 
         Returns:
             In [0, 1]. Shape (K,).
         """
         links = None if qpos is None else link_transforms(qpos.float())
-        target = int(self._target()[env_index])
+        target = int(self._target()[env_index]) if fruit is None else fruit
         T_world_plant = self._planting().T_world_plant[env_index]
         return self._cast_views.visible_fraction(
             T_world_camera.float(), target, T_world_plant, links, env_index

@@ -28,6 +28,7 @@ from maniskill_tomato.evaluation.benchmark_report import evaluate_runs, write_be
 from maniskill_tomato.evaluation.benchmark_store import EpisodeStore
 from maniskill_tomato.evaluation.view_episode import ViewEpisode
 from maniskill_tomato.evaluation.view_rollout import run_view_episode
+from maniskill_tomato.plants.episode_list import load_episodes, write_episodes
 
 HORIZON = 20
 
@@ -192,6 +193,8 @@ def test_sweeps_have_conditions_with_names_of_their_own() -> None:
     names = [condition.name for axis in SWEEPS for condition in sweep_conditions(axis)]
     assert len(names) == len(set(names)) >= 20
     assert main_condition().name not in names
+    own = main_condition("runs/fresh.json")
+    assert own.name == "fresh" and own.episode_list == own.env_options["episodes"] == "runs/fresh.json"
     with pytest.raises(InvalidInputError, match="the sweep"):
         sweep_conditions("weather")
 
@@ -364,6 +367,15 @@ def test_the_command_line_names_policies_list_and_sweeps(tmp_path: Path) -> None
     assert isinstance(command, Benchmark)
     assert (command.policies, command.episodes, command.seed, command.jobs) == ("nbv,oracle", 7, 3, 2)
     assert (command.sweeps, command.episode_list, command.out) == ("depth,pose", "validation", tmp_path)
+
+
+def test_sweeps_need_a_list_of_the_package(tmp_path: Path) -> None:
+    path = tmp_path / "own.json"
+    write_episodes(path, load_episodes("validation")[:2])
+    with pytest.raises(InvalidInputError, match="--episode-list validation or held_out"):
+        Benchmark(
+            policies="nbv", episodes=1, episode_list=str(path), sweeps="depth", out=tmp_path / "b"
+        ).run()
 
 
 @pytest.mark.parametrize(

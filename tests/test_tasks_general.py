@@ -51,7 +51,7 @@ def env() -> Iterator[Any]:
 
 @pytest.fixture(scope="module")
 def row() -> Iterator[Any]:
-    env = make(ROW)
+    env = make(ROW, transits="none")
     yield env
     env.close()
 
@@ -265,6 +265,12 @@ def test_episodes_of_a_list_come_by_seed_and_by_index(tmp_path: Path) -> None:
         pose = torch.cat([base.planting.position_w[0, :2], base.planting.yaw])
         torch.testing.assert_close(pose, torch.tensor(episode.plant_pose), atol=1e-5, rtol=0)
     env.close()
+    of_file: Any = make(episodes=str(path), plant=None)
+    of_file.reset(seed=2)
+    assert of_file.unwrapped.planting.seeds[0] == episodes[2].plant_seed
+    of_file.close()
+    with pytest.raises(InvalidInputError, match="held_out"):
+        make(episodes=str(tmp_path / "missing.json"))
 
 
 def test_a_list_grows_by_the_same_episodes_whether_at_once_or_in_parts() -> None:

@@ -4,7 +4,8 @@ import json
 import math
 import subprocess
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +20,7 @@ from maniskill_tomato.evaluation.rollout import run_episodes
 from maniskill_tomato.evaluation.view_rollout import run_view_episode
 from maniskill_tomato.evaluation.viewpoint_policy import acting_policy, open_viewpoint_policy
 from maniskill_tomato.learning.envs import make_env
+from maniskill_tomato.learning.script import parse_env_options, run_training
 from maniskill_tomato.learning.view_quality.collect import QualityData, collect_episodes
 from maniskill_tomato.learning.view_quality.fit import FitConfig, fit, judge, mirrored
 from maniskill_tomato.learning.view_quality.training import QualityTrainConfig, train_view_quality
@@ -210,6 +212,23 @@ def test_what_is_collected_is_the_truth(env: Any) -> None:
     assert joined.episode.max() == 3 and len(joined.maps) == 2 * len(data.maps)
 
 
+def test_a_camera_that_corrects_the_target_moves_the_candidates_that_are_judged() -> None:
+    env: Any = make_env("TomatoViewpoint-v1", plant=PLANT, perception="occlusion_model")
+    world = env.unwrapped
+    data = collect_episodes(env, range(3))
+    # An episode whose target was located on the way has a table for each belief.
+    assert 3 < len(data.visible_fraction) == int(data.episode.max()) + 1 <= 6
+    assert bool((data.episode.diff() >= 0).all()) and bool((data.episode.diff() <= 1).all())
+    env.reset(seed=0)
+    situation = world.situation
+    target = situation.target_position[0]
+    assert not torch.equal(target, world.target_position_w[0])
+    pose = look_at_pose(target + situation.lattice.offsets[250], target)[None]
+    truth = float(world.ground_truth.visible_fraction(pose)[0])
+    assert float(data.visible_fraction[0, 250]) == pytest.approx(truth, abs=1e-3)
+    env.close()
+
+
 def test_the_network_learns_what_the_maps_tell() -> None:
     """V_f of a candidate is the first feature at it; full views are those above the threshold."""
     generator = torch.Generator().manual_seed(0)
@@ -254,10 +273,66 @@ def test_a_training_goes_on_where_it_was(tmp_path: Path) -> None:
         train_view_quality(tmp_path / "run", QualityTrainConfig(), env_options=options)
 
 
+def test_a_training_begins_with_the_network_that_it_is_given(tmp_path: Path) -> None:
+    torch.manual_seed(3)
+    given = ViewQuality(new_network(4, 1))
+    for parameter in given.network.parameters():
+        parameter.data += 0.1
+    save_view_quality(tmp_path / "given.pt", given)
+    config = QualityTrainConfig(
+        rounds=(1,),
+        block=1,
+        pool=2,
+        validation_episodes=1,
+        fit=FitConfig(steps=1, batch_size=2, learning_rate=1e-9, weight_decay=0.0, width=8, blocks=2),
+    )
+    arguments: dict[str, Any] = {"env_options": {"plant": {"row": False, "pool": 2}}}
+    path = train_view_quality(tmp_path / "run", config, start_from=tmp_path / "given.pt", **arguments)
+    for a, b in zip(given.network.parameters(), load_view_quality(path).network.parameters(), strict=True):
+        torch.testing.assert_close(a, b, atol=1e-6, rtol=0.0)
+    with pytest.raises(InvalidInputError, match="other settings"):
+        train_view_quality(tmp_path / "run", config, **arguments)
+    with pytest.raises(CheckpointError):
+        train_view_quality(tmp_path / "other", config, start_from=tmp_path / "missing.pt", **arguments)
+
+
+def test_options_of_the_task_are_read_from_words() -> None:
+    texts = {"perception": "occlusion_model", "contact_penalty": "0.5", "plant": '{"pool": 3}'}
+    options = parse_env_options(texts)
+    assert options == {"perception": "occlusion_model", "contact_penalty": 0.5, "plant": {"pool": 3}}
+
+
+def test_a_training_script_says_errors_in_one_line(
+    capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    @dataclass
+    class Args:
+        out: Path = tmp_path
+
+    def fails(args: Args, report: Callable[[str], None]) -> Path:
+        report("begun")
+        raise InvalidInputError("the folder is full; empty it")
+
+    with pytest.raises(SystemExit) as stop:
+        run_training(Args, fails, [], "A script.")
+    assert stop.value.code == 2
+    told = capsys.readouterr()
+    assert told.out == "begun\n" and told.err.strip() == "error: the folder is full; empty it"
+    run_training(Args, lambda args, report: args.out / "policy.pt", ["--out", "there"], "A script.")
+    assert capsys.readouterr().out.startswith("policy there/policy.pt after ")
+
+
 def test_the_script_offers_every_setting() -> None:
     script = Path(__file__).resolve().parent.parent / "scripts" / "train_view_quality.py"
     done = subprocess.run([sys.executable, str(script), "--help"], capture_output=True, text=True, check=True)
-    for flag in ("--jobs", "--config.rounds", "--config.fit.learning-rate", "--config.fit.seed"):
+    for flag in (
+        "--jobs",
+        "--config.rounds",
+        "--config.fit.learning-rate",
+        "--config.fit.seed",
+        "--start-from",
+        "--env-options",
+    ):
         assert flag in done.stdout
 
 
@@ -346,4 +421,6 @@ def test_the_evaluation_of_a_row_counts_the_tomatoes_that_were_seen() -> None:
     figures = summarise([episode, episode])
     seen, wanted = episode.targets_seen
     assert 0 < seen <= wanted and figures["target_seen_share"] == pytest.approx(seen / wanted)
-    assert figures["moves_per_seen_target"] == pytest.approx(steps / seen)
+    moves = int(info["moves"])
+    assert episode.moves == moves >= steps == episode.steps
+    assert figures["moves_per_seen_target"] == pytest.approx(moves / seen)

@@ -5,13 +5,11 @@ import os
 from collections import Counter
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 from maniskill_tomato.errors import InvalidInputError
 
 # PyTorch and ManiSkill take seconds to import; the command imports what it needs when it runs.
-
-EpisodeList = Literal["held_out", "validation"]
 
 DEFAULT_POLICIES = (
     "random_viewpoint,fixed_sweep,3dmts,gradient_nbv,nbv_direction,nbv,view_quality,greedy_truth,oracle"
@@ -26,8 +24,8 @@ class Benchmark:
     """Names of planners, files of trained policies, or LABEL=FILE, with commas between them."""
     episodes: int = 500
     """How many episodes of the list."""
-    episode_list: EpisodeList = "held_out"
-    """Which fixed list: held_out to report, validation to choose."""
+    episode_list: str = "held_out"
+    """Which fixed list: held_out to report, validation to choose, or a file of `scripts/certify_episodes.py`."""
     seed: int = 0
     """The first of them."""
     out: Path = Path("runs/benchmark")
@@ -59,15 +57,19 @@ class Benchmark:
         )
         from maniskill_tomato.evaluation.benchmark_store import EpisodeStore
         from maniskill_tomato.planners.registry import PRIVILEGED
-        from maniskill_tomato.plants.episode_list import load_episodes
+        from maniskill_tomato.plants.episode_list import EPISODE_LISTS, load_episodes
         from maniskill_tomato.tasks.general_config import GeneralTaskConfig
 
         specs = parse_policies(self.policies)
         main = main_condition(self.episode_list)
-        listed = len(load_episodes(main.name))
+        listed = len(load_episodes(self.episode_list))
         axes = (
             list(SWEEPS) if self.sweeps == "all" else [a.strip() for a in self.sweeps.split(",") if a.strip()]
         )
+        if axes and self.episode_list not in EPISODE_LISTS:
+            raise InvalidInputError(
+                f"--sweeps grows plants of a split and needs --episode-list {' or '.join(EPISODE_LISTS)}"
+            )
         swept = [condition for axis in axes for condition in sweep_conditions(axis, main.name)]
         wanted_counts = {"--episodes": self.episodes} | (
             {"--sweep-episodes": self.sweep_episodes} if swept else {}

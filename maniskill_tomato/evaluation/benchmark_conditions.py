@@ -1,6 +1,7 @@
 """The conditions of a benchmark: the fixed list of held-out episodes, and sweeps over one difficulty at a time."""
 
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any
 
 from maniskill_tomato.errors import InvalidInputError
@@ -25,8 +26,9 @@ class Condition:
 
 
 def main_condition(episode_list: str = MAIN) -> Condition:
-    """The fixed list."""
-    return Condition(name=episode_list, env_options={"episodes": episode_list}, episode_list=episode_list)
+    """The fixed list of a name, or of a `.json` file, which lends the condition its own."""
+    name = Path(episode_list).stem
+    return Condition(name=name, env_options={"episodes": episode_list}, episode_list=episode_list)
 
 
 SWEEPS: dict[str, tuple[float, ...]] = {

@@ -46,7 +46,7 @@ def summarise(episodes: Sequence[Episode]) -> dict[str, Any]:
     steps = np.array([e.steps for e in episodes])
     success = np.array([e.success for e in episodes])
     touches = [e.plant_contact for e in episodes if e.plant_contact is not None]
-    rows = [(*e.targets_seen, e.steps) for e in episodes if e.targets_seen is not None]
+    rows = [(*e.targets_seen, e.moves or e.steps) for e in episodes if e.targets_seen is not None]
     found, wanted, moves = (sum(values) for values in zip(*rows, strict=True)) if rows else (0, 0, 0)
     return {
         "episodes": count,

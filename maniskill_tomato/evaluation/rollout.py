@@ -49,6 +49,8 @@ class Episode:
     """Whether each step touched a plant; None where the task does not say. Shape (T,)."""
     targets_seen: tuple[int, int] | None = None
     """How many tomatoes were seen, and of how many; None where the task has one target."""
+    moves: int | None = None
+    """Moves as the task counts them, those of a row's transits among them; None where it counts none."""
 
     @property
     def steps(self) -> int:
@@ -124,6 +126,7 @@ def _run_batch(env: gym.Env[Any, Any], policy: ActingPolicy, seeds: list[int]) -
             info.get("plant_contact", nowhere),
             info.get("seen_count", nowhere),
             info.get("target_count", nowhere),
+            info.get("moves", nowhere),
         )
         steps.append(torch.stack([value.float() for value in outcome], dim=-1))
         running = running & ~(terminated | truncated)
@@ -158,4 +161,5 @@ def _episode(seed: int, success: bool, seen: Float64, happened: Float64, told: C
         in_forbidden_zone=happened[:steps, 2].astype(np.bool_),
         plant_contact=happened[:steps, 4].astype(np.bool_) if "plant_contact" in told else None,
         targets_seen=(found, wanted) if "seen_count" in told else None,
+        moves=int(happened[steps - 1, 7]) if "moves" in told else None,
     )

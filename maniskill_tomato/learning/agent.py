@@ -13,6 +13,7 @@ from maniskill_tomato.learning.networks import Actor, Critic, ObservationNormali
 from maniskill_tomato.learning.presets import OBSERVATION_CENTRE, OBSERVATION_HALF_RANGE, TrainConfig
 from maniskill_tomato.learning.replay import Batch
 from maniskill_tomato.learning.running_statistics import RunningStatistics
+from maniskill_tomato.visibility.true_views import TRUE_VIEWS
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -36,12 +37,29 @@ class Agent:
     def observe(self, observations: Tensor) -> None:
         """Lets a running normaliser follow what the environments show. Shape (B, observation_dim)."""
         if self.config.normalize_observations == "running":
-            self.statistics.update(observations, self.normalizer)
+            self.statistics.update(observations[:, : self.actor_dim], self.normalizer)
+
+    @property
+    def actor_dim(self) -> int:
+        """How many of the observed values the actor sees: all but the last ones of a privileged critic."""
+        return len(self.normalizer.centre)
+
+    def actor_input(self, observations: Tensor) -> Tensor:
+        """What the actor sees of observations, normalised. Shape (B, actor_dim)."""
+        normalized: Tensor = self.normalizer(observations[:, : self.actor_dim])
+        return normalized
+
+    def critic_input(self, observations: Tensor) -> Tensor:
+        """What the critics see: the same, and after it the privileged values as they are. Shape (B, dim)."""
+        seen = self.actor_input(observations)
+        if observations.shape[-1] == self.actor_dim:
+            return seen
+        return torch.cat([seen, observations[:, self.actor_dim :]], dim=-1)
 
     def policy(self, observations: Tensor) -> Tensor:
         """The policy's actions, in units of the action scale. Shape (B, action_dim)."""
         with torch.no_grad():
-            actions: Tensor = self.actor(self.normalizer(observations))
+            actions: Tensor = self.actor(self.actor_input(observations))
         return actions
 
 
@@ -68,12 +86,20 @@ def make_critic(config: TrainConfig, observation_dim: int, action_dim: int) -> C
 def make_agent(
     config: TrainConfig, observation_dim: int, action_dim: int, device: torch.device | str = "cpu"
 ) -> Agent:
-    """A freshly initialised agent; the weights come from torch's global random state."""
-    actor = make_actor(config, observation_dim, action_dim).to(device)
+    """A freshly initialised agent; the weights come from torch's global random state.
+
+    Args:
+        config: How it learns.
+        observation_dim: Number of observed values, a privileged critic's at the end.
+        action_dim: Number of actions.
+        device: Where the networks are.
+    """
+    actor_dim = observation_dim - (TRUE_VIEWS if config.privileged_critic else 0)
+    actor = make_actor(config, actor_dim, action_dim).to(device)
     critics = nn.ModuleList(
         make_critic(config, observation_dim, action_dim) for _ in range(2 if config.twin_critics else 1)
     ).to(device)
-    heads = AuxiliaryHeads(config, observation_dim).to(device)
+    heads = AuxiliaryHeads(config, actor_dim).to(device)
     actor_parameters, critic_parameters = (
         _trained(actor, heads.distance),
         _trained(critics, heads.visible_fraction),
@@ -86,8 +112,8 @@ def make_agent(
         target_critics=copy.deepcopy(critics).requires_grad_(False),
         actor_optimizer=torch.optim.Adam(actor_parameters, lr=config.actor_learning_rate, fused=True),
         critic_optimizer=torch.optim.Adam(critic_parameters, lr=config.critic_learning_rate, fused=True),
-        normalizer=make_normalizer(config, observation_dim).to(device),
-        statistics=RunningStatistics(observation_dim).to(device),
+        normalizer=make_normalizer(config, actor_dim).to(device),
+        statistics=RunningStatistics(actor_dim).to(device),
         heads=heads,
     )
 
@@ -132,10 +158,10 @@ def distribution_targets(agent: Agent, batch: Batch, generator: torch.Generator 
 
 
 def _target_actions(agent: Agent, batch: Batch, generator: torch.Generator | None) -> tuple[Tensor, Tensor]:
-    """s', normalised, and what the target actor does there, smoothed where configured."""
+    """s' as the critics see it, and what the target actor does there, smoothed where configured."""
     config = agent.config
-    next_observations = agent.normalizer(batch.next_observations)
-    next_actions = agent.target_actor(next_observations)
+    next_observations = agent.critic_input(batch.next_observations)
+    next_actions = agent.target_actor(next_observations[:, : agent.actor_dim])
     if config.target_noise > 0.0:
         noise = torch.randn(next_actions.shape, generator=generator, device=next_actions.device)
         noise = (noise * config.target_noise).clamp_(-config.target_noise_clip, config.target_noise_clip)
@@ -161,7 +187,7 @@ def update_critic(agent: Agent, batch: Batch, generator: torch.Generator | None 
     """
     categorical = agent.config.critic == "categorical"
     targets = (distribution_targets if categorical else td_targets)(agent, batch, generator)
-    observations = agent.normalizer(batch.observations)
+    observations = agent.critic_input(batch.observations)
     total = torch.zeros((), device=targets.device)
     auxiliary = torch.zeros((), device=targets.device)
     logs: dict[str, Tensor] = {}
@@ -200,10 +226,10 @@ def update_actor(agent: Agent, observations: Tensor) -> dict[str, Tensor]:
         `actor_loss`: minus the mean value, plus the penalty on saturated outputs where one is configured;
         `aux_distance_loss` where it has a weight. Scalars.
     """
-    normalized = agent.normalizer(observations)
-    features = agent.actor.features(normalized)
+    seen = agent.critic_input(observations)
+    features = agent.actor.features(seen[:, : agent.actor_dim])
     pre_activation = agent.actor.output(features)
-    loss = -agent.critics[0](normalized, torch.tanh(pre_activation)).mean()
+    loss = -agent.critics[0](seen, torch.tanh(pre_activation)).mean()
     if agent.config.pre_tanh_penalty > 0.0:
         loss = loss + agent.config.pre_tanh_penalty * pre_activation.square().mean()
     logs = {"actor_loss": loss.detach()}

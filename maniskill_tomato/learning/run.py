@@ -4,11 +4,13 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+from maniskill_tomato.errors import InvalidInputError
 from maniskill_tomato.learning.envs import LearnerEnv, check_env_id, make_learner_env
 from maniskill_tomato.learning.presets import TrainConfig
 from maniskill_tomato.learning.progress import Progress
 from maniskill_tomato.learning.run_folder import check_run_dir, clear_run
 from maniskill_tomato.learning.trainer import Trainer, TrainResult
+from maniskill_tomato.tasks import GENERAL_IDS
 
 
 def train(
@@ -65,10 +67,16 @@ def train(
 
 
 def make_training_env(env_id: str, config: TrainConfig, env_options: dict[str, Any]) -> LearnerEnv:
-    """The environments that a configuration trains in: its number of them, judging what its hindsight needs.
+    """The environments that a configuration trains in, telling what its hindsight and its critics need.
 
     Raises:
         InvalidInputError: The id or an option cannot be used.
     """
-    judged = {"other_targets": config.hindsight_targets} if config.hindsight_targets else {}
-    return make_learner_env(env_id, config.num_envs, **{**judged, **env_options})
+    needed: dict[str, Any] = {"other_targets": config.hindsight_targets} if config.hindsight_targets else {}
+    if config.privileged_critic:
+        if env_id not in GENERAL_IDS:
+            raise InvalidInputError(
+                f"privileged_critic needs a general task, one of {', '.join(GENERAL_IDS)}; got {env_id}"
+            )
+        needed["privileged"] = True
+    return make_learner_env(env_id, config.num_envs, **{**needed, **env_options})

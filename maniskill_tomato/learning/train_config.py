@@ -22,6 +22,7 @@ MAY_CHANGE = (
 _AT_LEAST_ONE = (
     "n_step",
     "success_threshold_steps",
+    "leaf_density_steps",
     "batch_size",
     "buffer_size",
     "policy_frequency",
@@ -112,6 +113,14 @@ class TrainConfig:
     """Weight of predicting the distance to the target, in [m], from the actor's last hidden layer."""
     aux_visibility_weight: float = 0.0
     """Weight of predicting V_f after the action from the critics' last hidden layers."""
+    privileged_critic: bool = False
+    """Show the critics, which only training needs, the true V_f around the present view; general tasks only."""
+
+    # Curriculum.
+    leaf_density_start: float | None = None
+    """Highest leaf density of the plants at the start of the run; it rises linearly to the task's. None: no limit."""
+    leaf_density_steps: int = 5000
+    """Steps in which it rises."""
 
     # Hindsight.
     hindsight_targets: int = 0

@@ -16,6 +16,7 @@ from torch import Tensor
 from maniskill_tomato.errors import CheckpointError, InvalidInputError, TrainingDivergedError
 from maniskill_tomato.learning.agent import update
 from maniskill_tomato.learning.checkpoint import make_checkpoint, save_checkpoint
+from maniskill_tomato.learning.curriculum import LeafDensityCurriculum
 from maniskill_tomato.learning.env_state import seed_action_spaces
 from maniskill_tomato.learning.envs import LearnerEnv
 from maniskill_tomato.learning.initial_policy import begin_with, check_fits
@@ -38,6 +39,7 @@ from maniskill_tomato.learning.run_folder import (
 from maniskill_tomato.learning.threshold import label_successes, success_threshold
 from maniskill_tomato.learning.training_state import TrainingState
 from maniskill_tomato.learning.wandb_log import import_wandb
+from maniskill_tomato.visibility.true_views import TRUE_VIEWS
 
 logger = logging.getLogger(__name__)
 
@@ -110,12 +112,14 @@ class Trainer:
         self._given: Policy | None = None
         if config.initial_policy is not None and not resume:
             self._given = load_policy(config.initial_policy, env_id=env_id)
-            check_fits(self._given, config, observation_space.shape[0])
+            privileged = TRUE_VIEWS if config.privileged_critic else 0
+            check_fits(self._given, config, observation_space.shape[0] - privileged)
         if not resume:
             check_run_dir(run_dir)
         elif not (run_dir / "config.json").is_file():
             raise InvalidInputError(f"{run_dir} holds no run to continue (no config.json)")
         self._env = env
+        self._curriculum = LeafDensityCurriculum(config, env)
         self._env_id = env_id
         self._config = config
         self._run_dir = run_dir
@@ -157,6 +161,7 @@ class Trainer:
         seed_global_random_state(self._seed)
         seed_action_spaces(self._env, self._seed)
         saved = self._saved_run()
+        self._curriculum.apply(0)
         observations, info = self._env.reset(seed=self._seed)
         self._state = state = TrainingState(
             self._env, self._config, self._dims, self._seed, observations, info
@@ -206,6 +211,7 @@ class Trainer:
                 state.agent.policy(observations), observations, state.step, state.episode_starts
             )
             self._check_finite(action=actions)
+            self._curriculum.apply(state.step)
             next_observations, rewards, terminations, truncations, info = self._env.step(
                 actions * self._scale
             )

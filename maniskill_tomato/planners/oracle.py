@@ -181,7 +181,7 @@ class OracleSearch:
         outer, inner = moves * MAX_MOVE, (moves - 1) * MAX_MOVE
         spacing = SPACINGS[min(moves, len(SPACINGS)) - 1]
         count = math.ceil(4.0 / 3.0 * math.pi * (outer**3 - inner**3) / spacing**3)
-        points = start + _shell_points(count, inner, outer).to(start)
+        points = start + shell_points(count, inner, outer).to(start)
         shoulder = points.new_tensor(SHOULDER)
         kept = (
             ((points - target).norm(dim=1) >= MIN_DISTANCE)
@@ -248,7 +248,7 @@ def _apart(places: Tensor, excluded: Tensor) -> Tensor:
     return (torch.cdist(places, excluded) > NEAR_ENOUGH).all(dim=1)
 
 
-def _shell_points(count: int, inner: float, outer: float) -> Tensor:
+def shell_points(count: int, inner: float, outer: float) -> Tensor:
     """Points of even density between two spheres about the origin, the same ones every time.
 
     A Kronecker sequence of three coordinates (the R_3 sequence of Roberts 2018, whose base is the root of

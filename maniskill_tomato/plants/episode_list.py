@@ -45,22 +45,24 @@ class Episode:
 
 
 def episode_path(name: str) -> Path:
-    """The file of a list of `EPISODE_LISTS`.
+    """The file of a list of `EPISODE_LISTS`, or the one that the name itself is the path of.
 
     Raises:
         InvalidInputError: There is no such list.
     """
+    if name.endswith(".json") and Path(name).is_file():
+        return Path(name)
     if name not in EPISODE_LISTS:
-        raise InvalidInputError.choice("episodes", name, EPISODE_LISTS)
+        raise InvalidInputError.choice("episodes", name, (*EPISODE_LISTS, "a .json file of such a list"))
     return Path(asset_path(f"episodes/{name}.json"))
 
 
 @cache
 def load_episodes(name: str) -> tuple[Episode, ...]:
-    """A list of the package.
+    """A list of the package, or of a file.
 
     Args:
-        name: One of `EPISODE_LISTS`.
+        name: One of `EPISODE_LISTS`, or the path of a `.json` file.
 
     Raises:
         InvalidInputError: There is no such list.

@@ -20,14 +20,15 @@ from maniskill_tomato.visibility.situation import Situation
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class QualityData:
-    """N looks in M episodes."""
+    """N looks in M episodes or parts of them."""
 
     maps: Tensor
     """Shape (N, 20, 13, 9), float16."""
     scalars: Tensor
     """Shape (N, 9)."""
     episode: Tensor
-    """Row of each look in the tables below. Shape (N,), int64."""
+    """Row of each look in the tables below: an episode's, or the part's of it after the target was located anew. Shape
+    (N,), int64."""
     visible_fraction: Tensor
     """True V_f from every candidate. Shape (M, K), float16."""
     reachable: Tensor
@@ -104,15 +105,18 @@ def collect_episodes(
     for seed in seeds:
         env.reset(seed=seed)
         situation: Situation = world.situation
-        target = situation.target_position[0]
-        poses = look_at_pose(situation.lattice.positions(situation.target_position)[0], target)
-        fractions.append(world.ground_truth.visible_fraction(poses).half())
-        reachable.append(situation.reachable[0].clone())
         policy = _Wanderer(np.random.default_rng(seed), network)
         policy.begin(situation, first)
+        target = torch.full((3,), float("nan"))
         done = False
         while not done:
             situation = world.situation
+            if not torch.equal(target, situation.target_position[0]):
+                # The candidates stand round where the target is believed to be, which a camera may correct.
+                target = situation.target_position[0].clone()
+                poses = look_at_pose(situation.lattice.positions(target[None])[0], target)
+                fractions.append(world.ground_truth.visible_fraction(poses).half())
+                reachable.append(situation.reachable[0].clone())
             seen = quality_features(situation)
             maps.append(seen[0][0].half())
             scalars.append(seen[1][0])

@@ -1,5 +1,6 @@
 """From nothing to a view-quality policy: rounds of episodes and fits, kept in a folder and continued from there."""
 
+import hashlib
 import json
 import logging
 import time
@@ -63,6 +64,7 @@ def train_view_quality(
     jobs: int = 1,
     env_options: dict[str, Any] | None = None,
     report: Callable[[str], None] = lambda line: None,
+    start_from: Path | None = None,
 ) -> Path:
     """Trains, or goes on with the training in a folder.
 
@@ -72,15 +74,21 @@ def train_view_quality(
         jobs: Processes that run episodes.
         env_options: Options of the task beside its plants' split.
         report: Told one line after every block and every 200 batches.
+        start_from: A policy whose network leads the first round too, and that the first fit goes on from.
 
     Returns:
         File of the last round's policy, `policy.pt`.
 
     Raises:
         InvalidInputError: The folder holds a training with another configuration.
+        CheckpointError: `start_from` cannot be read.
     """
     config = config or QualityTrainConfig()
-    settings = {"config": asdict(config), "env_options": env_options or {}}
+    network: ViewQualityNetwork | None = None
+    settings: dict[str, Any] = {"config": asdict(config), "env_options": env_options or {}}
+    if start_from is not None:
+        network = load_view_quality(start_from).network
+        settings["start_from"] = hashlib.sha256(start_from.read_bytes()).hexdigest()
     # As JSON tells it, with lists for tuples.
     settings = json.loads(json.dumps(settings))
     described = out / "config.json"
@@ -102,11 +110,10 @@ def train_view_quality(
         )
         for b in range(count)
     ]
-    network: ViewQualityNetwork | None = None
     plan: list[Block] = []
     for number, episodes in enumerate(config.rounds):
         policy_path = out / f"round-{number}.pt"
-        before = None if number == 0 else out / f"round-{number - 1}.pt"
+        before = start_from if number == 0 else out / f"round-{number - 1}.pt"
         first = (config.seed * len(config.rounds) + number) * max(config.rounds)
         plan += [
             _block(
