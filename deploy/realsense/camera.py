@@ -130,11 +130,11 @@ class RealSenseCamera(Camera):
                 why_not = "only one of colour and depth came"
                 continue
             number, stamp = int(color.get_frame_number()), self._stamp(color)
-            if self._last_number is not None and number == self._last_number:
-                why_not = f"frame {number} came again"
-                continue
             if after is not None and stamp <= after:
                 why_not = f"frame {number} was taken {after - stamp:.3f} s too early"
+                continue
+            if self._last_number is not None and number == self._last_number:
+                why_not = f"frame {number} came again"
                 continue
             self._last_number = number
             assert self._filters is not None
