@@ -17,6 +17,7 @@ from tqdm import tqdm
 from maniskill_tomato.errors import InvalidInputError, TomatoError
 from maniskill_tomato.files import write_atomically
 from maniskill_tomato.perception.formats import read_annotated
+from maniskill_tomato.perception.occlusion.amodal import AmodalModel
 from maniskill_tomato.perception.occlusion.estimate import OcclusionModel
 from maniskill_tomato.perception.occlusion.figure import draw_steps
 from maniskill_tomato.perception.occlusion.improved import ImprovedModel
@@ -33,7 +34,7 @@ class Args:
     """A folder of `maniskill-tomato dataset`."""
     out: Path = Path("runs/occlusion")
     """Folder of the results."""
-    models: tuple[str, ...] = ("thesis", "improved", "sphere")
+    models: tuple[str, ...] = ("thesis", "improved", "sphere", "amodal")
     """Which models."""
     count: int | None = None
     """Only the first images; all by default."""
@@ -72,6 +73,7 @@ def main(args: Args) -> None:
         "thesis": ThesisModel(),
         "improved": ImprovedModel(),
         "sphere": SphereModel(),
+        "amodal": AmodalModel(),
     }
     for name in args.models:
         if name not in known:

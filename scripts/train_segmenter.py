@@ -26,7 +26,13 @@ from maniskill_tomato.perception.light_training import LightTrainConfig, LightTr
 from maniskill_tomato.perception.mask_rcnn_training import MaskRcnnTraining
 from maniskill_tomato.perception.resumable_training import CHECKPOINT, ResumableTraining
 from maniskill_tomato.perception.training_pictures import read_place
-from maniskill_tomato.perception.yolo import train_yolo, write_yolo_data
+from maniskill_tomato.perception.yolo import (
+    read_history,
+    stock_settings,
+    thesis_settings,
+    train_yolo,
+    write_yolo_data,
+)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -78,10 +84,11 @@ class Light(DataArgs):
 class MaskRcnn(DataArgs):
     """Mask R-CNN with the thesis's settings, or the light one."""
 
-    preset: Literal["light", "strategy-1", "strategy-2", "strategy-3"] = "light"
-    """Settings: `light` for a CPU, or those of Tables 4-3, 4-4 and section 6-2."""
+    preset: Literal["light", "light-lite0", "strategy-1", "strategy-2", "strategy-3"] = "light"
+    """Settings: `light` and `light-lite0` for a CPU, or those of Tables 4-3, 4-4 and section 6-2."""
     pretrained: bool = False
-    """Start from torchvision's ImageNet weights of the backbone, which are downloaded."""
+    """Start from ImageNet weights of the backbone: of `light-lite0` those of the extra `pretrained`, of the others
+    torchvision's, which are downloaded."""
     epochs: int | None = None
     """Epochs, if not those of the preset."""
     steps_per_epoch: int | None = None
@@ -105,8 +112,10 @@ class MaskRcnn(DataArgs):
 
 @dataclass(frozen=True, kw_only=True)
 class Yolo(DataArgs):
-    """YOLO through Ultralytics (extra `yolo`, licence AGPL-3.0) with the settings of Table 4-1."""
+    """YOLO through Ultralytics (extra `yolo`, licence AGPL-3.0), from random weights."""
 
+    preset: Literal["thesis", "stock"] = "thesis"
+    """Settings: those of Table 4-1, or Ultralytics' own."""
     model: str = "yolov8n.yaml"
     """Network of Ultralytics; the thesis's is yolov3.yaml."""
     epochs: int | None = None
@@ -118,8 +127,12 @@ class Yolo(DataArgs):
         """Trains."""
         images = [image for images in self.sets() for image in images]
         data = write_yolo_data(images, self.validation_images(), self.out / "data")
-        config = YOLO_PRESET if self.epochs is None else replace(YOLO_PRESET, epochs=self.epochs)
-        return train_yolo(data, self.out, self.model, config, self.seed)
+        epochs = YOLO_PRESET.epochs if self.epochs is None else self.epochs
+        thesis = replace(YOLO_PRESET, epochs=epochs)
+        settings = stock_settings(epochs) if self.preset == "stock" else thesis_settings(thesis)
+        path = train_yolo(data, self.out, settings, self.model, self.seed)
+        plot_losses({self.out.name: read_history(self.out / "yolo" / "results.csv")}, self.out / "losses.png")
+        return path
 
 
 def read_images(place: str, limit: int | None = None) -> tuple[AnnotatedImage, ...]:
@@ -163,7 +176,11 @@ def main(argv: Sequence[str] | None = None) -> None:
         print(f"error: {error}", file=sys.stderr)
         raise SystemExit(2) from None
     took = f"after {time.perf_counter() - start:.0f} s"
-    print(f"weights {path} {took}" if path else f"stopped {took}; the same command goes on")
+    print(
+        f"weights {path} {took}, {time.process_time():.0f} s of the processor"
+        if path
+        else f"stopped {took}; the same command goes on"
+    )
 
 
 if __name__ == "__main__":

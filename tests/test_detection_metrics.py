@@ -16,6 +16,7 @@ from maniskill_tomato.perception.detection_metrics import (
     box_overlaps,
     mask_overlaps,
     match,
+    without_narrow,
 )
 from maniskill_tomato.perception.instances import Instances
 from maniskill_tomato.perception.training_pictures import ignored_fruit
@@ -180,3 +181,21 @@ def test_rendered_fruits_that_no_one_would_label_are_set_aside_and_labelled_ones
     assert ignored_fruit(fruit(5.9, 0.5), 640, smallest_share=0.0)
     assert not ignored_fruit(fruit(6.0, 0.1), 640, smallest_share=0.0)
     assert ignored_fruit(fruit(40.0, 0.0999), 640)
+
+
+def test_detections_too_narrow_to_be_asked_for_do_not_count_unless_they_find_a_fruit() -> None:
+    found = found_boxes(
+        [
+            [10, 10, 21, 30],  # 11 px wide, of which 220 px are among the 240 px of the first fruit
+            [50, 50, 61, 70],  # 11 px wide, where nothing is annotated
+            [80, 10, 91, 30],  # 11 px wide, on a fruit that is set aside
+            [50, 10, 62, 30],  # 12 px wide, where nothing is annotated: false
+        ],
+        [0.9, 0.8, 0.7, 0.6],
+    )
+    truth = true_boxes([[10, 10, 22, 30], [80, 10, 91, 30]], [False, True])
+    narrow = ImageTruth(boxes=truth.boxes, ignored=truth.ignored, masks=truth.masks, least_side=12.0)
+    assert without_narrow(found, narrow).scores.tolist() == pytest.approx([0.9, 0.6])
+    assert len(without_narrow(found, truth)) == 4
+    nothing = ImageTruth(boxes=np.zeros((0, 4)), ignored=np.zeros(0, bool), least_side=12.0)
+    assert without_narrow(found, nothing).scores.tolist() == pytest.approx([0.6])

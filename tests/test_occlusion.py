@@ -1,10 +1,16 @@
 """Occlusion models on drawn scenes whose answer is known."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from maniskill_tomato.errors import InvalidInputError
+from maniskill_tomato.perception.instances import Image, Instances
+from maniskill_tomato.perception.masks import BinaryMask
 from maniskill_tomato.perception.occlusion import steps
+from maniskill_tomato.perception.occlusion.amodal import AmodalModel
 from maniskill_tomato.perception.occlusion.estimate import TomatoView, filled_depth, fruit_depth
 from maniskill_tomato.perception.occlusion.improved import ImprovedConfig, ImprovedModel
 from maniskill_tomato.perception.occlusion.judge import Judged, by_band, markdown, score
@@ -105,6 +111,42 @@ def test_the_thesis_model_bridges_a_leaf_across_a_tomato() -> None:
     (estimate,) = ThesisModel()(crossed)
     # At the image's edge perspective stretches a sphere's silhouette by an eighth, which a circle does not know.
     assert estimate.visible_fraction == pytest.approx(truth, abs=0.1)
+
+
+def test_the_learned_whole_box_completes_a_tomato_that_the_segmenter_found() -> None:
+    seen: BinaryMask = np.zeros((100, 100), bool)
+    seen[40:60, 40:50] = True
+    other: BinaryMask = np.zeros((100, 100), bool)
+    other[5:15, 5:15] = True
+
+    def segment(image: Image, depth_m: NDArray[np.float32] | None = None) -> Instances:
+        # A little more than the mask: 200 of 220 px are the same.
+        mask = seen.copy()
+        mask[40:60, 50] = True
+        return replace(
+            Instances.from_masks(mask[None]), amodal_boxes=np.array([[40, 40, 60, 60]], np.float32)
+        )
+
+    intrinsics = replace(color_intrinsics(), width=100, height=100)
+    view = TomatoView(
+        rgb=np.zeros((100, 100, 3), np.uint8),
+        depth_m=np.ones((100, 100)),
+        masks=(seen, other),
+        intrinsics=intrinsics,
+    )
+    found, missed = AmodalModel(segment)(view)
+    # V = 200 px; T is a circle 20 px in diameter, of 314.2 px, and the mask's corners outside it.
+    columns, rows = np.meshgrid(np.arange(100) + 0.5, np.arange(100) + 0.5)
+    corners = (seen & (np.hypot(columns - 50, rows - 50) > 10)).sum()
+    assert found.visible_fraction == pytest.approx(200 / (np.pi * 100 + corners))
+    assert found.whole is not None and found.whole[50, 55] and not found.whole[50, 61]
+    assert np.isnan(missed.visible_fraction)
+
+    def boxes_only(image: Image, depth_m: NDArray[np.float32] | None = None) -> Instances:
+        return Instances.from_masks(seen[None])
+
+    with pytest.raises(InvalidInputError, match="no whole boxes"):
+        AmodalModel(boxes_only)(view)
 
 
 def test_the_thesis_steps_are_what_they_say() -> None:

@@ -11,15 +11,23 @@ import numpy as np
 import pytest
 import torch
 
+from maniskill_tomato.errors import CheckpointError
 from maniskill_tomato.perception.annotations import AnnotatedImage, AnnotatedImages, Instance
 from maniskill_tomato.perception.coco import write_coco
 from maniskill_tomato.perception.detector_presets import MASK_RCNN_PRESETS
+from maniskill_tomato.perception.efficientnet_lite import EfficientNetLite0
 from maniskill_tomato.perception.instances import box_ellipse, mask_box
 from maniskill_tomato.perception.mask_rcnn_training import MaskRcnnTraining, mask_rcnn_target
 from maniskill_tomato.perception.masks import EncodedMask
 from maniskill_tomato.perception.segmenter import make_segmenter
 from maniskill_tomato.perception.training_pictures import training_picture
-from maniskill_tomato.perception.yolo import write_yolo_data, yolo_labels
+from maniskill_tomato.perception.yolo import (
+    read_history,
+    stock_settings,
+    thesis_settings,
+    write_yolo_data,
+    yolo_labels,
+)
 
 TINY = replace(
     MASK_RCNN_PRESETS["light"],
@@ -84,6 +92,22 @@ def test_mask_rcnn_trains_goes_on_and_opens_as_a_segmenter(tmp_path: Path) -> No
     assert set(found.categories) <= {"tomato"}
 
 
+def test_mask_rcnn_on_imagenet_weights_leaves_its_first_layers_alone(tmp_path: Path) -> None:
+    images = drawn_set(tmp_path / "set")
+    small = {"longest_side": 96, "shortest_side": 96, "steps_per_epoch": 1, "epochs": 1, "batch_size": 1}
+    config = replace(MASK_RCNN_PRESETS["light-lite0"], **small)
+    training = MaskRcnnTraining(config, [images], [1.0], pretrained=True)
+    start = EfficientNetLite0()
+    start.load_imagenet()
+    weights = training.run(tmp_path / "run", lambda line: None)
+    body = training.network.backbone.body.state_dict()
+    for name, before in start.state_dict().items():
+        fixed = name.startswith(("stem", *(f"blocks.{i}." for i in range(6)))) or "running" in name
+        fixed |= "tracked" in name
+        assert torch.equal(body[name], before) == fixed, name
+    assert weights is not None and make_segmenter(weights)(images[0].load()).masks.shape[1:] == (96, 128)
+
+
 def test_a_picture_without_masks_does_not_train_the_mask_head(tmp_path: Path) -> None:
     images = drawn_set(tmp_path / "set", masks=False)
     training = MaskRcnnTraining(TINY, [images], [1.0])
@@ -114,11 +138,37 @@ def test_yolo_labels_are_shares_of_the_image(tmp_path: Path) -> None:
         path=tmp_path / "a.png", file_name="a.png", width=100, height=200, instances=(fruit, leaf)
     )
     assert yolo_labels(image) == "0 0.250000 0.200000 0.300000 0.200000\n"
+    # 3 px are narrower than what is asked for.
+    tiny = Instance(category="tomato", box_xywh=(10.0, 20.0, 3.0, 40.0))
+    assert yolo_labels(replace(image, instances=(tiny, leaf))) == ""
     images = drawn_set(tmp_path / "set")
     data = write_yolo_data(images[:2], images[2:], tmp_path / "yolo")
     assert "val: images/val" in data.read_text()
     assert len(list((tmp_path / "yolo" / "labels" / "train").iterdir())) == 2
     assert (tmp_path / "yolo" / "images" / "val" / "000000.png").is_file()
+
+
+def test_yolo_losses_are_read_as_those_of_the_others(tmp_path: Path) -> None:
+    path = tmp_path / "results.csv"
+    path.write_text(
+        "epoch,time,train/box_loss,train/cls_loss,metrics/mAP50(B),val/box_loss,val/cls_loss\n"
+        "1,240.4,3.8,3.6,0,4.1,3.9\n2,460.4,3.1,2.8,0.01,3.5,3.3\n"
+    )
+    assert read_history(path) == [
+        {"step": 1, "box_loss": 3.8, "cls_loss": 3.6, "val_box_loss": 4.1, "val_cls_loss": 3.9},
+        {"step": 2, "box_loss": 3.1, "cls_loss": 2.8, "val_box_loss": 3.5, "val_cls_loss": 3.3},
+    ]
+    path.write_text("epoch,train/box_loss\n1,none\n")
+    with pytest.raises(CheckpointError, match="no list of losses"):
+        read_history(path)
+
+
+def test_yolo_is_trained_with_table_4_1_or_with_the_library_s_own_settings() -> None:
+    thesis, stock = thesis_settings(), stock_settings(7)
+    assert (thesis["epochs"], thesis["batch"], thesis["lr0"], thesis["patience"]) == (100, 1, 1e-4, 3)
+    # 288 to 448 px: 368 px on average, and 80 px to either side.
+    assert thesis["imgsz"] == 368 and thesis["multi_scale"] * 368 == pytest.approx(80)
+    assert stock["epochs"] == 7 and "lr0" not in stock and not stock["pretrained"]
 
 
 def test_the_training_script_writes_weights_and_curves(

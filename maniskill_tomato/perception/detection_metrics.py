@@ -31,6 +31,8 @@ class ImageTruth:
     """Those set aside. Shape (N,)."""
     masks: NDArray[np.bool_] | None = None
     """Visible pixels; None where only boxes are annotated. Shape (N, H, W)."""
+    least_side: float = 0.0
+    """Fruits of a narrower box were set aside, or not even annotated, in [px]."""
 
 
 def image_truth(image: AnnotatedImage, smallest_share: float = SMALLEST_SHARE) -> ImageTruth:
@@ -46,7 +48,25 @@ def image_truth(image: AnnotatedImage, smallest_share: float = SMALLEST_SHARE) -
         masks=np.array(masks, bool).reshape(-1, image.height, image.width)
         if len(masks) == len(fruits)
         else None,
+        # Whoever annotates by hand leaves no size out.
+        least_side=smallest_share * longer if any(f.visible_fraction is not None for f in fruits) else 0.0,
     )
+
+
+def without_narrow(found: Instances, truth: ImageTruth, threshold: float = 0.5) -> Instances:
+    """The detections but those too narrow to be asked for which overlap no fruit that counts.
+
+    A renderer's image shows fruits too small to be annotated at all. COCO treats detections outside a range of areas in
+    the same way.
+
+    Args:
+        found: Detections in an image.
+        truth: The fruits in it.
+        threshold: Least intersection over union with a fruit of a narrow detection that stays.
+    """
+    sides = (found.boxes[:, 2:] - found.boxes[:, :2]).min(axis=1, initial=np.inf)
+    overlaps, _ = box_overlaps(found.boxes.astype(np.float64), truth.boxes[~truth.ignored])
+    return found.chosen((sides >= truth.least_side) | (overlaps.max(axis=1, initial=0) >= threshold))
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -14,6 +14,7 @@ from maniskill_tomato.perception.detection_metrics import (
     Overlap,
     PrecisionRecall,
     image_truth,
+    without_narrow,
 )
 from maniskill_tomato.perception.detection_plots import plot_precision_recall
 from maniskill_tomato.perception.instances import Image
@@ -45,7 +46,8 @@ def evaluate_segmenter(
         images: Annotated images.
         out: Folder of the figures.
         limit: Look at this many images only, spread evenly.
-        smallest_share: Rendered fruits narrower than this share of the image's longer side are set aside.
+        smallest_share: Rendered fruits narrower than this share of the image's longer side are set aside, and
+            narrower detections where there is no other fruit.
 
     Returns:
         `box_AP50` and `mask_AP50` (Eq. 4-3 at an overlap of 0.5), precision and recall at `WORKING_SCORE`, COCO's
@@ -73,9 +75,10 @@ def evaluate_segmenter(
         found = segmenter(picture, None if depth is None else depth.astype(np.float32))
         seconds.append(time.perf_counter() - start)
         truth = image_truth(image, smallest_share)
+        counted = without_narrow(found, truth)
         for overlap in overlaps:
-            scores[overlap].add(found, truth)
-            coco[overlap].add(found, truth)
+            scores[overlap].add(counted, truth)
+            coco[overlap].add(counted, truth)
         if number in sheet:
             drawn.append(draw_instances(picture, found, WORKING_SCORE))
     metrics: dict[str, float] = {"images": len(images), "fruits": scores["box"].fruits}

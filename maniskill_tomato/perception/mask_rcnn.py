@@ -16,11 +16,12 @@ from torchvision.models.detection.backbone_utils import BackboneWithFPN, resnet_
 from torchvision.models.detection.faster_rcnn import FastRCNNPredictor
 from torchvision.models.detection.mask_rcnn import MaskRCNNHeads, MaskRCNNPredictor
 from torchvision.ops import MultiScaleRoIAlign
-from torchvision.ops.feature_pyramid_network import LastLevelMaxPool
+from torchvision.ops.feature_pyramid_network import FeaturePyramidNetwork, LastLevelMaxPool
 from torchvision.ops.misc import FrozenBatchNorm2d
 
 from maniskill_tomato.errors import MissingWeightsError
 from maniskill_tomato.perception.detector_presets import MaskRcnnConfig
+from maniskill_tomato.perception.efficientnet_lite import FEATURE_WIDTHS, EfficientNetLite0
 
 ASPECT_RATIOS = (0.5, 1.0, 2.0)
 """Height over width of the anchors; the implementation that the thesis built on has these."""
@@ -30,6 +31,27 @@ LIGHT_WIDTH = 96
 
 MOBILENET_LAYERS = {"2": "0", "4": "1", "7": "2", "13": "3"}
 """Blocks of MobileNetV3 (large) whose output has strides 4, 8, 16 and 32."""
+
+
+LITE0_FIXED_BLOCKS = 6
+"""First blocks of a pretrained EfficientNet-Lite0, up to stride 8, that training leaves as they are."""
+
+
+class Lite0Pyramid(nn.Module):
+    """EfficientNet-Lite0 under a light pyramid; takes colours from 0 to 255."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.body = EfficientNetLite0()
+        self.out_channels = LIGHT_WIDTH
+        self.fpn = FeaturePyramidNetwork(
+            list(FEATURE_WIDTHS), LIGHT_WIDTH, extra_blocks=LastLevelMaxPool(), norm_layer=nn.BatchNorm2d
+        )
+
+    def forward(self, image: Tensor) -> dict[str, Tensor]:
+        """Features by level. Shape (B, 3, H, W) to five of (B, `LIGHT_WIDTH`, h, w)."""
+        features: dict[str, Tensor] = self.fpn({str(i): f for i, f in enumerate(self.body(image))})
+        return features
 
 
 class BoxHead(nn.Module):
@@ -54,14 +76,15 @@ class BoxHead(nn.Module):
 
 
 def build_mask_rcnn(config: MaskRcnnConfig, pretrained: bool = False) -> MaskRCNN:
-    """A network with random weights, or on a backbone with torchvision's ImageNet weights.
+    """A network with random weights, or on a backbone with ImageNet weights.
 
     Args:
         config: Its settings.
-        pretrained: Download the backbone's weights.
+        pretrained: Download the backbone's weights; those of EfficientNet-Lite0 come from an installed package.
 
     Raises:
         MissingWeightsError: They cannot be downloaded.
+        MissingPackageError: The package is not installed.
     """
     try:
         backbone = _backbone(config, pretrained)
@@ -70,7 +93,8 @@ def build_mask_rcnn(config: MaskRcnnConfig, pretrained: bool = False) -> MaskRCN
             f"the ImageNet weights of {config.backbone} cannot be downloaded ({error}); "
             "train from random weights, or put them into torchvision's cache"
         ) from error
-    light = config.backbone == "mobilenet"
+    lite0 = config.backbone == "efficientnet_lite0"
+    light = lite0 or config.backbone == "mobilenet"
     width = LIGHT_WIDTH if light else 256
     representation = 256 if light else 1024
     classes = len(config.categories) + 1
@@ -79,6 +103,8 @@ def build_mask_rcnn(config: MaskRcnnConfig, pretrained: bool = False) -> MaskRCN
         backbone,
         min_size=config.shortest_side,
         max_size=config.longest_side,
+        image_mean=[0.0] * 3 if lite0 else None,
+        image_std=[1 / 255] * 3 if lite0 else None,
         # A square of the longest side, so that several pictures fit one batch.
         size_divisible=config.longest_side if config.longest_side % 32 == 0 else 32,
         rpn_anchor_generator=AnchorGenerator(
@@ -101,6 +127,12 @@ def build_mask_rcnn(config: MaskRcnnConfig, pretrained: bool = False) -> MaskRCN
 
 def _backbone(config: MaskRcnnConfig, pretrained: bool) -> nn.Module:
     """Features at strides 4 to 32, and one more level by pooling."""
+    if config.backbone == "efficientnet_lite0":
+        pyramid = Lite0Pyramid()
+        if pretrained:
+            pyramid.body.load_imagenet()
+            pyramid.body.keep_fixed(LITE0_FIXED_BLOCKS)
+        return pyramid
     weights: Any = "IMAGENET1K_V1" if pretrained else None
     if config.backbone != "mobilenet":
         residual: nn.Module = resnet_fpn_backbone(

@@ -46,13 +46,14 @@ class MaskRcnnTraining(ResumableTraining):
             sets: Sets of annotated images; without masks, a picture does not train the mask head.
             shares: How often each set is drawn from.
             validation: Images whose losses are measured after each epoch.
-            pretrained: Start from torchvision's ImageNet weights of the backbone.
+            pretrained: Start from ImageNet weights of the backbone.
             seed: Of the weights and the pictures.
             log_every: Steps between two lines of the history.
 
         Raises:
             InvalidInputError: A set is empty, or the shares do not fit.
             MissingWeightsError: The backbone's weights cannot be downloaded.
+            MissingPackageError: They come from a package that is not installed.
         """
         super().__init__()
         torch.manual_seed(seed)
@@ -138,7 +139,9 @@ class MaskRcnnTraining(ResumableTraining):
 
     def _losses(self, pictures: list[TrainingPicture]) -> dict[str, Tensor]:
         images = [torch.from_numpy(p.image).permute(2, 0, 1).float() / 255 for p in pictures]
-        terms: dict[str, Tensor] = self.network(images, [mask_rcnn_target(p) for p in pictures])
+        with torch.autocast("cpu", dtype=torch.bfloat16, enabled=self.config.bfloat16):
+            found: dict[str, Tensor] = self.network(images, [mask_rcnn_target(p) for p in pictures])
+        terms = {name: term.float() for name, term in found.items()}
         if any(p.labels is None for p in pictures):
             terms = {**terms, "loss_mask": terms["loss_mask"] * 0}
         return terms

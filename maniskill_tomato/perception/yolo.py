@@ -4,9 +4,9 @@ Whoever gives a program that uses Ultralytics to others, or offers it over a net
 same licence, or buy another one. Nothing else in this package needs it, and it is imported only here.
 """
 
+import csv
 import json
 from collections.abc import Sequence
-from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +20,7 @@ from maniskill_tomato.perception.annotations import AnnotatedImage
 from maniskill_tomato.perception.detector_presets import YOLO_PRESET, YoloConfig
 from maniskill_tomato.perception.instances import TOMATO, Image, Instances, box_ellipse
 from maniskill_tomato.perception.segmenter import check_image
+from maniskill_tomato.perception.training_pictures import ignored_fruit
 
 
 class YoloSegmenter:
@@ -131,28 +132,63 @@ def write_yolo_data(
 
 
 def yolo_labels(image: AnnotatedImage) -> str:
-    """One line a fruit: class 0, centre x, centre y, width, height, as shares of the image's size."""
+    """One line a fruit: class 0, centre x, centre y, width, height, as shares of the image's size.
+
+    YOLO cannot be told to overlook what is set aside (`ignored_fruit`), so that those fruits are left out.
+    """
     lines = []
     for fruit in image.fruits:
+        if ignored_fruit(fruit, max(image.width, image.height)):
+            continue
         x, y, w, h = fruit.box_xywh
         values = (x + w / 2) / image.width, (y + h / 2) / image.height, w / image.width, h / image.height
         lines.append("0 " + " ".join(f"{v:.6f}" for v in values))
     return "\n".join(lines) + ("\n" if lines else "")
 
 
-def train_yolo(
-    data: Path, out: Path, model: str = "yolov8n.yaml", config: YoloConfig = YOLO_PRESET, seed: int = 0
-) -> Path:
-    """Trains from random weights with the settings of Table 4-1.
+STOCK_BATCH = 8
+"""Pictures in a batch of the stock training; Ultralytics' 16 fill a small machine's memory."""
+
+
+def thesis_settings(config: YoloConfig = YOLO_PRESET) -> dict[str, Any]:
+    """Table 4-1 in Ultralytics' words.
 
     Deviations: Ultralytics lowers the learning rate along its own schedule instead of at plateaus, and rounds the sizes
     of the input to multiples of 32.
+    """
+    return {
+        "epochs": config.epochs,
+        "batch": config.batch_size,
+        "lr0": config.learning_rate,
+        "imgsz": (config.smallest_input + config.largest_input) // 2,
+        "multi_scale": (config.largest_input - config.smallest_input)
+        / (config.largest_input + config.smallest_input),
+        "patience": config.patience,
+        "optimizer": "Adam",
+        "pretrained": config.pretrained,
+    }
+
+
+def stock_settings(epochs: int = YOLO_PRESET.epochs) -> dict[str, Any]:
+    """What Ultralytics does when nothing is asked of it (version 8.4), at the largest input of Table 4-1."""
+    return {
+        "epochs": epochs,
+        "batch": STOCK_BATCH,
+        "imgsz": YOLO_PRESET.largest_input,
+        "pretrained": False,
+    }
+
+
+def train_yolo(
+    data: Path, out: Path, settings: dict[str, Any], model: str = "yolov8n.yaml", seed: int = 0
+) -> Path:
+    """Trains from random weights.
 
     Args:
         data: What `write_yolo_data` wrote.
         out: Folder of the training.
+        settings: Of `thesis_settings` or `stock_settings`.
         model: Network of Ultralytics; the thesis used YOLOv3 (`yolov3.yaml`), which is large for a CPU.
-        config: Settings.
         seed: Of the weights and the pictures.
 
     Returns:
@@ -164,22 +200,44 @@ def train_yolo(
     network = import_ultralytics().YOLO(model)
     network.train(
         data=str(data),
-        epochs=config.epochs,
-        batch=config.batch_size,
-        lr0=config.learning_rate,
-        imgsz=(config.smallest_input + config.largest_input) // 2,
-        multi_scale=(config.largest_input - config.smallest_input)
-        / (config.largest_input + config.smallest_input),
-        patience=config.patience,
-        optimizer="Adam",
-        pretrained=config.pretrained,
         project=str(out.resolve()),
         name="yolo",
         exist_ok=True,
         seed=seed,
+        workers=0,
+        **settings,
     )
     best = out / "yolo" / "weights" / "best.pt"
     target = out / "yolo.pt"
     write_atomically(target, best.read_bytes())
-    write_atomically(out / "yolo.json", json.dumps(asdict(config), indent=1).encode())
+    write_atomically(out / "yolo.json", json.dumps(settings, indent=1).encode())
     return target
+
+
+def read_history(results: Path) -> list[dict[str, float]]:
+    """The losses that Ultralytics wrote after each epoch, named as those of the other trainings.
+
+    Args:
+        results: Its `results.csv`.
+
+    Returns:
+        A line an epoch: `step`, the number of the epoch, and each term in training and, as `val_...`, in validation.
+
+    Raises:
+        CheckpointError: It cannot be read.
+    """
+    try:
+        with results.open(newline="") as file:
+            rows = [{key.strip(): float(value) for key, value in row.items()} for row in csv.DictReader(file)]
+        return [
+            {"step": row["epoch"]}
+            | {key.removeprefix("train/"): value for key, value in row.items() if key.startswith("train/")}
+            | {
+                "val_" + key.removeprefix("val/"): value
+                for key, value in row.items()
+                if key.startswith("val/")
+            }
+            for row in rows
+        ]
+    except (OSError, KeyError, TypeError, ValueError) as error:
+        raise CheckpointError(f"{results} is no list of losses of Ultralytics ({error})") from error
