@@ -277,6 +277,25 @@ def test_the_configuration_is_saved_with_the_run(tmp_path: Path) -> None:
     assert TrainConfig.from_dict(saved["config"]) == config
 
 
+@pytest.mark.parametrize(
+    ("changes", "learns"),
+    [
+        ({"total_timesteps": 31, "learning_starts": 1, "batch_size": 32}, False),
+        ({"total_timesteps": 32, "learning_starts": 1, "batch_size": 32}, True),
+        ({"total_timesteps": 32, "learning_starts": 33, "batch_size": 32}, False),
+        (
+            {"total_timesteps": None, "total_episodes": 2, "batch_size": 512},
+            True,
+        ),  # As long as they may take.
+    ],
+)
+def test_a_training_too_short_for_its_first_update_is_named(
+    changes: dict[str, Any], learns: bool, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    Trainer(ReachTask(), "Reach-v0", small_config(**changes), tmp_path / "run", show_progress=False)
+    assert ("nothing will be learned" in caplog.text) != learns
+
+
 def test_a_folder_that_holds_a_run_is_not_overwritten(tmp_path: Path) -> None:
     train(ReachTask(), small_config(total_timesteps=10), tmp_path / "run")
     with pytest.raises(InvalidInputError, match="already holds a run"):

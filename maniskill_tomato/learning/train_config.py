@@ -177,6 +177,14 @@ class TrainConfig:
     wandb_project: str | None = None
     """Log to this project of Weights & Biases too, which needs the package wandb."""
 
+    def too_short(self) -> bool:
+        """Whether `total_timesteps` end before the first update."""
+        if self.total_timesteps is None:
+            return False
+        # Hindsight stores a transition again for each of its targets.
+        stored = self.total_timesteps * (1 + self.hindsight_targets)
+        return self.total_timesteps < self.learning_starts or stored < self.batch_size
+
     def __post_init__(self) -> None:
         for name in ("total_episodes", "total_timesteps", "max_minutes", "checkpoint_seconds"):
             value = getattr(self, name)

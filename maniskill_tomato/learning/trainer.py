@@ -118,6 +118,13 @@ class Trainer:
             check_run_dir(run_dir)
         elif not (run_dir / "config.json").is_file():
             raise InvalidInputError(f"{run_dir} holds no run to continue (no config.json)")
+        if config.too_short():
+            logger.warning(
+                "nothing will be learned: %s steps end before learning_starts (%s) or before a batch of %s is there",
+                config.total_timesteps,
+                config.learning_starts,
+                config.batch_size,
+            )
         self._env = env
         self._curriculum = LeafDensityCurriculum(config, env)
         self._env_id = env_id
