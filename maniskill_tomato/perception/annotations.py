@@ -27,6 +27,10 @@ def is_fruit(category: str) -> bool:
     return category.startswith("tomato")
 
 
+BEHIND = "behind_"
+"""How the names of fruits of the rows behind begin in rendered images; an arm in front of its row cannot reach them."""
+
+
 @dataclass(frozen=True, kw_only=True)
 class Instance:
     """One thing in one image."""

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from maniskill_tomato.errors import InvalidInputError
-from maniskill_tomato.perception.annotations import AnnotatedImage
+from maniskill_tomato.perception.annotations import BEHIND, AnnotatedImage
 from maniskill_tomato.perception.instances import Instances
 from maniskill_tomato.perception.training_pictures import SMALLEST_SHARE, ignored_fruit
 
@@ -35,8 +35,16 @@ class ImageTruth:
     """Fruits of a narrower box were set aside, or not even annotated, in [px]."""
 
 
-def image_truth(image: AnnotatedImage, smallest_share: float = SMALLEST_SHARE) -> ImageTruth:
-    """The visible fruits of an annotated image, ripe or not; see `ignored_fruit` for those set aside."""
+def image_truth(
+    image: AnnotatedImage, smallest_share: float = SMALLEST_SHARE, rows_behind: bool = True
+) -> ImageTruth:
+    """The visible fruits of an annotated image, ripe or not; see `ignored_fruit` for those set aside.
+
+    Args:
+        image: Whose fruits.
+        smallest_share: What stands for `SMALLEST_SHARE`.
+        rows_behind: Whether fruits of the rows behind a rendered row count, or are set aside too.
+    """
     longer = max(image.width, image.height)
     fruits = image.fruits
     boxes = np.array([f.box_xywh for f in fruits], np.float64).reshape(-1, 4)
@@ -44,7 +52,14 @@ def image_truth(image: AnnotatedImage, smallest_share: float = SMALLEST_SHARE) -
     masks = [f.visible_mask.decode() for f in fruits if f.visible_mask is not None]
     return ImageTruth(
         boxes=boxes,
-        ignored=np.array([ignored_fruit(f, longer, smallest_share) for f in fruits], bool),
+        ignored=np.array(
+            [
+                ignored_fruit(f, longer, smallest_share)
+                or (not rows_behind and (f.name or "").startswith(BEHIND))
+                for f in fruits
+            ],
+            bool,
+        ),
         masks=np.array(masks, bool).reshape(-1, image.height, image.width)
         if len(masks) == len(fruits)
         else None,

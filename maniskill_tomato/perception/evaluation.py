@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from maniskill_tomato.errors import InvalidInputError
-from maniskill_tomato.perception.annotations import AnnotatedImage
+from maniskill_tomato.perception.annotations import BEHIND, AnnotatedImage
 from maniskill_tomato.perception.coco_metrics import CocoScore
 from maniskill_tomato.perception.detection_metrics import (
     DetectionScore,
@@ -51,7 +51,8 @@ def evaluate_segmenter(
 
     Returns:
         `box_AP50` and `mask_AP50` (Eq. 4-3 at an overlap of 0.5), precision and recall at `WORKING_SCORE`, COCO's
-        metrics as `coco_box_...` and `coco_mask_...`, counts, seconds an image.
+        metrics as `coco_box_...` and `coco_mask_...`, counts, seconds an image; in rendered images with rows behind
+        also `front_box_AP50` and `front_mask_AP50`, of the fruits of the row in front alone.
 
     Raises:
         InvalidInputError: There is no image, or one cannot be read.
@@ -67,6 +68,8 @@ def evaluate_segmenter(
     overlaps: tuple[Overlap, ...] = ("box", "mask") if with_masks else ("box",)
     scores: dict[Overlap, DetectionScore] = {overlap: DetectionScore(overlap) for overlap in overlaps}
     coco = {overlap: CocoScore(overlap) for overlap in overlaps}
+    with_rows = any((f.name or "").startswith(BEHIND) for image in images for f in image.fruits)
+    front = {overlap: DetectionScore(overlap) for overlap in overlaps} if with_rows else {}
     seconds = []
     for number, image in enumerate(images):
         picture = image.load()
@@ -79,6 +82,9 @@ def evaluate_segmenter(
         for overlap in overlaps:
             scores[overlap].add(counted, truth)
             coco[overlap].add(counted, truth)
+        nearby = image_truth(image, smallest_share, rows_behind=False)
+        for score in front.values():
+            score.add(without_narrow(found, nearby), nearby)
         if number in sheet:
             drawn.append(draw_instances(picture, found, WORKING_SCORE))
     metrics: dict[str, float] = {"images": len(images), "fruits": scores["box"].fruits}
@@ -93,6 +99,11 @@ def evaluate_segmenter(
             f"{overlap}_recall": recall,
         }
         metrics |= {f"coco_{overlap}_{k}": v for k, v in coco[overlap].metrics().items()}
+    for overlap, score in front.items():
+        metrics |= {
+            "front_fruits": score.fruits,
+            f"front_{overlap}_AP50": score.precision_recall().average_precision,
+        }
     metrics["median_seconds"] = float(np.median(seconds))
     plot_precision_recall(curves, out / "precision_recall.png")
     write_picture(out / "pictures.jpg", contact_sheet(drawn))

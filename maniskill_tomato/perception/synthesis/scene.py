@@ -12,6 +12,7 @@ import sapien.render
 from numpy.random import Generator
 from numpy.typing import NDArray
 
+from maniskill_tomato.perception.annotations import BEHIND
 from maniskill_tomato.perception.synthesis import surroundings
 from maniskill_tomato.perception.synthesis.look import SceneLook, draw_crop
 from maniskill_tomato.perception.synthesis.paint import PlantMaterials
@@ -224,7 +225,7 @@ class GreenhouseScene:
                     if organ.semantic_class <= SemanticClass.LEAF:
                         continue
                     vertices = (organ.vertices @ T[:3, :3].T + T[:3, 3]).astype(np.float32)
-                    name = f"behind_{k}_{j}/{organ.name}"
+                    name = f"{BEHIND}{k}_{j}/{organ.name}"
                     thing = Thing(name, CATEGORY[organ.semantic_class], False, vertices, organ.faces)
                     self._name(thing, [self._add_parts(organ.parts, pose)])
 
