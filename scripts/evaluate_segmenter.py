@@ -15,7 +15,7 @@ import tyro
 from maniskill_tomato.errors import TomatoError
 from maniskill_tomato.files import write_atomically
 from maniskill_tomato.perception.evaluation import evaluate_segmenter
-from maniskill_tomato.perception.segmenter import make_segmenter
+from maniskill_tomato.perception.segmenter import open_for_files
 from maniskill_tomato.perception.training_pictures import SMALLEST_SHARE, read_place
 
 
@@ -27,6 +27,8 @@ class Args:
     """Folder of annotated images, or FOLDER:SPLIT for one list of it (`photos:val` for its val.txt)."""
     segmenter: str = "light"
     """Name of a segmenter, or a file of weights."""
+    thorough: bool = False
+    """Let the light segmenter look at each image as often as `maniskill-tomato detect` does."""
     limit: int | None = None
     """Look at this many images only, spread over the list."""
     smallest_share: float = SMALLEST_SHARE
@@ -40,15 +42,17 @@ def main(argv: list[str] | None = None) -> None:
     logging.basicConfig(level=logging.WARNING, format="%(message)s", stream=sys.stderr)
     try:
         args = tyro.cli(Args, args=argv, description=__doc__)
-        options = {} if args.segmenter == "colour" else {"score_threshold": 0.02}
-        segmenter = make_segmenter(args.segmenter, **options)
+        segmenter = open_for_files(args.segmenter, 0.02, args.thorough)
         found = read_place(args.data)
         if found.skipped:
             print(f"{args.data}: {found.skipped_text()}", file=sys.stderr)
         metrics = evaluate_segmenter(segmenter, found.images, args.out, args.limit, args.smallest_share)
         write_atomically(
             args.out / "metrics.json",
-            json.dumps({"segmenter": args.segmenter, "data": args.data, **metrics}, indent=1).encode(),
+            json.dumps(
+                {"segmenter": args.segmenter, "thorough": args.thorough, "data": args.data, **metrics},
+                indent=1,
+            ).encode(),
         )
     except TomatoError as error:
         print(f"error: {error}", file=sys.stderr)

@@ -9,8 +9,11 @@ import numpy as np
 import pytest
 from pycocotools import mask as coco_mask
 
+from maniskill_tomato.assets import asset_path
 from maniskill_tomato.cli import main
 from maniskill_tomato.perception.instances import box_ellipse
+from maniskill_tomato.perception.light_segmenter import SHIPPED_WEIGHTS, LightSegmenter
+from maniskill_tomato.perception.segmenter import open_for_files
 
 
 def write_image(path: Path, *boxes: tuple[int, int, int, int]) -> None:
@@ -112,3 +115,14 @@ def test_an_older_list_stays_when_the_new_one_fails(
         "broken.png",
         "list.json",
     ]
+
+
+def test_the_light_segmenter_looks_thoroughly_at_files_unless_there_is_a_hurry() -> None:
+    thorough = open_for_files("light", 0.2, thorough=True)
+    quick = open_for_files("light", 0.2, thorough=False)
+    assert isinstance(thorough, LightSegmenter) and isinstance(quick, LightSegmenter)
+    assert thorough.mirrored and len(thorough.scales) > len(quick.scales) and not quick.mirrored
+    assert thorough.score_threshold == quick.score_threshold == 0.2
+    by_file = open_for_files(str(asset_path(SHIPPED_WEIGHTS)), 0.2, thorough=True)
+    assert isinstance(by_file, LightSegmenter) and by_file.mirrored
+    assert not isinstance(open_for_files("colour", 0.2, thorough=True), LightSegmenter)

@@ -9,6 +9,7 @@ import cv2
 import numpy as np
 import pytest
 import torch
+from numpy.typing import NDArray
 
 from maniskill_tomato.errors import CheckpointError, InvalidInputError
 from maniskill_tomato.perception.annotations import AnnotatedImage, Instance
@@ -27,6 +28,7 @@ from maniskill_tomato.perception.fruit_targets import TrainingPicture, fruit_los
 from maniskill_tomato.perception.light_segmenter import (
     LightSegmenter,
     find_fruits,
+    mirror,
     open_light,
     split_by_votes,
 )
@@ -36,7 +38,7 @@ from maniskill_tomato.perception.training_pictures import PictureDraw, training_
 from maniskill_tomato.perception.weights import save_weights
 
 SMALL = FruitNetworkConfig(
-    backbone="plain", widths=(8, 8, 8, 8), blocks=(0, 0, 0, 0), neck_width=8, head_width=8
+    backbone="plain", widths=(8, 8, 8, 8), blocks=(0, 0, 0, 0), neck_width=8, fine_width=8
 )
 
 
@@ -129,10 +131,46 @@ def test_losses_are_near_zero_for_perfect_maps_and_not_for_others() -> None:
     right = fruit_losses(perfect_maps(picture), targets)
     wrong = fruit_losses(FruitMaps(*(-m for m in perfect_maps(picture))), targets)
     assert set(right) == {"centre", "box", "whole", "category", "fruit", "vote"}
+    # The heat around a centre has a focal loss that cannot vanish: (1 - h)^4 h^2 (-ln (1 - h)) at each place.
+    heat = targets.heat.numpy().astype(np.float64)
+    around = heat[(heat > 0) & (heat < 1)]
+    shoulders = (-((1 - around) ** 4) * around**2 * np.log(1 - around)).sum() / (heat == 1).sum()
+    assert float(right["centre"]) == pytest.approx(shoulders, rel=0.02)
     for name in right:
-        # The heat around a centre and cells that are part fruit have an entropy that cannot vanish.
-        assert float(right[name]) < {"fruit": 0.35, "centre": 0.1}.get(name, 0.02), name
+        # So do cells that are part fruit.
+        least = {"fruit": 0.35, "centre": 1.1 * shoulders}
+        assert float(right[name]) < least.get(name, 0.02), name
         assert float(wrong[name]) > 2 * float(right[name]) + 0.2, name
+
+
+def test_places_of_small_fruits_weigh_more_in_the_mask_terms() -> None:
+    # Squares of 64, 16, 8 and 4 px: 32 px over the side, from 1 to 4.
+    labels = np.zeros((128, 128), np.int16)
+    boxes = np.array([[0, 0, 64, 64], [80, 0, 96, 16], [80, 40, 88, 48], [80, 80, 84, 84]], np.float32)
+    for index, (left, top, right, bottom) in enumerate(boxes.astype(int)):
+        labels[top:bottom, left:right] = index + 1
+    picture = TrainingPicture(
+        image=np.zeros((128, 128, 3), np.uint8), boxes=boxes, ignored=np.zeros(4, bool), labels=labels
+    )
+    targets = make_targets([picture])
+    rows, columns = ((boxes[:, [1, 0]] + 2) // STRIDE).astype(int).T
+    assert targets.vote_weight[0, 0, rows, columns].tolist() == [1, 2, 4, 4]
+    assert targets.fruit_weight[0, 0, rows, columns].tolist() == [1, 2, 4, 4]
+    assert targets.fruit_weight[0, 0, -1, -1] == 1 and targets.vote_weight[0, 0, -1, -1] == 0
+    assert targets.vote_size[0, :, rows[1], columns[1]].tolist() == [16, 16]
+    # Votes that are wrong by an eighth of the box, half of its quarter: 0.5 * 0.5^2 along x and 0 along y.
+    x, y = place_centres(64, 64)
+    maps = perfect_maps(picture)
+    off = targets.vote_size * torch.tensor([1 / 8, 0.0])[:, None, None]
+    vote = targets.vote - torch.stack([x, y]) + off
+    # Fruit pixels as likely as not: ln 2, and one minus Dice with half of everything.
+    found = fruit_losses(maps._replace(vote=vote, fruit=torch.zeros(1, 1, 64, 64)), targets)
+    assert float(found["vote"]) == pytest.approx(0.125 / 2, rel=1e-4)
+    weight, fruit = targets.fruit_weight, targets.fruit
+    weighed, everything = float((weight * fruit).sum()), float(weight.sum())
+    dice = (weighed + 1) / (everything / 2 + weighed + 1)
+    assert float(found["fruit"]) == pytest.approx(np.log(2) + 1 - dice, rel=1e-4)
+    assert 0 < float(fruit_losses(maps, targets)["fruit"]) < 0.1
 
 
 def test_terms_without_annotation_are_zero() -> None:
@@ -263,6 +301,21 @@ def test_training_from_imagenet_moves_all_but_the_first_layers_and_the_backbone_
         assert torch.equal(tensor, start.state_dict()[name]) == fixed, name
 
 
+def test_training_from_weights_takes_over_the_layers_that_fit(tmp_path: Path) -> None:
+    images = annotated(tmp_path, 1)
+    start = FruitNetwork(SMALL)
+    save_weights(tmp_path / "w.pt", "light", SMALL.to_dict(), start.state_dict())
+    wider = replace(small_config(1), network=replace(SMALL, fine_width=12))
+    network = LightTraining(wider, [images], [1.0], start_from=tmp_path / "w.pt").network.state_dict()
+    for name, tensor in start.state_dict().items():
+        if network[name].shape == tensor.shape:
+            torch.testing.assert_close(network[name].float(), tensor.float(), rtol=1e-3, atol=1e-4, msg=name)
+    assert network["output.weight"].shape[1] == 12
+    other = replace(small_config(1), network=replace(SMALL, widths=(12, 8, 8, 8)))
+    with pytest.raises(CheckpointError, match="another backbone"):
+        LightTraining(other, [images], [1.0], start_from=tmp_path / "w.pt")
+
+
 def test_a_training_of_other_settings_is_not_continued(tmp_path: Path) -> None:
     images = annotated(tmp_path)
     LightTraining(small_config(2), [images], [1.0]).run(tmp_path / "run", lambda line: None)
@@ -338,6 +391,44 @@ def test_two_looks_at_one_image_are_joined_in_order_and_sizes_are_shared_out() -
         LightSegmenter(network, scales=(0.5, 1.0))
 
 
+def turned(boxes: NDArray[np.float32], width: int) -> NDArray[np.float32]:
+    """Boxes of a mirror image."""
+    return np.asarray(
+        np.stack([width - boxes[:, 2], boxes[:, 1], width - boxes[:, 0], boxes[:, 3]], axis=1), np.float32
+    )
+
+
+def test_what_a_mirror_image_shows_is_turned_back() -> None:
+    picture = apart(3)
+    assert picture.labels is not None and picture.whole_boxes is not None
+    width = picture.image.shape[1]
+    mirrored = replace(
+        picture,
+        image=picture.image[:, ::-1],
+        labels=picture.labels[:, ::-1],
+        boxes=turned(picture.boxes, width),
+        whole_boxes=turned(picture.whole_boxes, width),
+    )
+    seen, known = mirror(perfect_maps(mirrored)), perfect_maps(picture)
+    found, expected = find_fruits(seen, 0.5, 0.9), find_fruits(known, 0.5, 0.9)
+    for name in ("boxes", "whole"):
+        # Of two places as near to a centre either may be the peak; the box is the same.
+        gap = (found[name][:, None] - expected[name][None]).abs().amax(dim=2).amin(dim=1)
+        assert len(gap) == len(expected[name]) and float(gap.max()) < 1e-3
+    on_fruit = make_targets([picture]).vote_weight.expand(-1, 2, -1, -1) > 0
+    assert float((seen.vote - known.vote)[on_fruit].abs().median()) < 1e-3
+
+
+def test_a_mirrored_look_finds_the_mirror_image_s_fruits() -> None:
+    torch.manual_seed(0)
+    segmenter = LightSegmenter(FruitNetwork(SMALL), score_threshold=0.0, scales=(1.0,), mirrored=True)
+    image = fruit_picture(size=(160, 192)).image
+    found, other = segmenter(image), segmenter(np.ascontiguousarray(image[:, ::-1]))
+    assert len(found) == len(other) > 0
+    gap = np.abs(found.boxes[:, None] - turned(other.boxes, 192)[None]).max(axis=2).min(axis=1)
+    assert gap.max() < 0.01
+
+
 def test_weights_come_back_in_half_precision(tmp_path: Path) -> None:
     network = FruitNetwork(SMALL)
     save_weights(tmp_path / "w.pt", "light", SMALL.to_dict(), network.state_dict())
@@ -358,7 +449,7 @@ def test_values_beyond_16_bits_survive_in_a_file(tmp_path: Path) -> None:
 
 def test_weights_that_do_not_fit_are_refused(tmp_path: Path) -> None:
     state = FruitNetwork(SMALL).state_dict()
-    save_weights(tmp_path / "w.pt", "light", {**SMALL.to_dict(), "head_width": 9}, state)
+    save_weights(tmp_path / "w.pt", "light", {**SMALL.to_dict(), "fine_width": 9}, state)
     with pytest.raises(CheckpointError, match="does not fit"):
         open_light(tmp_path / "w.pt")
     save_weights(tmp_path / "m.pt", "mask_rcnn", SMALL.to_dict(), state)

@@ -17,6 +17,7 @@ from maniskill_tomato.perception.coco import write_coco
 from maniskill_tomato.perception.detector_presets import MASK_RCNN_PRESETS
 from maniskill_tomato.perception.efficientnet_lite import EfficientNetLite0
 from maniskill_tomato.perception.instances import box_ellipse, mask_box
+from maniskill_tomato.perception.mask_rcnn import Lite0Pyramid
 from maniskill_tomato.perception.mask_rcnn_training import MaskRcnnTraining, mask_rcnn_target
 from maniskill_tomato.perception.masks import EncodedMask
 from maniskill_tomato.perception.segmenter import make_segmenter
@@ -94,13 +95,21 @@ def test_mask_rcnn_trains_goes_on_and_opens_as_a_segmenter(tmp_path: Path) -> No
 
 def test_mask_rcnn_on_imagenet_weights_leaves_its_first_layers_alone(tmp_path: Path) -> None:
     images = drawn_set(tmp_path / "set")
-    small = {"longest_side": 96, "shortest_side": 96, "steps_per_epoch": 1, "epochs": 1, "batch_size": 1}
-    config = replace(MASK_RCNN_PRESETS["light-lite0"], **small)
+    config = replace(
+        MASK_RCNN_PRESETS["light-lite0"],
+        longest_side=96,
+        shortest_side=96,
+        steps_per_epoch=1,
+        epochs=1,
+        batch_size=1,
+    )
     training = MaskRcnnTraining(config, [images], [1.0], pretrained=True)
     start = EfficientNetLite0()
     start.load_imagenet()
     weights = training.run(tmp_path / "run", lambda line: None)
-    body = training.network.backbone.body.state_dict()
+    pyramid = training.network.backbone
+    assert isinstance(pyramid, Lite0Pyramid)
+    body = pyramid.body.state_dict()
     for name, before in start.state_dict().items():
         fixed = name.startswith(("stem", *(f"blocks.{i}." for i in range(6)))) or "running" in name
         fixed |= "tracked" in name

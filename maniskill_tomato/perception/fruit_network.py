@@ -15,7 +15,7 @@ from torch.nn import functional
 
 from maniskill_tomato.perception.efficientnet_lite import FEATURE_WIDTHS, EfficientNetLite0
 
-STRIDE = 4
+STRIDE = 2
 """Pixels of the image between neighbouring places of the output."""
 
 BOX_SCALE = 16.0
@@ -37,8 +37,8 @@ class FruitNetworkConfig:
     """Its residual blocks at these strides."""
     neck_width: int = 64
     """Channels on the way back to stride 4."""
-    head_width: int = 48
-    """Channels before the outputs."""
+    fine_width: int = 48
+    """Channels at stride 2, where the outputs are."""
     categories: int = 3
     """Kinds of fruit that are told apart."""
 
@@ -79,6 +79,12 @@ def _conv(inputs: int, outputs: int, size: int = 3, stride: int = 1) -> nn.Seque
     )
 
 
+def _unshuffled(image: Tensor) -> Tensor:
+    """Colours from 0 to 255, (B, 3, H, W), as (B, 12, H / 2, W / 2): what a place of stride 2 holds."""
+    x = functional.pixel_unshuffle((image - 110.0) / 64.0, 2)
+    return x.contiguous(memory_format=torch.channels_last)
+
+
 class _Block(nn.Module):
     """Two convolutions beside a shortcut."""
 
@@ -109,9 +115,7 @@ class PlainBackbone(nn.Module):
 
     def forward(self, image: Tensor) -> list[Tensor]:
         """Features of images of colours from 0 to 255, of shape (B, 3, H, W), at strides 4, 8, 16 and 32."""
-        x = functional.pixel_unshuffle((image - 110.0) / 64.0, 2).contiguous(
-            memory_format=torch.channels_last
-        )
+        x = _unshuffled(image)
         features = []
         for stage in self.stages:
             x = stage(x)
@@ -135,9 +139,12 @@ class FruitNetwork(nn.Module):
         self.laterals = nn.ModuleList(nn.Conv2d(width, neck, 1) for width in widths)
         self.smooths = nn.ModuleList(_conv(neck, neck) for _ in widths[:-1])
         self.context = nn.Sequential(nn.AdaptiveAvgPool2d(1), nn.Conv2d(widths[-1], neck, 1))
-        self.head = _conv(neck, self.config.head_width)
+        fine = self.config.fine_width
+        self.fine = _conv(12, fine)
+        self.coarse = nn.Conv2d(neck, fine, 1)
+        self.head = nn.Sequential(_conv(fine, fine), _conv(fine, fine))
         self.sizes = (1, 4, 4, self.config.categories, 1, 2)
-        self.output = nn.Conv2d(self.config.head_width, sum(self.sizes), 1)
+        self.output = nn.Conv2d(fine, sum(self.sizes), 1)
         for module in self.modules():
             if isinstance(module, nn.Conv2d):
                 nn.init.kaiming_normal_(module.weight, nonlinearity="relu")
@@ -163,7 +170,8 @@ class FruitNetwork(nn.Module):
         for i in (2, 1, 0):
             y = functional.interpolate(y, scale_factor=2.0, mode="nearest")
             y = self.smooths[i](y + self.laterals[i](features[i]))
-        output = self.output(self.head(y)).float()
+        y = functional.interpolate(self.coarse(y), scale_factor=2.0, mode="nearest")
+        output = self.output(self.head(y + self.fine(_unshuffled(image)))).float()
         centre, box, whole, category, fruit, vote = output.split(self.sizes, dim=1)
         return FruitMaps(
             centre,

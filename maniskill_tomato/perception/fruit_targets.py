@@ -5,7 +5,6 @@ loss of CornerNet (Law and Deng, 2018), generalised IoU weighted by the logarith
 """
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 import torch
@@ -18,8 +17,15 @@ from maniskill_tomato.perception.fruit_network import STRIDE, FruitMaps, place_c
 GAUSSIAN_SHARE = 0.54
 """Share of the box that three standard deviations to both sides span (TTFNet's alpha and beta)."""
 
-LOSS_WEIGHTS = {"centre": 1.0, "box": 5.0, "whole": 2.0, "category": 0.5, "fruit": 2.0, "vote": 0.5}
+LOSS_WEIGHTS = {"centre": 1.0, "box": 5.0, "whole": 2.0, "category": 0.5, "fruit": 2.0, "vote": 2.0}
 """Weight of each term; the first two are TTFNet's."""
+
+EVEN_SIDE = 32.0
+"""Fruits of smaller boxes, by the root of their area in [px], have places that weigh more in the mask terms, in
+proportion, so that large fruits with their many places do not decide alone."""
+
+MOST_WEIGHT = 4.0
+"""Most that such a place weighs."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -62,11 +68,13 @@ class FruitTargets:
     fruit: Tensor
     """Share of fruit pixels. Shape (B, 1, h, w)."""
     fruit_weight: Tensor
-    """0 where masks are not known. Shape (B, 1, h, w)."""
+    """0 where masks are not known, more than 1 in the boxes of small fruits. Shape (B, 1, h, w)."""
     vote: Tensor
     """Centre of the fruit at each place, x and y in [px]. Shape (B, 2, h, w)."""
+    vote_size: Tensor
+    """Width and height of its box in [px]. Shape (B, 2, h, w)."""
     vote_weight: Tensor
-    """1 on fruit. Shape (B, 1, h, w)."""
+    """The same weight on fruit, 0 elsewhere. Shape (B, 1, h, w)."""
 
 
 def make_targets(pictures: list[TrainingPicture]) -> FruitTargets:
@@ -114,7 +122,6 @@ def _picture_targets(picture: TrainingPicture) -> dict[str, NDArray[np.float32] 
     known_fruits: NDArray[np.bool_] = np.asarray(np.isfinite(whole).all(axis=1))
     whole_known = owned & known_fruits[index]
     kinds = np.full(max(count, 1), -1) if picture.categories is None or not count else picture.categories
-    fruit, fruit_weight, vote, vote_weight = _mask_targets(picture, rows, columns)
     return {
         "heat": heat[None],
         "heat_weight": heat_weight[None],
@@ -123,20 +130,15 @@ def _picture_targets(picture: TrainingPicture) -> dict[str, NDArray[np.float32] 
         "box_weight": (weight * owned)[None].astype(np.float32),
         "whole_weight": (weight * whole_known)[None].astype(np.float32),
         "category": np.where(owned, kinds[index], -1).astype(np.int64),
-        "fruit": fruit[None],
-        "fruit_weight": fruit_weight[None],
-        "vote": vote,
-        "vote_weight": vote_weight[None],
+        **_mask_targets(picture, rows, columns),
     }
 
 
-def _mask_targets(
-    picture: TrainingPicture, rows: int, columns: int
-) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]:
-    """Share of fruit, its weight, the centre voted for and its weight, at every place."""
-    nothing = np.zeros((rows, columns), np.float32)
+def _mask_targets(picture: TrainingPicture, rows: int, columns: int) -> dict[str, NDArray[np.float32]]:
+    """The targets of the mask terms of one picture; see `FruitTargets`."""
     if picture.labels is None:
-        return nothing, nothing, np.zeros((2, rows, columns), np.float32), nothing
+        one, two = np.zeros((1, rows, columns), np.float32), np.zeros((2, rows, columns), np.float32)
+        return {"fruit": one, "fruit_weight": one, "vote": two, "vote_size": two + 1, "vote_weight": one}
     labels = picture.labels[: rows * STRIDE, : columns * STRIDE]
     cells = labels.reshape(rows, STRIDE, columns, STRIDE).transpose(0, 2, 1, 3).reshape(rows, columns, -1)
     fruit = np.asarray((cells > 0).mean(axis=2), np.float32)
@@ -144,11 +146,21 @@ def _mask_targets(
     # The fruit in the middle of a cell stands for the cell.
     middle = cells[:, :, STRIDE * STRIDE // 2 + STRIDE // 2]
     on_fruit = middle > 0
-    centres: NDArray[np.floating[Any]] = np.zeros((max(len(picture.boxes), 1), 2), np.float32)
-    if len(picture.boxes):
-        centres = (picture.boxes[:, :2] + picture.boxes[:, 2:]) / 2
-    vote = centres[np.maximum(middle - 1, 0)].transpose(2, 0, 1).astype(np.float32)
-    return fruit, known, vote, (on_fruit * known).astype(np.float32)
+    boxes = picture.boxes if len(picture.boxes) else np.zeros((1, 4), np.float32)
+    centres, sizes = (boxes[:, :2] + boxes[:, 2:]) / 2, np.maximum(boxes[:, 2:] - boxes[:, :2], 1)
+    weights = np.clip(EVEN_SIDE / np.sqrt(sizes.prod(axis=1)), 1, MOST_WEIGHT)
+    weight = np.ones((rows, columns), np.float32)
+    for index in np.argsort(weights):
+        (left, top), (right, bottom) = boxes[index, :2] / STRIDE, boxes[index, 2:] / STRIDE
+        weight[_span(top - 1, bottom + 1, rows), _span(left - 1, right + 1, columns)] = weights[index]
+    owner = np.maximum(middle - 1, 0)
+    return {
+        "fruit": fruit[None],
+        "fruit_weight": (weight * known)[None],
+        "vote": centres[owner].transpose(2, 0, 1).astype(np.float32),
+        "vote_size": sizes[owner].transpose(2, 0, 1).astype(np.float32),
+        "vote_weight": (weights[owner] * on_fruit * known)[None].astype(np.float32),
+    }
 
 
 def _span(start: float, stop: float, size: int) -> slice:
@@ -222,16 +234,17 @@ def _fruit_term(logits: Tensor, fruit: Tensor, weight: Tensor) -> Tensor:
     entropy = (
         functional.binary_cross_entropy_with_logits(logits, fruit, weight, reduction="sum") / weight.sum()
     )
-    probability, fruit = logits.sigmoid() * weight, fruit * weight
-    dice = (2 * (probability * fruit).sum() + 1) / (probability.sum() + fruit.sum() + 1)
+    probability = logits.sigmoid()
+    shared, sizes = (probability * fruit * weight).sum(), ((probability + fruit) * weight).sum()
+    dice = (2 * shared + 1) / (sizes + 1)
     return entropy + 1 - dice
 
 
 def _vote_term(vote: Tensor, targets: FruitTargets, x: Tensor, y: Tensor) -> Tensor:
-    """Mean distance of the votes to the centres along x and y, in strides, smooth near 0."""
+    """Mean distance of the votes to the centres along x and y, in quarters of the box, smooth near 0."""
     weight = targets.vote_weight
     if weight.sum() == 0:
         return vote.sum() * 0
-    centre = torch.stack([x, y]) + vote
-    error = functional.smooth_l1_loss(centre / STRIDE, targets.vote / STRIDE, reduction="none")
-    return (error * weight).sum() / weight.sum() / 2
+    error = (torch.stack([x, y]) + vote - targets.vote) / (targets.vote_size / 4)
+    smooth = functional.smooth_l1_loss(error, torch.zeros_like(error), reduction="none")
+    return (smooth * weight).sum() / weight.sum() / 2

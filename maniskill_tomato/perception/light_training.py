@@ -50,7 +50,7 @@ class LightTrainConfig:
     """Multiply in 16 bits, which processors with AMX or AVX-512 BF16 do several times faster."""
     backbone_rate: float = 0.3
     """Learning rate of a backbone with ImageNet weights, as a share of the others'."""
-    fixed_blocks: int = 3
+    fixed_blocks: int = 6
     """First blocks of a backbone with ImageNet weights that stay as they are, with the stem."""
     plain_share: float = 0.0
     """Last share of the steps without mosaics, so that the last pictures look like those to come."""
@@ -93,7 +93,7 @@ class LightTraining(ResumableTraining):
             sets: Sets of annotated images.
             shares: How often each set is drawn from.
             validation: Images whose losses are logged, at most 64 of them.
-            start_from: Weights to begin with instead of random ones.
+            start_from: Weights to begin with instead of random ones, at least of the same backbone.
 
         Raises:
             InvalidInputError: A set is empty, or the shares do not fit.
@@ -213,11 +213,16 @@ def learning_rate(config: LightTrainConfig, step: int) -> float:
 
 
 def _load_into(network: FruitNetwork, path: Path) -> None:
-    """Puts saved weights into a network of the same size."""
+    """Puts saved weights into a network on the same backbone; layers of other sizes begin anew."""
     data = load_weights(path, "light")
-    if data["config"] != network.config.to_dict():
-        raise CheckpointError(f"{path} is of a network of another size: {data['config']}")
-    network.load_state_dict(data["state"])
+    own = network.state_dict()
+    fitting = {n: v for n, v in data["state"].items() if n in own and own[n].shape == v.shape}
+    missing = [n for n in own if n.startswith("backbone") and n not in fitting]
+    if missing:
+        raise CheckpointError(
+            f"{path} is of a network on another backbone ({missing[0]} does not fit): {data['config']}"
+        )
+    network.load_state_dict(fitting, strict=False)
 
 
 def _fixed_batches(

@@ -34,7 +34,7 @@ MOBILENET_LAYERS = {"2": "0", "4": "1", "7": "2", "13": "3"}
 
 
 LITE0_FIXED_BLOCKS = 6
-"""First blocks of a pretrained EfficientNet-Lite0, up to stride 8, that training leaves as they are."""
+"""First blocks of a pretrained EfficientNet-Lite0 that training leaves as they are, as the light segmenter's does."""
 
 
 class Lite0Pyramid(nn.Module):

@@ -73,6 +73,27 @@ def make_segmenter(name_or_path: str | Path = DEFAULT_SEGMENTER, **options: Any)
         raise InvalidInputError(f"segmenter {name!r}: {str(error).split('() ', 1)[-1]}") from error
 
 
+def open_for_files(name: str, score_threshold: float, thorough: bool) -> Segmenter:
+    """Opens a segmenter that looks at images in files, where there is no hurry.
+
+    Args:
+        name: Name of a segmenter, or a file of weights.
+        score_threshold: Least score, of segmenters that give scores.
+        thorough: Whether the light segmenter looks at each image more often.
+
+    Raises:
+        InvalidInputError: There is no such segmenter, or the threshold is out of its range.
+        CheckpointError: The weights are missing or damaged.
+        MissingPackageError: The segmenter needs a package that is not installed.
+    """
+    options: dict[str, Any] = {} if name == "colour" else {"score_threshold": score_threshold}
+    if thorough and (name == "light" or (Path(name).is_file() and weights_kind(Path(name)) == "light")):
+        from maniskill_tomato.perception.light_segmenter import THOROUGH
+
+        options |= THOROUGH
+    return make_segmenter(name, **options)
+
+
 def weights_kind(path: Path) -> str:
     """Which segmenter a file of weights is for: what it says, or `yolo` for a file that Ultralytics wrote.
 
