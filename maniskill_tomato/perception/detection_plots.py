@@ -42,7 +42,8 @@ def plot_losses(
 ) -> None:
     """One panel for each loss term, training above and validation below (Fig. 4-9 to 4-19).
 
-    Thick lines are moving means, thin ones the values.
+    Thick lines are moving means, thin ones the values. Terms that the images do not annotate, which are 0 throughout,
+    have no panel.
 
     Args:
         histories: Lines of `history.json` of each run, by its name.
@@ -61,6 +62,8 @@ def plot_losses(
     figure = Figure(figsize=(2.7 * len(terms), 2.4 * rows), layout="constrained")
     for row, prefix in enumerate(("", "val_")[:rows]):
         for column, term in enumerate(terms):
+            if not any(line.get(prefix + term) for lines in histories.values() for line in lines):
+                continue
             axes = figure.add_subplot(rows, len(terms), row * len(terms) + column + 1)
             for (name, lines), colour in zip(histories.items(), COLOURS, strict=False):
                 _plot_term(axes, lines, prefix + term, name, colour, smoothing)
