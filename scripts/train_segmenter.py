@@ -65,10 +65,10 @@ class DataArgs:
 
 @dataclass(frozen=True, kw_only=True)
 class Light(DataArgs):
-    """The light segmenter, from random weights, on a CPU."""
+    """The light segmenter, on a CPU."""
 
     start_from: Path | None = None
-    """Weights to begin with instead of random ones."""
+    """Weights to begin with instead of ImageNet's; layers that do not fit begin anew."""
     config: LightTrainConfig = field(default_factory=LightTrainConfig)
     """How to train."""
 

@@ -1,19 +1,21 @@
 """Precision, recall and average precision, against values by hand, a plain loop and COCO's own library."""
 
 import math
+from pathlib import Path
 
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 
 from maniskill_tomato.errors import InvalidInputError
-from maniskill_tomato.perception.annotations import Instance
+from maniskill_tomato.perception.annotations import AnnotatedImage, Instance
 from maniskill_tomato.perception.coco_metrics import CocoScore
 from maniskill_tomato.perception.detection_metrics import (
     DetectionScore,
     ImageTruth,
     PrecisionRecall,
     box_overlaps,
+    image_truth,
     mask_overlaps,
     match,
     without_narrow,
@@ -199,3 +201,24 @@ def test_detections_too_narrow_to_be_asked_for_do_not_count_unless_they_find_a_f
     assert len(without_narrow(found, truth)) == 4
     nothing = ImageTruth(boxes=np.zeros((0, 4)), ignored=np.zeros(0, bool), least_side=12.0)
     assert without_narrow(found, nothing).scores.tolist() == pytest.approx([0.6])
+
+
+def test_fruits_of_the_rows_behind_can_be_set_aside_and_labels_by_hand_ask_for_every_size() -> None:
+    def image(fraction: float | None) -> AnnotatedImage:
+        fruits = [
+            Instance(
+                category="tomato_ripe",
+                box_xywh=(10.0, 10.0, 40.0, 40.0),
+                visible_fraction=fraction,
+                name=name,
+            )
+            for name in ("fruit_01", "left/fruit_02", "behind_1_-2/fruit_03", None)
+        ]
+        return AnnotatedImage(
+            path=Path("a.png"), file_name="a.png", width=640, height=480, instances=tuple(fruits)
+        )
+
+    assert image_truth(image(0.5)).ignored.tolist() == [False] * 4
+    assert image_truth(image(0.5), rows_behind=False).ignored.tolist() == [False, False, True, False]
+    # 12 of 640 px where a renderer annotated, nothing where a person did.
+    assert image_truth(image(0.5)).least_side == 12 and image_truth(image(None)).least_side == 0

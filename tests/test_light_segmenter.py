@@ -301,7 +301,9 @@ def test_training_from_imagenet_moves_all_but_the_first_layers_and_the_backbone_
         assert torch.equal(tensor, start.state_dict()[name]) == fixed, name
 
 
-def test_training_from_weights_takes_over_the_layers_that_fit(tmp_path: Path) -> None:
+def test_training_from_weights_takes_over_the_layers_that_fit(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
     images = annotated(tmp_path, 1)
     start = FruitNetwork(SMALL)
     save_weights(tmp_path / "w.pt", "light", SMALL.to_dict(), start.state_dict())
@@ -310,7 +312,7 @@ def test_training_from_weights_takes_over_the_layers_that_fit(tmp_path: Path) ->
     for name, tensor in start.state_dict().items():
         if network[name].shape == tensor.shape:
             torch.testing.assert_close(network[name].float(), tensor.float(), rtol=1e-3, atol=1e-4, msg=name)
-    assert network["output.weight"].shape[1] == 12
+    assert network["output.weight"].shape[1] == 12 and "begin anew" in caplog.text
     other = replace(small_config(1), network=replace(SMALL, widths=(12, 8, 8, 8)))
     with pytest.raises(CheckpointError, match="another backbone"):
         LightTraining(other, [images], [1.0], start_from=tmp_path / "w.pt")

@@ -3,7 +3,7 @@
 Detection follows TTFNet (Liu et al., 2020, Training-Time-Friendly Network for Real-Time Object Detection): a heat
 map of centres and, at each place, the distances to the sides of the box. Masks follow the centre votes of
 Panoptic-DeepLab (Cheng et al., 2020): a map of fruit pixels and, at each, the way to the centre of its fruit. Both
-are dense targets, which a small network learns from random weights on a CPU. What is added: the box of the whole fruit.
+are dense targets, which a small network learns on a CPU. What is added: the box of the whole fruit.
 """
 
 from dataclasses import asdict, dataclass

@@ -1,7 +1,8 @@
-"""Training of the light segmenter from random weights, resumable step by step."""
+"""Training of the light segmenter, from ImageNet weights or others, resumable step by step."""
 
 import copy
 import json
+import logging
 import math
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field
@@ -15,7 +16,7 @@ from torch import Tensor, nn
 from maniskill_tomato.errors import CheckpointError, InvalidInputError
 from maniskill_tomato.perception.annotations import AnnotatedImage
 from maniskill_tomato.perception.augmentation import AugmentationConfig, augmented
-from maniskill_tomato.perception.efficientnet_lite import EfficientNetLite0
+from maniskill_tomato.perception.efficientnet_lite import FIXED_BLOCKS, EfficientNetLite0
 from maniskill_tomato.perception.fruit_network import FruitNetwork, FruitNetworkConfig
 from maniskill_tomato.perception.fruit_targets import (
     LOSS_WEIGHTS,
@@ -26,6 +27,8 @@ from maniskill_tomato.perception.fruit_targets import (
 from maniskill_tomato.perception.resumable_training import ResumableTraining
 from maniskill_tomato.perception.training_pictures import PictureDraw, training_picture
 from maniskill_tomato.perception.weights import load_weights, save_weights
+
+logger = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -50,7 +53,7 @@ class LightTrainConfig:
     """Multiply in 16 bits, which processors with AMX or AVX-512 BF16 do several times faster."""
     backbone_rate: float = 0.3
     """Learning rate of a backbone with ImageNet weights, as a share of the others'."""
-    fixed_blocks: int = 6
+    fixed_blocks: int = FIXED_BLOCKS
     """First blocks of a backbone with ImageNet weights that stay as they are, with the stem."""
     plain_share: float = 0.0
     """Last share of the steps without mosaics, so that the last pictures look like those to come."""
@@ -222,6 +225,8 @@ def _load_into(network: FruitNetwork, path: Path) -> None:
         raise CheckpointError(
             f"{path} is of a network on another backbone ({missing[0]} does not fit): {data['config']}"
         )
+    if anew := len(own) - len(fitting):
+        logger.warning("%d of %d layers do not fit those of %s and begin anew", anew, len(own), path)
     network.load_state_dict(fitting, strict=False)
 
 

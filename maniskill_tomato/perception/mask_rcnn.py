@@ -21,7 +21,7 @@ from torchvision.ops.misc import FrozenBatchNorm2d
 
 from maniskill_tomato.errors import MissingWeightsError
 from maniskill_tomato.perception.detector_presets import MaskRcnnConfig
-from maniskill_tomato.perception.efficientnet_lite import FEATURE_WIDTHS, EfficientNetLite0
+from maniskill_tomato.perception.efficientnet_lite import FEATURE_WIDTHS, FIXED_BLOCKS, EfficientNetLite0
 
 ASPECT_RATIOS = (0.5, 1.0, 2.0)
 """Height over width of the anchors; the implementation that the thesis built on has these."""
@@ -31,10 +31,6 @@ LIGHT_WIDTH = 96
 
 MOBILENET_LAYERS = {"2": "0", "4": "1", "7": "2", "13": "3"}
 """Blocks of MobileNetV3 (large) whose output has strides 4, 8, 16 and 32."""
-
-
-LITE0_FIXED_BLOCKS = 6
-"""First blocks of a pretrained EfficientNet-Lite0 that training leaves as they are, as the light segmenter's does."""
 
 
 class Lite0Pyramid(nn.Module):
@@ -131,7 +127,7 @@ def _backbone(config: MaskRcnnConfig, pretrained: bool) -> nn.Module:
         pyramid = Lite0Pyramid()
         if pretrained:
             pyramid.body.load_imagenet()
-            pyramid.body.keep_fixed(LITE0_FIXED_BLOCKS)
+            pyramid.body.keep_fixed(FIXED_BLOCKS)
         return pyramid
     weights: Any = "IMAGENET1K_V1" if pretrained else None
     if config.backbone != "mobilenet":

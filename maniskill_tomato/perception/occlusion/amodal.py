@@ -9,6 +9,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from maniskill_tomato.errors import InvalidInputError
+from maniskill_tomato.perception.detection_metrics import mask_overlaps
 from maniskill_tomato.perception.instances import box_ellipse
 from maniskill_tomato.perception.occlusion.estimate import Estimate, TomatoView
 from maniskill_tomato.perception.segmenter import Segmenter, make_segmenter
@@ -36,12 +37,9 @@ class AmodalModel:
                 "this segmenter tells no whole boxes; take one that was trained on rendered images"
             )
         height, width = view.rgb.shape[:2]
-        masks = found.masks.reshape(len(found), height * width)
-        areas = masks.sum(axis=1)
+        given = np.array(view.masks, bool).reshape(-1, height, width)
         estimates = []
-        for mask in view.masks:
-            shared = masks[:, mask.ravel()].sum(axis=1)
-            overlaps = shared / np.maximum(areas + mask.sum() - shared, 1)
+        for mask, overlaps in zip(view.masks, mask_overlaps(given, found.masks)[0], strict=True):
             best = int(overlaps.argmax()) if len(found) else -1
             if best < 0 or overlaps[best] < LEAST_OVERLAP:
                 estimates.append(Estimate.failed())
