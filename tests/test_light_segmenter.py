@@ -163,14 +163,51 @@ def test_places_of_small_fruits_weigh_more_in_the_mask_terms() -> None:
     maps = perfect_maps(picture)
     off = targets.vote_size * torch.tensor([1 / 8, 0.0])[:, None, None]
     vote = targets.vote - torch.stack([x, y]) + off
-    # Fruit pixels as likely as not: ln 2, and one minus Dice with half of everything.
+    # Fruit pixels as likely as not: ln 2, and one minus each fruit's Dice. Two for one in length, the boxes and a place
+    # around them, cut at the picture's edges, have 33 x 33, 10 x 9, 6 x 6 and 4 x 4 places, of which 32 x 32, 8 x 8,
+    # 4 x 4 and 2 x 2 are fruit: Dice is (fruit + 1) / (places / 2 + fruit + 1).
     found = fruit_losses(maps._replace(vote=vote, fruit=torch.zeros(1, 1, 64, 64)), targets)
     assert float(found["vote"]) == pytest.approx(0.125 / 2, rel=1e-4)
-    weight, fruit = targets.fruit_weight, targets.fruit
-    weighed, everything = float((weight * fruit).sum()), float(weight.sum())
-    dice = (weighed + 1) / (everything / 2 + weighed + 1)
+    dice = np.mean([1025 / 1569.5, 65 / 110, 17 / 35, 5 / 13])
     assert float(found["fruit"]) == pytest.approx(np.log(2) + 1 - dice, rel=1e-4)
     assert 0 < float(fruit_losses(maps, targets)["fruit"]) < 0.1
+
+
+def test_the_mask_of_a_fruit_is_judged_without_its_neighbours_and_without_fruits_that_do_not_count() -> None:
+    # Two squares of 8 px side by side, and one that is ignored.
+    labels = np.zeros((64, 64), np.int16)
+    boxes = np.array([[16, 16, 24, 24], [24, 16, 32, 24], [40, 40, 48, 48]], np.float32)
+    for index, (left, top, right, bottom) in enumerate(boxes.astype(int)):
+        labels[top:bottom, left:right] = index + 1
+    picture = TrainingPicture(
+        image=np.zeros((64, 64, 3), np.uint8),
+        boxes=boxes,
+        ignored=np.array([False, False, True]),
+        labels=labels,
+    )
+    targets = make_targets([picture, picture])
+    # 6 x 6 places around a box of 4 x 4, less the column of 4 that is the neighbour's; both pictures one after another.
+    assert np.bincount(targets.inside_fruit).tolist() == [32, 32, 32, 32]
+    owner = (
+        torch.from_numpy(labels[1::2, 1::2].astype(np.int64)).repeat(2, 1, 1).flatten()[targets.inside_place]
+    )
+    for fruit, others in enumerate(({2, 3}, {1, 3}, {2, 3}, {1, 3})):
+        assert set(owner[targets.inside_fruit == fruit].tolist()) == {0, 1, 2, 3} - others
+    assert targets.inside_place[targets.inside_fruit == 2].min() >= 32 * 32
+    # One fruit missed altogether costs a quarter of the Dice term, whatever its size.
+    maps = perfect_maps(picture)
+    both = FruitMaps(*(torch.cat([m, m]) for m in maps))
+    missed = both.fruit.clone()
+    missed[0, 0, 8:12, 8:12] = -10
+    entropy = torch.nn.functional.binary_cross_entropy_with_logits
+    losses = [
+        float(fruit_losses(both._replace(fruit=f), targets)["fruit"])
+        - float(entropy(f, targets.fruit, targets.fruit_weight, reduction="sum") / targets.fruit_weight.sum())
+        for f in (both.fruit, missed)
+    ]
+    assert losses[0] == pytest.approx(0, abs=1e-3)
+    # Nothing of 16 places: Dice 1 / 17.
+    assert losses[1] == pytest.approx((1 - 1 / 17) / 4, abs=1e-3)
 
 
 def test_terms_without_annotation_are_zero() -> None:

@@ -75,12 +75,26 @@ class FruitTargets:
     """Width and height of its box in [px]. Shape (B, 2, h, w)."""
     vote_weight: Tensor
     """The same weight on fruit, 0 elsewhere. Shape (B, 1, h, w)."""
+    inside_place: Tensor
+    """Places in the boxes of fruits with masks, without those of other fruits, as indices of the flattened batch.
+    Shape (M,)."""
+    inside_fruit: Tensor
+    """Which fruit of the batch each of them is for. Shape (M,)."""
 
 
 def make_targets(pictures: list[TrainingPicture]) -> FruitTargets:
     """The targets of pictures of one size."""
     each = [_picture_targets(picture) for picture in pictures]
-    return FruitTargets(**{name: torch.from_numpy(np.stack([t[name] for t in each])) for name in each[0]})
+    targets = {name: torch.from_numpy(np.stack([t[name] for t in each])) for name in each[0]}
+    insides = [_inside(picture) for picture in pictures]
+    rows, columns = targets["heat"].shape[2:]
+    places = [place + number * rows * columns for number, pair in enumerate(insides) for place in pair]
+    counts = [len(place) for place in places]
+    return FruitTargets(
+        **targets,
+        inside_place=torch.from_numpy(np.concatenate([*places, np.zeros(0, np.int64)])),
+        inside_fruit=torch.from_numpy(np.repeat(np.arange(len(places)), counts)),
+    )
 
 
 def _picture_targets(picture: TrainingPicture) -> dict[str, NDArray[np.float32] | NDArray[np.int64]]:
@@ -163,6 +177,23 @@ def _mask_targets(picture: TrainingPicture, rows: int, columns: int) -> dict[str
     }
 
 
+def _inside(picture: TrainingPicture) -> list[NDArray[np.int64]]:
+    """For each fruit that is asked for and has a mask: the places in its box, without those of other fruits."""
+    if picture.labels is None:
+        return []
+    rows, columns = picture.image.shape[0] // STRIDE, picture.image.shape[1] // STRIDE
+    middle = picture.labels[STRIDE // 2 :: STRIDE, STRIDE // 2 :: STRIDE][:rows, :columns]
+    insides = []
+    for index in np.flatnonzero(~picture.ignored).tolist():
+        left, top, right, bottom = picture.boxes[index] / STRIDE
+        area = _span(top - 1, bottom + 1, rows), _span(left - 1, right + 1, columns)
+        own = middle[area] == index + 1
+        if own.any():
+            y, x = np.nonzero(own | (middle[area] == 0))
+            insides.append((y + area[0].start) * columns + x + area[1].start)
+    return insides
+
+
 def _span(start: float, stop: float, size: int) -> slice:
     """The places between two coordinates, at least one."""
     first = min(max(int(start), 0), size - 1)
@@ -182,7 +213,7 @@ def fruit_losses(maps: FruitMaps, targets: FruitTargets) -> dict[str, Tensor]:
         "box": _box_term(_to_corners(maps.box, x, y), targets.box, targets.box_weight),
         "whole": _box_term(_to_corners(maps.whole, x, y), targets.whole, targets.whole_weight),
         "category": _category_term(maps.category, targets.category),
-        "fruit": _fruit_term(maps.fruit, targets.fruit, targets.fruit_weight),
+        "fruit": _fruit_term(maps.fruit, targets),
         "vote": _vote_term(maps.vote, targets, x, y),
     }
 
@@ -227,17 +258,27 @@ def _category_term(logits: Tensor, category: Tensor) -> Tensor:
     return functional.cross_entropy(logits.movedim(1, -1)[chosen], category[chosen])
 
 
-def _fruit_term(logits: Tensor, fruit: Tensor, weight: Tensor) -> Tensor:
-    """Binary cross entropy plus one minus the Dice coefficient, over the pictures with masks."""
+def _fruit_term(logits: Tensor, targets: FruitTargets) -> Tensor:
+    """Binary cross entropy over the pictures with masks, plus one minus the Dice coefficient, the mean of all fruits.
+
+    Whether a mask counts as right is asked of each fruit by itself, so a sliver counts as much as a whole fruit.
+    """
+    weight = targets.fruit_weight
     if weight.sum() == 0:
         return logits.sum() * 0
     entropy = (
-        functional.binary_cross_entropy_with_logits(logits, fruit, weight, reduction="sum") / weight.sum()
+        functional.binary_cross_entropy_with_logits(logits, targets.fruit, weight, reduction="sum")
+        / weight.sum()
     )
-    probability = logits.sigmoid()
-    shared, sizes = (probability * fruit * weight).sum(), ((probability + fruit) * weight).sum()
+    if not len(targets.inside_place):
+        return entropy
+    place, fruit = targets.inside_place, targets.inside_fruit
+    probability, share = logits.sigmoid().flatten()[place], targets.fruit.flatten()[place]
+    empty = torch.zeros(int(fruit[-1]) + 1, device=logits.device)
+    shared = empty.index_add(0, fruit, probability * share)
+    sizes = empty.index_add(0, fruit, probability + share)
     dice = (2 * shared + 1) / (sizes + 1)
-    return entropy + 1 - dice
+    return entropy + 1 - dice.mean()
 
 
 def _vote_term(vote: Tensor, targets: FruitTargets, x: Tensor, y: Tensor) -> Tensor:
