@@ -12,6 +12,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from maniskill_tomato.perception.instances import TOMATO
 from maniskill_tomato.perception.masks import BinaryMask
 from maniskill_tomato.perception.occlusion.estimate import (
     Estimate,
@@ -27,6 +28,7 @@ from maniskill_tomato.perception.occlusion.thesis import ThesisModel
 from maniskill_tomato.perception.segmenter import Segmenter, make_segmenter
 from maniskill_tomato.robot.d435 import CameraIntrinsics, color_intrinsics
 from maniskill_tomato.robot.depth_noise import DepthNoise, measure_depth
+from maniskill_tomato.tasks.target_choice import TargetChoice
 from maniskill_tomato.visibility.cast_image import ImageCaster, PixelLabel
 from maniskill_tomato.visibility.caster import VisibilityCaster
 from maniskill_tomato.visibility.view_rays import DEPTH_MODE, ViewRays, sample_view
@@ -55,9 +57,6 @@ row made from further away."""
 
 USUAL_RADIUS: Final = 0.029
 """Median radius of the tasks' tomatoes, in [m]."""
-
-GATES: Final = (0.05, 0.08)
-"""A fruit farther than this from where the target is believed to be is another one, in [m]: once seen, and before."""
 
 
 class CameraPerception:
@@ -90,6 +89,8 @@ class CameraPerception:
         self._segmenter, self._picture = segmenter, picture
         b, device = caster.num_envs, caster.device
         self._rng = [np.random.default_rng(0) for _ in range(b)]
+        self._hidden_below: list[float | None] = [None] * b
+        self._choices = [TargetChoice() for _ in range(b)]
         self._offset = torch.zeros(b, 3, device=device)
         self.located = torch.zeros(b, dtype=torch.bool, device=device)
         """Whether the camera has seen where the target is. Shape (B,)."""
@@ -100,15 +101,23 @@ class CameraPerception:
         self._mask: list[BinaryMask] = []
         self._robot: list[BinaryMask] = []
 
-    def begin(self, env_index: int, rng: np.random.RandomState) -> None:
-        """Draws the numbers that an episode's errors come from."""
+    def begin(self, env_index: int, rng: np.random.RandomState, hidden_below: float | None = None) -> None:
+        """Begins an episode; `forget` comes next.
+
+        Args:
+            env_index: Which environment's.
+            rng: Where the number that its errors follow from is drawn.
+            hidden_below: Its first view shows less of its first target than this V_f; None if that is not known.
+        """
         self._rng[env_index] = np.random.default_rng(int(rng.randint(2**31 - 1)))
+        self._hidden_below[env_index] = hidden_below
 
     def forget(self, env_idx: Tensor) -> None:
         """Begins with other targets, which are known from afar only. Shape (b,)."""
         for k in (int(i) for i in env_idx):
             offset = self._rng[k].normal(0.0, COARSE_POSITION, 3)
             self._offset[k] = torch.as_tensor(offset).to(self._offset)
+            self._choices[k], self._hidden_below[k] = TargetChoice(self._hidden_below[k]), None
         self.located[env_idx] = False
 
     def known_target(self, target_position: Tensor) -> Tensor:
@@ -135,17 +144,18 @@ class CameraPerception:
             depth = measure_depth(true, i, self._noise, self._rng[k], stereo=DEPTH_MODE)
             pose = T_world_camera[k].double().cpu().numpy()
             rgb = np.zeros((i.height, i.width, 3), np.uint8) if self._picture is None else self._picture(k)
-            if self._segmenter is None:
-                masks = [(images.label[k] == int(PixelLabel.TARGET)).cpu().numpy()]
-            else:
-                masks = list(self._segmenter(rgb, depth.astype(np.float32)).masks)
-            masks = [mask for mask in masks if np.count_nonzero(mask) >= MIN_SEEN]
+            masks, kinds = self._found(rgb, depth, (images.label[k] == int(PixelLabel.TARGET)).cpu().numpy())
             estimates = self._model(TomatoView(rgb=rgb, depth_m=depth, masks=tuple(masks), intrinsics=i))
             centres = [
                 _in_world(estimate, mask, depth, i, pose)
                 for estimate, mask in zip(estimates, masks, strict=True)
             ]
-            chosen = self._target_among(centres, known[k].double().cpu().numpy(), bool(self.located[k]))
+            if self._segmenter is None:
+                chosen = 0 if masks else None
+            else:
+                fractions = [estimate.visible_fraction for estimate in estimates]
+                believed = known[k].double().cpu().numpy()
+                chosen = self._choices[k].choose(centres, fractions, kinds, believed, bool(self.located[k]))
             self._depth.append(depth)
             self._robot.append((images.label[k] == int(PixelLabel.ROBOT)).cpu().numpy())
             self._mask.append(np.zeros(depth.shape, bool) if chosen is None else masks[chosen])
@@ -155,14 +165,16 @@ class CameraPerception:
             if chosen is not None and (centre := centres[chosen]) is not None:
                 self._seen_at[k] = torch.as_tensor(centre).to(self._seen_at)
 
-    def _target_among(self, centres: list[Float64 | None], known: Float64, located: bool) -> int | None:
-        """Which of the fruits that were found is the target."""
-        if self._segmenter is None:
-            return 0 if centres else None
-        away = [np.inf if c is None else float(np.linalg.norm(c - known)) for c in centres]
-        if not away or min(away) > GATES[0 if located else 1]:
-            return None
-        return int(np.argmin(away))
+    def _found(
+        self, rgb: UInt8, depth_m: Float64, target_mask: BinaryMask
+    ) -> tuple[list[BinaryMask], list[str]]:
+        """Masks and kinds of the fruits that can be seen; of the target alone where masks are perfect."""
+        masks, kinds = [target_mask], [TOMATO]
+        if self._segmenter is not None:
+            found = self._segmenter(rgb, depth_m.astype(np.float32))
+            masks, kinds = list(found.masks), list(found.categories)
+        seen = [n for n, mask in enumerate(masks) if np.count_nonzero(mask) >= MIN_SEEN]
+        return [masks[n] for n in seen], [kinds[n] for n in seen]
 
     def locate(self, target_position: Tensor) -> Tensor:
         """Takes the position from the last look for the targets that were first seen in it.

@@ -255,10 +255,11 @@ class TomatoViewpointGeneralEnv(TomatoEnv):
         near = torch.tensor([START_RPY], dtype=torch.float64, device=self.device).expand(len(starts), 3)
         viewpoint = camera_to_viewpoint(poses, near).float()
         self._set_arm(env_idx, viewpoint, torch.stack([start.qpos for start in starts]))
-        for i, rng in zip(indices, rngs, strict=True):
+        for i, rng, start in zip(indices, rngs, starts, strict=True):
             self._errors.begin(i, rng)
             if self._eyes is not None:
-                self._eyes.begin(i, rng)
+                hidden = start.is_hard and options.get("camera_position") is None
+                self._eyes.begin(i, rng, self.task.start_visibility[1] if hidden else None)
         self._begin(env_idx)
 
     def _start(

@@ -1,0 +1,55 @@
+"""Which of the fruits that were found is the target."""
+
+import numpy as np
+import pytest
+
+from maniskill_tomato.tasks.target_choice import GATES, MEASURED_MARGIN, SAME_FRUIT, TargetChoice
+
+TARGET = np.array([0.9, 0.0, 0.6])
+NEIGHBOUR = TARGET + [0.0, 0.045, 0.0]
+RIPE = ("tomato_ripe", "tomato_ripe")
+
+
+@pytest.mark.parametrize("order", [1, -1])
+def test_the_nearest_fruit_inside_the_gate_is_the_target_in_any_order(order: int) -> None:
+    places = [TARGET, NEIGHBOUR][::order]
+    believed = TARGET + [0.0, -0.02, 0.0]
+    assert TargetChoice().choose(places, [0.1, 0.9], RIPE, believed, True) == (0 if order == 1 else 1)
+
+
+@pytest.mark.parametrize("located", [False, True])
+def test_gates_are_closed_intervals(located: bool) -> None:
+    gate = GATES[0 if located else 1]
+    for away, expected in ((gate - 1e-6, 0), (gate + 1e-6, None)):
+        place = TARGET + [away, 0.0, 0.0]
+        assert TargetChoice().choose([place], [0.5], ("tomato",), TARGET, located) == expected
+
+
+def test_what_the_first_view_of_a_hidden_target_shows_well_is_never_the_target() -> None:
+    believed = NEIGHBOUR + [0.0, 0.005, 0.0]
+    choice = TargetChoice(hidden_below=0.3)
+    assert choice.choose([NEIGHBOUR], [0.3 + MEASURED_MARGIN + 0.01], RIPE[:1], believed, False) is None
+    # Nor later, measured a little beside where it was, though the believed place is its own; the target is found.
+    beside = NEIGHBOUR + [0.0, SAME_FRUIT - 0.001, 0.0]
+    assert choice.choose([beside, TARGET], [0.9, 0.2], RIPE, believed, False) == 1
+    # A fruit that only later is seen well may be it.
+    assert choice.choose([TARGET], [0.95], RIPE[:1], believed, False) == 0
+
+
+@pytest.mark.parametrize(
+    ("hidden_below", "fraction"), [(None, 1.0), (0.3, 0.3 + MEASURED_MARGIN), (0.3, np.nan)]
+)
+def test_without_that_knowledge_or_below_the_margin_it_may_be(
+    hidden_below: float | None, fraction: float
+) -> None:
+    choice = TargetChoice(hidden_below)
+    assert choice.choose([NEIGHBOUR], [fraction], RIPE[:1], NEIGHBOUR, False) == 0
+    assert choice.choose([NEIGHBOUR], [1.0], RIPE[:1], NEIGHBOUR, False) == 0
+
+
+def test_unripe_fruits_and_fruits_without_a_place_are_passed_over() -> None:
+    kinds = ("tomato_unripe", "tomato", "tomato_turning")
+    places = [TARGET, None, NEIGHBOUR]
+    assert TargetChoice().choose(places, [1.0, 1.0, 1.0], kinds, TARGET, True) == 2
+    assert TargetChoice().choose(places[:2], [1.0, 1.0], kinds[:2], TARGET, True) is None
+    assert TargetChoice().choose([], [], (), TARGET, True) is None
