@@ -15,11 +15,12 @@ SAME_FRUIT: Final = 0.025
 """Two places nearer to each other than this are one fruit, in [m]; centres of tomatoes of the usual radius of 29 mm
 are twice as far apart."""
 
-MEASURED_MARGIN: Final = 0.25
-"""How much more of a fruit must be measured than of a hidden target can be seen, to rule it out: four times the mean
-error of V_f with rendered images in the loop."""
+MEASURED_MARGIN: Final = 0.15
+"""How much more of a fruit must be measured than of a hidden target can be seen, to rule it out: three times the mean
+error of V_f."""
 
-UNRIPE: Final = "tomato_unripe"
+TARGET_CATEGORIES: Final = ("tomato_ripe", "tomato")
+"""Targets are ripe; a segmenter that does not tell ripeness says `tomato`."""
 
 
 class TargetChoice:
@@ -62,7 +63,7 @@ class TargetChoice:
             self._hidden_below = None
         best, nearest = None, GATES[0 if located else 1]
         for index, (place, category) in enumerate(zip(places, categories, strict=True)):
-            if place is None or category == UNRIPE or self._is_other(place):
+            if place is None or category not in TARGET_CATEGORIES or self._is_other(place):
                 continue
             away = float(np.linalg.norm(place - known))
             if away <= nearest:

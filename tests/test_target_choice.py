@@ -47,9 +47,9 @@ def test_without_that_knowledge_or_below_the_margin_it_may_be(
     assert choice.choose([NEIGHBOUR], [1.0], RIPE[:1], NEIGHBOUR, False) == 0
 
 
-def test_unripe_fruits_and_fruits_without_a_place_are_passed_over() -> None:
-    kinds = ("tomato_unripe", "tomato", "tomato_turning")
-    places = [TARGET, None, NEIGHBOUR]
-    assert TargetChoice().choose(places, [1.0, 1.0, 1.0], kinds, TARGET, True) == 2
-    assert TargetChoice().choose(places[:2], [1.0, 1.0], kinds[:2], TARGET, True) is None
+def test_fruits_that_are_not_ripe_or_have_no_place_are_passed_over() -> None:
+    kinds = ("tomato_unripe", "tomato", "tomato_turning", "tomato")
+    places = [TARGET, None, TARGET, NEIGHBOUR]
+    assert TargetChoice().choose(places, [1.0] * 4, kinds, TARGET, True) == 3
+    assert TargetChoice().choose(places[:3], [1.0] * 3, kinds[:3], TARGET, True) is None
     assert TargetChoice().choose([], [], (), TARGET, True) is None
