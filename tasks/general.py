@@ -13,12 +13,13 @@ from torch import Tensor
 
 from maniskill_tomato.errors import InvalidInputError
 from maniskill_tomato.plants.choice import PlantChoice
-from maniskill_tomato.plants.episode_list import EPISODE_LISTS, Episode, load_episodes
+from maniskill_tomato.plants.episode_list import Episode
 from maniskill_tomato.plants.row import Row, leaf_density_of
 from maniskill_tomato.robot.kinematics import link_transforms
 from maniskill_tomato.robot.look_at import camera_to_viewpoint
 from maniskill_tomato.tasks import MAX_GENERAL_STEPS, options
 from maniskill_tomato.tasks.camera_perception import RENDERED, RENDERED_SIZE, Perception, make_perception
+from maniskill_tomato.tasks.episode_choice import EpisodeChoice
 from maniskill_tomato.tasks.general_config import GeneralTaskConfig
 from maniskill_tomato.tasks.general_rewards import view_gain_reward
 from maniskill_tomato.tasks.ground_truth import GroundTruth
@@ -125,16 +126,9 @@ class TomatoViewpointGeneralEnv(TomatoEnv):
         if contact_penalty is not None:
             task = replace(task, contact_penalty=float(contact_penalty))
         choice = PlantChoice.parse(plant, task.plant)
-        self._episodes: tuple[Episode, ...] | None = None
-        if isinstance(episodes, str):
-            self._episodes = load_episodes(episodes)
-            split = episodes if episodes in EPISODE_LISTS else "train"
-            choice = replace(choice, seed=split, pool=None)
-        elif episodes is not None:
-            self._episodes = tuple(episodes)
-            if not self._episodes or not all(isinstance(e, Episode) for e in self._episodes):
-                raise InvalidInputError("episodes must be the name of a list or one or more Episode objects")
-            choice = replace(choice, seed="train", pool=None)
+        self._episodes = EpisodeChoice(episodes)
+        if self._episodes.episodes is not None:
+            choice = replace(choice, seed=self._episodes.split, pool=None)
         if layout is not None and not isinstance(layout, ObservationLayout):
             layout = ObservationLayout(parts=tuple(layout))  # type: ignore[arg-type]
         self.layout: ObservationLayout = layout or ObservationLayout()
@@ -183,20 +177,7 @@ class TomatoViewpointGeneralEnv(TomatoEnv):
 
     def episode(self, env_index: int, options: Mapping[str, Any]) -> Episode | None:
         """The episode of the list that a reset with these options begins; None without a list."""
-        if self._episodes is None:
-            if "episode" in options:
-                raise InvalidInputError(
-                    f"reset option episode needs a list: make the task with episodes= one of {', '.join(EPISODE_LISTS)}"
-                )
-            return None
-        index = options.get("episode", None)
-        if index is None:
-            index = int(self._episode_seed[env_index])
-        elif isinstance(index, Sequence | np.ndarray | Tensor):
-            index = index[env_index]
-        if isinstance(index, bool) or int(index) != index or int(index) < 0:
-            raise InvalidInputError(f"reset option episode must be an index of 0 or more; got {index!r}")
-        return self._episodes[int(index) % len(self._episodes)]
+        return self._episodes.at(env_index, int(self._episode_seed[env_index]), options)
 
     def _plant_seed(self, env_index: int, rng: np.random.RandomState, options: dict[str, Any]) -> int:
         episode = self.episode(env_index, options)
@@ -242,7 +223,7 @@ class TomatoViewpointGeneralEnv(TomatoEnv):
         rngs = [episode_rngs[i] for i in indices]
         self._place_plants(env_idx, indices, rngs, options)
         episodes = [self.episode(i, options) for i in indices]
-        if self._episodes is not None:
+        if self._episodes.episodes is not None:
             self._put_plants(env_idx, np.array([e.plant_pose for e in episodes if e is not None]))
         starts = [
             self._start(i, rng, episode, options)
