@@ -19,6 +19,10 @@ MEASURED_MARGIN: Final = 0.15
 """How much more of a fruit must be measured than of a hidden target can be seen, to rule it out: three times the mean
 error of V_f."""
 
+LEAST_MEASURED: Final = 0.1
+"""A fruit of which less V_f than this is measured does not say where the target is: centres of slivers are centimetres
+off."""
+
 TARGET_CATEGORIES: Final = ("tomato_ripe", "tomato")
 """Targets are ripe; a segmenter that does not tell ripeness says `tomato`."""
 
@@ -62,8 +66,10 @@ class TargetChoice:
             self._others = [p for p, f in zip(places, fractions, strict=True) if p is not None and f > limit]
             self._hidden_below = None
         best, nearest = None, GATES[0 if located else 1]
-        for index, (place, category) in enumerate(zip(places, categories, strict=True)):
+        for index, (place, fraction, category) in enumerate(zip(places, fractions, categories, strict=True)):
             if place is None or category not in TARGET_CATEGORIES or self._is_other(place):
+                continue
+            if not located and fraction < LEAST_MEASURED:
                 continue
             away = float(np.linalg.norm(place - known))
             if away <= nearest:

@@ -3,7 +3,13 @@
 import numpy as np
 import pytest
 
-from maniskill_tomato.tasks.target_choice import GATES, MEASURED_MARGIN, SAME_FRUIT, TargetChoice
+from maniskill_tomato.tasks.target_choice import (
+    GATES,
+    LEAST_MEASURED,
+    MEASURED_MARGIN,
+    SAME_FRUIT,
+    TargetChoice,
+)
 
 TARGET = np.array([0.9, 0.0, 0.6])
 NEIGHBOUR = TARGET + [0.0, 0.045, 0.0]
@@ -53,3 +59,10 @@ def test_fruits_that_are_not_ripe_or_have_no_place_are_passed_over() -> None:
     assert TargetChoice().choose(places, [1.0] * 4, kinds, TARGET, True) == 3
     assert TargetChoice().choose(places[:3], [1.0] * 3, kinds[:3], TARGET, True) is None
     assert TargetChoice().choose([], [], (), TARGET, True) is None
+
+
+def test_a_sliver_does_not_locate_the_target_but_is_followed_once_it_is_located() -> None:
+    places, kinds = [TARGET, NEIGHBOUR], RIPE
+    fractions = [LEAST_MEASURED - 0.01, LEAST_MEASURED]
+    assert TargetChoice().choose(places, fractions, kinds, TARGET, False) == 1
+    assert TargetChoice().choose(places, fractions, kinds, TARGET, True) == 0
