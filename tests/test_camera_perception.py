@@ -120,7 +120,7 @@ def test_rendered_perceptions_run_and_their_pictures_lie_on_the_cast_labels(perc
 
 def test_of_several_fruits_found_the_one_near_the_known_place_is_the_target() -> None:
     env = make(perception="occlusion_model")
-    env.reset(seed=0)
+    env.reset(seed=2)
     looks = []
     for order in (1, -1):
         eyes = CameraPerception(env._caster, segmenter=LabelSegmenter(env, order))
@@ -134,6 +134,26 @@ def test_of_several_fruits_found_the_one_near_the_known_place_is_the_target() ->
         assert float(eyes.visible_fraction[0]) == 0.0, "a fruit a metre away is another one"
         looks.append(float(near[0]))
     assert looks[0] == looks[1] > 0.0
+    env.close()
+
+
+def test_what_the_first_view_of_a_hidden_target_shows_well_is_not_taken_for_it() -> None:
+    env: Any = gym.make(
+        "TomatoViewpoint-v1", obs_mode="state", render_backend="none", start_visibility=(0.7, 1.0)
+    ).unwrapped
+    env.reset(seed=0)
+    seen = []
+    for hidden_below in (None, 0.3):
+        eyes = CameraPerception(env._caster, segmenter=LabelSegmenter(env, 1))
+        eyes.begin(0, np.random.RandomState(0), hidden_below)
+        eyes.forget(torch.tensor([0]))
+        T_w_links = link_transforms(env.agent.robot.get_qpos())
+        T_w_camera = T_w_links[:, -1] @ env._T_ee_camera
+        for _ in range(2):
+            eyes.look(T_w_camera, env._target, env._target_position_w, env.planting.T_world_plant, T_w_links)
+            seen.append(float(eyes.visible_fraction[0]))
+    assert min(seen[:2]) > 0.45
+    assert seen[2:] == [0.0, 0.0]
     env.close()
 
 
