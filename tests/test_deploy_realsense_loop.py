@@ -5,6 +5,7 @@ import json
 import time
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -15,10 +16,14 @@ from torch import Tensor
 from maniskill_tomato.cli import main
 from maniskill_tomato.deploy.clock import SimulatedClock
 from maniskill_tomato.deploy.drivers import DriverContext
+from maniskill_tomato.deploy.errors import NotConnectedError
 from maniskill_tomato.deploy.interface import Float64
 from maniskill_tomato.deploy.mock.options import twin_options, twin_world
 from maniskill_tomato.deploy.mock.world import TwinWorld
 from maniskill_tomato.deploy.profile import Profile, parse_profile
+from maniskill_tomato.deploy.realsense.config import RealSenseConfig
+from maniskill_tomato.deploy.realsense.sdk import load_sdk
+from maniskill_tomato.deploy.realsense.source import FrameSource
 from maniskill_tomato.deploy.replay import load_recording
 from maniskill_tomato.deploy.station import make_station
 from maniskill_tomato.deploy.steps import KeptSteps, RunResult, Step
@@ -165,3 +170,46 @@ def test_pictures_of_a_recording_guide_the_arm_as_the_twins_own_do(tmp_path: Pat
         assert float(np.median(np.abs(step.frame.depth - twin_step.frame.depth)[both])) < 0.004
     for seen, wanted in zip(policy.situations, expected_policy.situations, strict=True):
         assert float((seen - wanted).abs().median()) < 0.01
+
+
+class StallingSdk:
+    """The SDK on a machine that stalls for half a second after the streams' start."""
+
+    def __init__(self, sdk: Any) -> None:
+        self._sdk = sdk
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._sdk, name)
+
+    def pipeline(self, context: Any) -> "StallingPipeline":
+        return StallingPipeline(self._sdk.pipeline(context))
+
+    def pipeline_wrapper(self, stalling: "StallingPipeline") -> Any:
+        return self._sdk.pipeline_wrapper(stalling.pipeline)
+
+
+class StallingPipeline:
+    """Its pipeline."""
+
+    def __init__(self, pipeline: Any) -> None:
+        self.pipeline = pipeline
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self.pipeline, name)
+
+    def start(self, settings: Any) -> Any:
+        profile = self.pipeline.start(settings)
+        time.sleep(0.5)
+        return profile
+
+
+def test_no_picture_of_a_recording_is_lost_to_a_busy_machine(tmp_path: Path) -> None:
+    made = world()
+    record(tmp_path / "views.db3", made, [made.episode.start_joints] * 3)
+    config = RealSenseConfig(recording=str(tmp_path / "views.db3"), temporal=False)
+    source = FrameSource(StallingSdk(load_sdk()), config)
+    numbers = [source.next(2.0).get_color_frame().get_frame_number() for _ in range(3)]
+    assert numbers == [1, 2, 3]
+    with pytest.raises(NotConnectedError, match="over"):
+        source.next(2.0)
+    source.close()

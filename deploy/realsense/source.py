@@ -41,7 +41,13 @@ class FrameSource:
                 )
             settings.enable_device_from_file(str(path), repeat_playback=config.repeat)
         self._pipeline = sdk.pipeline(self._context)
+        self._playback = None
         try:
+            if config.recording is not None:
+                # Before the start: played in real time, the first pictures are lost to whoever is late.
+                device = settings.resolve(sdk.pipeline_wrapper(self._pipeline)).get_device()
+                self._playback = device.as_playback()
+                self._playback.set_real_time(False)
             self.profile = self._pipeline.start(settings)
         except RuntimeError as error:
             what = f"camera {self.serial}" if config.recording is None else f"recording {config.recording}"
@@ -49,10 +55,6 @@ class FrameSource:
                 f"the {what} cannot be started: {error}; is another program using it, is it on a USB 3 port, and does "
                 "it have these sizes and this rate?"
             ) from error
-        self._playback = None
-        if config.recording is not None:
-            self._playback = self.profile.get_device().as_playback()
-            self._playback.set_real_time(False)
 
     @property
     def is_recording(self) -> bool:
