@@ -14,10 +14,10 @@ from maniskill_tomato.deploy.interface import JointMove
 from maniskill_tomato.deploy.observing import Observing
 from maniskill_tomato.deploy.policies import decide, default_policy, open_policy
 from maniskill_tomato.deploy.profile import Profile
-from maniskill_tomato.deploy.station import make_station
+from maniskill_tomato.deploy.workcell import make_workcell
 from maniskill_tomato.errors import TomatoError
 from maniskill_tomato.files import write_atomically
-from maniskill_tomato.visibility.view_rays import NEAREST_DEPTH
+from maniskill_tomato.raycast.view_rays import NEAREST_DEPTH
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -53,11 +53,11 @@ def check(profile: Profile, policy: str | None, seed: int, out: Path | None) -> 
     except TomatoError as error:
         yield Finding(what="policy", good=False, detail=str(error))
     try:
-        station = make_station(profile, seed)
+        workcell = make_workcell(profile, seed)
     except TomatoError as error:
         yield Finding(what="drivers", good=False, detail=str(error))
         return
-    calibrated = profile.calibrated or station.simulated
+    calibrated = profile.calibrated or workcell.simulated
     where = np.round(profile.T_flange_camera[:3, 3] * 1e3, 1).tolist()
     detail = (
         f"camera at {where} mm from the flange, {'measured' if profile.calibrated else 'from the drawings'}"
@@ -67,30 +67,32 @@ def check(profile: Profile, policy: str | None, seed: int, out: Path | None) -> 
     yield Finding(what="calibration", good=calibrated, detail=detail)
     joints: Any = None
     try:
-        with station.arm:
-            yield Finding(what="arm", good=True, detail=_facts(station.arm.describe()))
-            joints = station.guarded_arm.read().joint_positions
+        with workcell.arm:
+            yield Finding(what="arm", good=True, detail=_facts(workcell.arm.describe()))
+            joints = workcell.guarded_arm.read().joint_positions
             degrees = ", ".join(f"{v:.1f}" for v in np.rad2deg(joints))
             yield Finding(what="state", good=True, detail=f"joints at ({degrees}) deg")
             stay = JointMove(joint_positions=joints, speed_fraction=profile.safety.speed_fraction)
-            refusal = station.guarded_arm.safety.check(stay, station.guarded_arm.read(), station.clock.now())
+            refusal = workcell.guarded_arm.safety.check(
+                stay, workcell.guarded_arm.read(), workcell.clock.now()
+            )
             yield Finding(
                 what="limits",
                 good=refusal is None,
                 detail="the arm stands inside the envelope" if refusal is None else str(refusal),
             )
-            can_stop = station.guarded_arm.can_stop
+            can_stop = workcell.guarded_arm.can_stop
             detail = "can be stopped" if can_stop else "only the smartPAD or the emergency stop halts a move"
             yield Finding(what="stop", good=True, detail=detail)
-            with station.camera:
-                yield from _look(station, profile, joints, opened, out)
+            with workcell.camera:
+                yield from _look(workcell, profile, joints, opened, out)
     except DeployError as error:
         yield Finding(what="device", good=False, detail=str(error))
 
 
-def _look(station: Any, profile: Profile, joints: Any, opened: Any, out: Path | None) -> Iterator[Finding]:
-    yield Finding(what="camera", good=True, detail=_facts(station.camera.describe()))
-    frame = Capture(station.camera, profile.capture, station.clock).take(-np.inf)
+def _look(workcell: Any, profile: Profile, joints: Any, opened: Any, out: Path | None) -> Iterator[Finding]:
+    yield Finding(what="camera", good=True, detail=_facts(workcell.camera.describe()))
+    frame = Capture(workcell.camera, profile.capture, workcell.clock).take(-np.inf)
     share = float((frame.depth > 0.0).mean())
     near = float((frame.depth[frame.depth > 0.0] < 2.0 * NEAREST_DEPTH).mean()) if share else 0.0
     yield Finding(
@@ -110,15 +112,15 @@ def _look(station: Any, profile: Profile, joints: Any, opened: Any, out: Path | 
         yield Finding(what="saved", good=True, detail=str(path))
     observing = Observing(profile.T_flange_camera, profile.loop.max_moves)
     T_world_camera = observing.camera_pose(joints)
-    target = station.target_position()
+    target = workcell.target_position()
     if target is None:
-        target = station.perception.find_target(frame, T_world_camera)
+        target = workcell.perception.find_target(frame, T_world_camera)
     if target is None:
         yield Finding(
             what="target", good=False, detail="no ripe fruit in the picture; point the camera at one"
         )
         return
-    view = station.perception.look(frame, T_world_camera, target)
+    view = workcell.perception.look(frame, T_world_camera, target)
     yield Finding(
         what="target",
         good=True,
@@ -128,12 +130,12 @@ def _look(station: Any, profile: Profile, joints: Any, opened: Any, out: Path | 
     if opened is None:
         return
     observing.begin(target)
-    situation = observing.observe(joints, view, profile.loop.max_moves)
+    belief = observing.observe(joints, view, profile.loop.max_moves)
     try:
         import torch
 
-        opened.begin(situation, torch.zeros(1, dtype=torch.int64))
-        action = decide(opened, situation)
+        opened.begin(belief, torch.zeros(1, dtype=torch.int64))
+        action = decide(opened, belief)
         detail = f"answers {np.round(action, 3).tolist()} (right, up, forward; 1 is 0.12 m)"
         yield Finding(what="decision", good=True, detail=detail)
     except TomatoError as error:

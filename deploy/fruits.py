@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 from maniskill_tomato.deploy.errors import PerceptionError, ProfileError
 from maniskill_tomato.deploy.interface import Float64, Frame
 from maniskill_tomato.errors import TomatoError
+from maniskill_tomato.raycast.picture_caster import ROBOT_LABEL
 from maniskill_tomato.robot.d435 import CameraIntrinsics
-from maniskill_tomato.visibility.picture_caster import ROBOT_LABEL
 
 Mask = NDArray[np.bool_]
 
@@ -128,7 +128,7 @@ def open_finder(name: str) -> FruitFinder:
     if name == TruthFinder.name:
         return TruthFinder()
     try:
-        module: Any = importlib.import_module("maniskill_tomato.perception.segmenter")
+        module: Any = importlib.import_module("maniskill_tomato.segmentation.segmenter")
         return SegmenterFinder(name, module.make_segmenter(name))
     except ImportError as error:
         raise ProfileError(

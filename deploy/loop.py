@@ -29,7 +29,7 @@ from maniskill_tomato.deploy.errors import (
 from maniskill_tomato.deploy.guarded_arm import GuardedArm
 from maniskill_tomato.deploy.interface import Camera, Float64, Frame, JointMove
 from maniskill_tomato.deploy.loop_config import LoopConfig, Mode, Proposal
-from maniskill_tomato.deploy.move_choice import MoveChooser, Wish
+from maniskill_tomato.deploy.move_choice import MoveChooser, MoveRequest
 from maniskill_tomato.deploy.observing import Observing
 from maniskill_tomato.deploy.perceive import Perception
 from maniskill_tomato.deploy.plant_points import PlantPoints
@@ -39,7 +39,7 @@ from maniskill_tomato.deploy.stage_times import StageTimes
 from maniskill_tomato.deploy.steps import Recorder, RunResult, Step
 from maniskill_tomato.deploy.stops import Stops
 from maniskill_tomato.errors import PolicyError, TomatoError
-from maniskill_tomato.planners.base import Planner
+from maniskill_tomato.policies.base import Planner
 
 WAIT_SLICE: Final = 0.1
 """While the arm moves, stops are looked for this often, in [s]."""
@@ -182,7 +182,7 @@ class Loop:
             return
         self._way_back = joints
         with self._times.timed("policy"):
-            action = decide(self._policy, self._situation)
+            action = decide(self._policy, self._belief)
         step = replace(step, action=(float(action[0]), float(action[1]), float(action[2])))
         self._moves += 1
         self._act(step, frame)
@@ -205,11 +205,11 @@ class Loop:
             view = self._perception.look(frame, T_world_camera, self._target)
         with self._times.timed("observe"):
             moves_left = self._config.max_moves - self._moves
-            self._situation = self._observing.observe(joints, view, moves_left)
+            self._belief = self._observing.observe(joints, view, moves_left)
         with self._times.timed("plant points"):
             self._points.add(frame, T_world_camera, joints)
         if first:
-            self._policy.begin(self._situation, torch.zeros(1, dtype=torch.int64))
+            self._policy.begin(self._belief, torch.zeros(1, dtype=torch.int64))
         self._fractions.append(view.visible_fraction)
         self._true_fraction = None if frame.truth is None else frame.truth.visible_fraction
         return Step(
@@ -225,7 +225,7 @@ class Loop:
     def _act(self, step: Step, frame: Frame) -> None:
         """Solves the move, has it checked and carried out, or counts it as refused."""
         assert step.action is not None and self._target is not None
-        wish = Wish(
+        request = MoveRequest(
             joint_positions=step.joint_positions,
             camera_position=self._observing.camera_position(step.joint_positions),
             target_position=self._target,
@@ -233,10 +233,10 @@ class Loop:
         )
         points = self._points.points_w
         with self._times.timed("kinematics"):
-            own_goal = self._chooser.own_goal(wish)
+            own_goal = self._chooser.own_goal(request)
         with self._times.timed("safety"):
             state = self._arm.read()
-            chosen = self._chooser.choose(wish, own_goal, state, self._clock.now(), frame.stamp, points)
+            chosen = self._chooser.choose(request, own_goal, state, self._clock.now(), frame.stamp, points)
         if chosen.move is None:
             self._refuse(step, "out of reach")
             return

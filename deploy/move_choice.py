@@ -21,7 +21,7 @@ _logger = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Wish:
+class MoveRequest:
     """Where the policy wants the camera."""
 
     joint_positions: Float64
@@ -36,7 +36,7 @@ class Wish:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Choice:
-    """What became of a wish."""
+    """What became of a request."""
 
     move: JointMove | None
     """The safe move, or if there is none the task's own; None where the arm cannot reach that either."""
@@ -58,13 +58,13 @@ class MoveChooser:
         self._mover = LookAtMover(T_flange_camera=np.array(T_flange_camera, dtype=np.float64))
         self._postures = Postures(T_flange_camera, safety.config.joint_margin)
 
-    def own_goal(self, wish: Wish) -> Float64 | None:
+    def own_goal(self, request: MoveRequest) -> Float64 | None:
         """Joint positions of the task's own move, in [rad], shape (7,); None if out of reach."""
         solved = self._mover.move(
-            torch.tensor(wish.joint_positions[None], dtype=torch.float32),
-            torch.as_tensor(wish.camera_position[None]),
-            torch.as_tensor(wish.target_position[None]),
-            torch.tensor([wish.action]),
+            torch.tensor(request.joint_positions[None], dtype=torch.float32),
+            torch.as_tensor(request.camera_position[None]),
+            torch.as_tensor(request.target_position[None]),
+            torch.tensor([request.action]),
         )
         if int(solved.reach[0]) == int(Reach.UNREACHABLE):
             return None
@@ -73,7 +73,7 @@ class MoveChooser:
 
     def choose(
         self,
-        wish: Wish,
+        request: MoveRequest,
         own_goal: Float64 | None,
         state: ArmState,
         now: float,
@@ -83,7 +83,7 @@ class MoveChooser:
         """Holds the task's own posture and then others against `safety`.
 
         Args:
-            wish: Where to.
+            request: Where to.
             own_goal: What the task would do, from `own_goal`.
             state: Where the arm is.
             now: The time, in [s].
@@ -99,15 +99,15 @@ class MoveChooser:
             if refusal is None:
                 return Choice(move=own, refusal=None)
         aim = moved_position(
-            torch.as_tensor(wish.camera_position),
-            torch.as_tensor(wish.target_position),
-            torch.tensor(wish.action, dtype=torch.float64),
+            torch.as_tensor(request.camera_position),
+            torch.as_tensor(request.target_position),
+            torch.tensor(request.action, dtype=torch.float64),
         )
         others = self._postures.of_move(
             state.joint_positions,
-            wish.camera_position,
+            request.camera_position,
             aim.numpy(),
-            wish.target_position,
+            request.target_position,
             config.max_joint_step,
         )
         for posture in islice(others, OTHERS_TRIED):

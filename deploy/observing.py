@@ -7,8 +7,8 @@ from maniskill_tomato.deploy.interface import Float64
 from maniskill_tomato.deploy.perceive import View
 from maniskill_tomato.robot.kinematics import forward_kinematics, link_transforms
 from maniskill_tomato.robot.rotations import matrix_to_rpy
-from maniskill_tomato.visibility.observation import ObservationLayout, ViewpointObserver
-from maniskill_tomato.visibility.situation import Situation
+from maniskill_tomato.sensing.belief import Belief
+from maniskill_tomato.sensing.observation import ObservationLayout, ViewpointObserver
 
 FIRST_RPY = (0.0, np.pi / 2, 0.0)
 """The angles that those of the first view are near to, in [rad], as in the task: along +x, upright."""
@@ -57,7 +57,7 @@ class Observing:
         position: Float64 = pose[0, :3, 3].numpy()
         return position
 
-    def observe(self, joint_positions: Float64, view: View, moves_left: int) -> Situation:
+    def observe(self, joint_positions: Float64, view: View, moves_left: int) -> Belief:
         """Takes a view into the memory; once for every view.
 
         Args:
@@ -75,7 +75,7 @@ class Observing:
             torch.tensor([view.visible_fraction], dtype=torch.float32),
             torch.tensor([moves_left]),
         )
-        return self._observer.situation
+        return self._observer.belief
 
     def _poses(self, joint_positions: Float64) -> tuple[torch.Tensor, torch.Tensor]:
         joints = torch.as_tensor(np.array(joint_positions)[None], dtype=torch.float32)

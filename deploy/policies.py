@@ -11,12 +11,12 @@ from torch import Tensor
 from maniskill_tomato.assets import asset_path
 from maniskill_tomato.errors import PolicyError, TomatoError
 from maniskill_tomato.files import read_tensors
-from maniskill_tomato.planners.base import Planner
-from maniskill_tomato.planners.learned import LearnedPolicy
-from maniskill_tomato.planners.registry import PLANNERS, PRIVILEGED, make_planner
-from maniskill_tomato.planners.view_quality import is_view_quality, load_view_quality
-from maniskill_tomato.policy.onnx_policy import OnnxPolicy
-from maniskill_tomato.visibility.situation import Situation
+from maniskill_tomato.policies.base import Planner
+from maniskill_tomato.policies.learned import LearnedPolicy
+from maniskill_tomato.policies.onnx_policy import OnnxPolicy
+from maniskill_tomato.policies.registry import PLANNERS, PRIVILEGED, make_planner
+from maniskill_tomato.policies.view_quality import is_view_quality, load_view_quality
+from maniskill_tomato.sensing.belief import Belief
 
 TASK: Final = "TomatoViewpoint-v1"
 """The task whose observations and actions the loop has."""
@@ -91,7 +91,7 @@ def _onnx(path: Path) -> Planner:
     return LearnedPolicy(_OnnxActor(policy))
 
 
-def decide(policy: Planner, situation: Situation) -> NDArray[np.float64]:
+def decide(policy: Planner, belief: Belief) -> NDArray[np.float64]:
     """The policy's next move, checked.
 
     Returns:
@@ -100,7 +100,7 @@ def decide(policy: Planner, situation: Situation) -> NDArray[np.float64]:
     Raises:
         PolicyError: It is not three finite numbers within the bounds.
     """
-    action = np.asarray(policy.act(situation).detach().double())
+    action = np.asarray(policy.act(belief).detach().double())
     if action.shape != (1, 3):
         raise PolicyError(
             f"the policy answered with shape {action.shape}, not (1, 3); is it for another task?"

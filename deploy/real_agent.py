@@ -14,7 +14,7 @@ from maniskill_tomato.deploy.errors import NotConnectedError, RefusedError
 from maniskill_tomato.deploy.interface import Float64, Frame, JointMove
 from maniskill_tomato.deploy.picture_fit import depth_in_mm, fit_color, fit_depth
 from maniskill_tomato.deploy.plant_points import PlantPoints
-from maniskill_tomato.deploy.station import Station
+from maniskill_tomato.deploy.workcell import Workcell
 from maniskill_tomato.errors import InvalidInputError
 from maniskill_tomato.robot.d435 import CameraIntrinsics
 from maniskill_tomato.robot.iiwa14 import NUM_JOINTS
@@ -37,32 +37,32 @@ class IiwaRealAgent(BaseRealAgent):  # type: ignore[misc]
     and field of view of the simulated camera, with the channel axis that ManiSkill has.
     """
 
-    def __init__(self, station: Station, camera_name: str = "d435") -> None:
+    def __init__(self, workcell: Workcell, camera_name: str = "d435") -> None:
         """Touches nothing; `start` connects.
 
         Args:
-            station: Devices, calibration and safety.
+            workcell: Devices, calibration and safety.
             camera_name: Of the simulated sensor that the camera stands for.
         """
         super().__init__()
-        self.station = station
+        self.workcell = workcell
         self._camera_name = camera_name
-        self._points = PlantPoints(station.profile.T_flange_camera)
-        self._capture = Capture(station.camera, station.profile.capture, station.clock)
+        self._points = PlantPoints(workcell.profile.T_flange_camera)
+        self._capture = Capture(workcell.camera, workcell.profile.capture, workcell.clock)
         self._settled_at = -math.inf
         self._frame: Frame | None = None
         self._frame_joints: Float64 | None = None
 
     def start(self) -> None:
         """Connects arm and camera."""
-        self.station.arm.connect()
-        self.station.camera.connect()
-        self._settled_at = self.station.clock.now()
+        self.workcell.arm.connect()
+        self.workcell.camera.connect()
+        self._settled_at = self.workcell.clock.now()
 
     def stop(self) -> None:
         """Disconnects both; a move of the iiwa under way goes on."""
-        self.station.camera.disconnect()
-        self.station.arm.disconnect()
+        self.workcell.camera.disconnect()
+        self.workcell.arm.disconnect()
 
     def set_target_qpos(self, qpos: Any) -> None:
         """Moves there and returns when the arm stands.
@@ -75,7 +75,7 @@ class IiwaRealAgent(BaseRealAgent):  # type: ignore[misc]
             DeployError: A device fails.
         """
         joints = _joints(qpos)
-        state = self.station.guarded_arm.read()
+        state = self.workcell.guarded_arm.read()
         if (
             not np.abs(joints - state.joint_positions).max() <= 1e-4
         ):  # NaN goes on to safety, which refuses it.
@@ -100,7 +100,7 @@ class IiwaRealAgent(BaseRealAgent):  # type: ignore[misc]
             RefusedError: `safety` speaks against a piece; the arm stands at its beginning.
             DeployError: A device fails.
         """
-        goal, start = _joints(qpos), self.station.guarded_arm.read().joint_positions
+        goal, start = _joints(qpos), self.workcell.guarded_arm.read().joint_positions
         pieces = max(1, math.ceil(float(np.abs(goal - start).max()) / RESET_STEP))
         for k in range(1, pieces + 1):
             self.set_target_qpos(start + (goal - start) * (k / pieces))
@@ -112,9 +112,9 @@ class IiwaRealAgent(BaseRealAgent):  # type: ignore[misc]
             DeployError: The camera gives none that can be used.
         """
         if self._frame is None or self._frame_joints is None:
-            self.station.camera.begin_view()
+            self.workcell.camera.begin_view()
             self._frame = self._capture.take(self._settled_at)
-            self._frame_joints = self.station.guarded_arm.read().joint_positions
+            self._frame_joints = self.workcell.guarded_arm.read().joint_positions
             self._points.add(self._frame, self.camera_pose(self._frame_joints), self._frame_joints)
         return self._frame, self._frame_joints
 
@@ -160,27 +160,27 @@ class IiwaRealAgent(BaseRealAgent):  # type: ignore[misc]
     def camera_pose(self, joint_positions: Float64) -> Float64:
         """The colour camera's optical frame in the world at joint angles in [rad], by the calibration. Shape (4, 4)."""
         flange = forward_kinematics(torch.as_tensor(np.array(joint_positions))).numpy()
-        return np.asarray(flange @ self.station.profile.T_flange_camera, np.float64)
+        return np.asarray(flange @ self.workcell.profile.T_flange_camera, np.float64)
 
     def get_qpos(self) -> Tensor:
         """Measured joint angles, in [rad]. Shape (1, 7), float32."""
-        state = self.station.guarded_arm.read()
+        state = self.workcell.guarded_arm.read()
         return torch.as_tensor(np.array(state.joint_positions), dtype=torch.float32)[None]
 
     def get_qvel(self) -> Tensor:
         """Measured joint speeds, in [rad/s]. Shape (1, 7), float32."""
-        state = self.station.guarded_arm.read()
+        state = self.workcell.guarded_arm.read()
         return torch.as_tensor(np.array(state.joint_velocities), dtype=torch.float32)[None]
 
     def _go(self, joints: Float64, frame_stamp: float | None) -> None:
-        arm = self.station.guarded_arm
+        arm = self.workcell.guarded_arm
         move = JointMove(joint_positions=joints, speed_fraction=arm.safety.config.speed_fraction)
         arm.command(move, frame_stamp, self._points.points_w)
         self._frame = self._frame_joints = None
         while not arm.wait(0.2):
             pass
-        self.station.clock.sleep(SETTLE_S)
-        self._settled_at = self.station.clock.now()
+        self.workcell.clock.sleep(SETTLE_S)
+        self._settled_at = self.workcell.clock.now()
 
     def _simulated_intrinsics(self) -> CameraIntrinsics | None:
         """Of the simulated camera that this one stands for, once there is a simulation."""

@@ -22,11 +22,11 @@ from maniskill_tomato.deploy.policies import open_policy
 from maniskill_tomato.deploy.profile import Profile, parse_profile
 from maniskill_tomato.deploy.recording import FORMAT, decode_depth, decode_png, read_messages, unpack
 from maniskill_tomato.deploy.safety import Safety
-from maniskill_tomato.deploy.station import make_perception
 from maniskill_tomato.deploy.steps import RunResult, Step
 from maniskill_tomato.deploy.stops import Stops
+from maniskill_tomato.deploy.workcell import make_perception
+from maniskill_tomato.raycast.view_rays import ViewRays
 from maniskill_tomato.robot.d435 import CameraIntrinsics
-from maniskill_tomato.visibility.view_rays import ViewRays
 
 TOLERANCE: Final = 1e-5
 """Actions, V_f and joint positions [rad] that differ by less are the same."""

@@ -15,9 +15,9 @@ from maniskill_tomato.deploy.policies import default_policy, open_policy
 from maniskill_tomato.deploy.profile import Profile
 from maniskill_tomato.deploy.recording import McapRecorder
 from maniskill_tomato.deploy.run_report import Contact, write_report
-from maniskill_tomato.deploy.station import make_station, prepare_folder
 from maniskill_tomato.deploy.steps import Recorder, RunResult, Step
 from maniskill_tomato.deploy.stops import Stops
+from maniskill_tomato.deploy.workcell import make_workcell, prepare_folder
 
 RECORDING = "run.mcap"
 """Name of the recording in the output folder."""
@@ -82,9 +82,9 @@ def run(
     profile = config.profile
     name = default_policy() if config.policy is None else config.policy
     policy = open_policy(name, config.seed)
-    station = make_station(profile, config.seed, clock)
-    mode: Mode = config.mode or ("unattended" if station.simulated else "dry_run")
-    if not station.simulated and not profile.calibrated:
+    workcell = make_workcell(profile, config.seed, clock)
+    mode: Mode = config.mode or ("unattended" if workcell.simulated else "dry_run")
+    if not workcell.simulated and not profile.calibrated:
         if mode != "dry_run":
             raise ProfileError(
                 "the camera's place on the flange is not calibrated: run `maniskill-tomato deploy calibrate` and name "
@@ -95,17 +95,17 @@ def run(
         "profile": profile.name,
         "policy": name,
         "policy_name": policy.name,
-        "perception": station.perception.name,
+        "perception": workcell.perception.name,
         "seed": config.seed,
         "mode": mode,
-        "simulated": station.simulated,
+        "simulated": workcell.simulated,
         "version": __version__,
     }
     stop_file = prepare_folder(profile, config.out)
     contact = Contact()
     with ExitStack() as stack:
-        arm = stack.enter_context(station.arm)
-        camera = stack.enter_context(station.camera)
+        arm = stack.enter_context(workcell.arm)
+        camera = stack.enter_context(workcell.camera)
         devices = {"arm": arm.describe(), "camera": camera.describe()}
         recorders: list[Recorder] = [contact]
         if config.record:
@@ -117,10 +117,10 @@ def run(
                 stop_file=stop_file,
                 keyboard=keyboard,
                 heartbeat_s=profile.stop.heartbeat,
-                on_lost_heartbeat=station.guarded_arm.stop,
+                on_lost_heartbeat=workcell.guarded_arm.stop,
             )
         )
-        result = station.loop(policy, stops, mode, _Several(recorders), confirm).run()
+        result = workcell.loop(policy, stops, mode, _Several(recorders), confirm).run()
     try:
         write_report(config.out, result, {**facts, "devices": devices}, contact)
     except RecordingError as error:

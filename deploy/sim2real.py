@@ -28,8 +28,8 @@ from maniskill_tomato.deploy.observing import Observing
 from maniskill_tomato.deploy.perceive import View
 from maniskill_tomato.deploy.real_agent import IiwaRealAgent
 from maniskill_tomato.robot.inverse_kinematics import Reach
-from maniskill_tomato.robot.look_at_controller import LookAtController
-from maniskill_tomato.robot.viewpoint_controller import ViewpointController
+from maniskill_tomato.tasks.maniskill.look_at_controller import LookAtController
+from maniskill_tomato.tasks.maniskill.viewpoint_controller import ViewpointController
 
 logger = logging.getLogger(__name__)
 
@@ -96,19 +96,19 @@ class TomatoSim2RealEnv(Sim2RealEnv):  # type: ignore[misc]
             PerceptionError: No ripe fruit is in the picture.
             DeployError: A device fails.
         """
-        station = self.agent.station
+        workcell = self.agent.workcell
         frame, joints = self.agent.look()
         T_world_camera = self.agent.camera_pose(joints)
-        target = station.target_position()
+        target = workcell.target_position()
         if target is None:
-            target = station.perception.find_target(frame, T_world_camera)
+            target = workcell.perception.find_target(frame, T_world_camera)
         if target is None:
             raise PerceptionError("the first picture shows no ripe fruit; start where one is in view")
         self._target = target
         self._moves, self._refused, self._fraction_before = 0, False, 0.0
         layout = getattr(self.base_sim_env, "layout", None)
         if layout is not None:
-            self._observing = Observing(station.profile.T_flange_camera, self._max_moves, layout)
+            self._observing = Observing(workcell.profile.T_flange_camera, self._max_moves, layout)
             self._observing.begin(target)
         self._reach = torch.full((1,), int(Reach.REACHABLE), dtype=torch.int64)
         self._take_view()
@@ -210,7 +210,7 @@ class TomatoSim2RealEnv(Sim2RealEnv):  # type: ignore[misc]
     def _take_view(self) -> None:
         """Looks, once for every place where the arm stands."""
         frame, joints = self.agent.look()
-        self._view = self.agent.station.perception.look(
+        self._view = self.agent.workcell.perception.look(
             frame, self.agent.camera_pose(joints), self.target_position
         )
         self._follow_the_arm()

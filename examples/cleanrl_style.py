@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 from torch.nn.functional import mse_loss
 
-from maniskill_tomato.learning.gymnasium_env import Array, LearnableTask, make_gymnasium_env
+from maniskill_tomato.learning.rl.gymnasium_env import Array, LearnableTask, make_gymnasium_env
 
 VectorEnv = gym.vector.VectorEnv[Array, Array, NDArray[Any]]
 

@@ -16,7 +16,7 @@ from stable_baselines3 import PPO
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecEnv
 
-from maniskill_tomato.learning.gymnasium_env import Array, make_gymnasium_env
+from maniskill_tomato.learning.rl.gymnasium_env import Array, make_gymnasium_env
 
 GAMMA = 0.9
 

@@ -14,7 +14,7 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.noise import NormalActionNoise
 
-from maniskill_tomato.learning.gymnasium_env import LearnableTask, make_gymnasium_env
+from maniskill_tomato.learning.rl.gymnasium_env import LearnableTask, make_gymnasium_env
 
 GAMMA = 0.9
 

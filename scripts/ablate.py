@@ -16,9 +16,9 @@ from typing import Any
 import tyro
 
 from maniskill_tomato.errors import TomatoError
-from maniskill_tomato.evaluation.ablation import choose_variants, execute_all, plan
-from maniskill_tomato.evaluation.ablation_report import write_ablation
-from maniskill_tomato.learning.presets import PresetName
+from maniskill_tomato.experiments.ablation import choose_variants, execute_all, plan
+from maniskill_tomato.experiments.ablation_report import write_ablation
+from maniskill_tomato.learning.rl.presets import PresetName
 from maniskill_tomato.tasks import THESIS_IDS
 
 

@@ -27,14 +27,14 @@ from mani_skill.utils.structs.types import SimConfig
 
 import maniskill_tomato  # noqa: F401
 from maniskill_tomato.plants.generator import generate_plant
-from maniskill_tomato.rendering import rendering_available
-from maniskill_tomato.robot import agent as agent
+from maniskill_tomato.raycast.caster import VisibilityCaster
+from maniskill_tomato.rendering.vulkan_probe import rendering_available
 from maniskill_tomato.robot.d435 import color_intrinsics
 from maniskill_tomato.robot.iiwa14 import JOINT_LOWER, JOINT_UPPER
 from maniskill_tomato.robot.inverse_kinematics import InverseKinematics
 from maniskill_tomato.robot.kinematics import forward_kinematics
-from maniskill_tomato.tasks.planting import GROWN_PLANTS
-from maniskill_tomato.visibility.caster import VisibilityCaster
+from maniskill_tomato.tasks.maniskill import agent as agent
+from maniskill_tomato.tasks.maniskill.planting import GROWN_PLANTS
 
 GUIDED = "TomatoViewpointGuided-v1"
 EMPTY = "TomatoBenchmarkEmpty-v1"

@@ -17,8 +17,8 @@ import tyro
 from tqdm import tqdm
 
 from maniskill_tomato.errors import InvalidInputError, TomatoError
-from maniskill_tomato.evaluation.benchmark_policies import parse_policies
-from maniskill_tomato.evaluation.row_benchmark import (
+from maniskill_tomato.experiments.benchmark_policies import parse_policies
+from maniskill_tomato.experiments.row_benchmark import (
     RowResult,
     SeeableTomatoes,
     compare_rows,
@@ -26,7 +26,7 @@ from maniskill_tomato.evaluation.row_benchmark import (
     search_row,
 )
 from maniskill_tomato.files import write_atomically
-from maniskill_tomato.learning.envs import make_env
+from maniskill_tomato.learning.rl.envs import make_env
 
 ENV_ID = "TomatoViewpointRow-v1"
 

@@ -26,9 +26,7 @@ import tyro
 
 from maniskill_tomato.assets import ASSETS_DIR
 from maniskill_tomato.errors import InvalidInputError, TomatoError
-from maniskill_tomato.learning.envs import make_env
-from maniskill_tomato.planners.env_truth import EnvironmentTruth
-from maniskill_tomato.planners.oracle import OracleSearch
+from maniskill_tomato.learning.rl.envs import make_env
 from maniskill_tomato.plants.episode_list import (
     EPISODE_LISTS,
     Episode,
@@ -36,7 +34,9 @@ from maniskill_tomato.plants.episode_list import (
     read_episodes,
     write_episodes,
 )
-from maniskill_tomato.tasks.episode_draw import draw_episodes, extend_episodes
+from maniskill_tomato.policies.env_truth import EnvironmentTruth
+from maniskill_tomato.policies.oracle import OracleSearch
+from maniskill_tomato.tasks.row.episode_sampling import draw_episodes, extend_episodes
 
 logger = logging.getLogger("certify_episodes")
 
@@ -73,9 +73,9 @@ def certify(episodes: list[Episode], contact_free: bool) -> list[Episode]:
     certified = []
     for number, episode in enumerate(episodes):
         env.reset(options={"episode": number})
-        situation = world.situation
+        belief = world.belief
         solution = search.solve(
-            situation.camera_position[0], situation.target_position[0], 0, int(world.task.max_moves)
+            belief.camera_position[0], belief.target_position[0], 0, int(world.task.max_moves)
         )
         moves = None if solution is None else solution.moves
         certified.append(replace(episode, oracle_moves=moves, certified=True))

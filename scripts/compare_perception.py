@@ -21,9 +21,9 @@ from tqdm import tqdm
 
 import maniskill_tomato  # noqa: F401  (registers the tasks)
 from maniskill_tomato.errors import InvalidInputError, TomatoError
-from maniskill_tomato.evaluation.benchmark_policies import parse_policies
+from maniskill_tomato.experiments.benchmark_policies import parse_policies
 from maniskill_tomato.files import write_atomically
-from maniskill_tomato.tasks.camera_perception import RENDERED, Perception
+from maniskill_tomato.sensing.camera_perception import RENDERED, Perception
 
 PERCEPTIONS = get_args(Perception)
 
@@ -72,17 +72,17 @@ def run_episode(env: gym.Env[Any, Any], policy: Any, label: str, perception: str
     if (reseed := getattr(policy, "reseed", None)) is not None:
         reseed(episode)
     env.reset(seed=episode)
-    policy.begin(world.situation, torch.zeros(1, dtype=torch.int64))
+    policy.begin(world.belief, torch.zeros(1, dtype=torch.int64))
     errors, moves, ended = [], 0, False
     info: dict[str, Any] = {}
     while not ended:
-        _, _, terminated, truncated, info = env.step(policy.act(world.situation))
+        _, _, terminated, truncated, info = env.step(policy.act(world.belief))
         moves += 1
         measured = float(info["visible_fraction"][0])
         errors.append(abs(measured - float(info.get("true_visible_fraction", info["visible_fraction"])[0])))
         ended = bool(terminated) or bool(truncated)
     true = float(info.get("true_visible_fraction", info["visible_fraction"])[0])
-    believed = world.situation.target_position[0]
+    believed = world.belief.target_position[0]
     return Result(
         policy=label,
         perception=perception,

@@ -16,9 +16,9 @@ import torch
 import tyro
 
 from maniskill_tomato.errors import TomatoError
-from maniskill_tomato.evaluation.comparison import find_runs, group_runs, load_run
-from maniskill_tomato.evaluation.comparison_report import make_rows, markdown_table, write_comparison
-from maniskill_tomato.evaluation.evaluate import evaluate_run
+from maniskill_tomato.experiments.comparison import find_runs, group_runs, load_run
+from maniskill_tomato.experiments.comparison_report import make_rows, markdown_table, write_comparison
+from maniskill_tomato.experiments.evaluate import evaluate_run
 
 
 def main(

@@ -11,7 +11,7 @@ import numpy as np
 import tyro
 from tqdm import tqdm
 
-from maniskill_tomato.visibility.rendered import ComparedView, compare
+from maniskill_tomato.rendering.rendered_visibility import ComparedView, compare
 
 
 def draw(views: list[ComparedView], path: Path) -> None:

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 import maniskill_tomato  # noqa: F401
 from maniskill_tomato.assets import asset_path
-from maniskill_tomato.learning.policy import load_policy
+from maniskill_tomato.learning.rl.policy import load_policy
 
 TASK = "TomatoViewpointGuided-v1"
 

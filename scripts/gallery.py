@@ -23,7 +23,7 @@ from maniskill_tomato.errors import RenderingUnavailableError
 from maniskill_tomato.plants.generator import Detail, generate_plant
 from maniskill_tomato.plants.hiding import view_direction
 from maniskill_tomato.plants.organs import Plant
-from maniskill_tomato.plants.rendering import make_render_shape
+from maniskill_tomato.rendering.plant_actors import make_render_shape
 
 logger = logging.getLogger("gallery")
 UInt8 = NDArray[np.uint8]

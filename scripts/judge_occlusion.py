@@ -16,14 +16,14 @@ from tqdm import tqdm
 
 from maniskill_tomato.errors import InvalidInputError, TomatoError
 from maniskill_tomato.files import write_atomically
-from maniskill_tomato.perception.formats import read_annotated
-from maniskill_tomato.perception.occlusion.amodal import AmodalModel
-from maniskill_tomato.perception.occlusion.estimate import OcclusionModel
-from maniskill_tomato.perception.occlusion.figure import draw_steps
-from maniskill_tomato.perception.occlusion.improved import ImprovedModel
-from maniskill_tomato.perception.occlusion.judge import annotated_fruits, judge, make_view, markdown
-from maniskill_tomato.perception.occlusion.sphere import SphereModel
-from maniskill_tomato.perception.occlusion.thesis import ThesisModel
+from maniskill_tomato.segmentation.datasets.formats import read_annotated
+from maniskill_tomato.sensing.visible_fraction.amodal import AmodalModel
+from maniskill_tomato.sensing.visible_fraction.estimate import OcclusionModel
+from maniskill_tomato.sensing.visible_fraction.figure import draw_steps
+from maniskill_tomato.sensing.visible_fraction.improved import ImprovedModel
+from maniskill_tomato.sensing.visible_fraction.judge import annotated_fruits, judge, make_view, markdown
+from maniskill_tomato.sensing.visible_fraction.sphere import SphereModel
+from maniskill_tomato.sensing.visible_fraction.thesis import ThesisModel
 
 
 @dataclass(frozen=True, kw_only=True)

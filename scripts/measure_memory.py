@@ -22,13 +22,13 @@ from tqdm import tqdm
 
 from maniskill_tomato.plants.generator import generate_plant
 from maniskill_tomato.plants.organs import Plant, SemanticClass
+from maniskill_tomato.raycast.cast_views import CastViews
+from maniskill_tomato.raycast.caster import VisibilityCaster
+from maniskill_tomato.raycast.view_rays import ViewRayCaster
 from maniskill_tomato.robot.d435 import color_intrinsics
 from maniskill_tomato.robot.look_at import camera_to_viewpoint, look_at_pose
-from maniskill_tomato.visibility.cast_views import CastViews
-from maniskill_tomato.visibility.caster import VisibilityCaster
-from maniskill_tomato.visibility.observation import PART_SHAPES, ViewpointObserver
-from maniskill_tomato.visibility.view_lattice import ViewLattice
-from maniskill_tomato.visibility.view_rays import ViewRayCaster
+from maniskill_tomato.sensing.observation import PART_SHAPES, ViewpointObserver
+from maniskill_tomato.sensing.view_lattice import ViewLattice
 
 AFTER_VIEWS = (1, 3, 6)
 PLANT_X = 0.85
@@ -125,8 +125,8 @@ def measure(episode: Episode) -> dict[str, float]:
     look(episode, observer, rays, 0)
     pose = episode.poses[episode.order[0]][None]
     fruit, plant = torch.tensor([episode.fruit]), plant_pose()
-    view = observer.situation.rays
-    viewpoint, fraction, left = observer.situation.viewpoint, torch.tensor([0.5]), torch.tensor([19])
+    view = observer.belief.rays
+    viewpoint, fraction, left = observer.belief.viewpoint, torch.tensor([0.5]), torch.tensor([19])
     generator = torch.Generator().manual_seed(0)
     positions = episode.target[:, None] + 0.3 * torch.randn(1, 2000, 3, generator=generator)
     views = CastViews(episode.caster)
@@ -149,7 +149,7 @@ def draw(episode: Episode, path: Path) -> None:
     matplotlib.use("Agg")
     from matplotlib import pyplot as plt
 
-    from maniskill_tomato.visibility.rendered import COMPARISON_INTRINSICS, SegmentedPlant
+    from maniskill_tomato.rendering.rendered_visibility import COMPARISON_INTRINSICS, SegmentedPlant
 
     colours = {SemanticClass.LEAF: (0.45, 0.65, 0.4), SemanticClass.STEM: (0.55, 0.45, 0.3)}
     segmented = SegmentedPlant(episode.plant, COMPARISON_INTRINSICS)
@@ -165,8 +165,8 @@ def draw(episode: Episode, path: Path) -> None:
             picture[organs == index] = colours.get(organ.semantic_class, (0.95, 0.65, 0.3))
         picture[organs == episode.plant.fruits[episode.fruit].organ_index] = (0.85, 0.1, 0.1)
         row[0].imshow(picture)
-        pixels = COMPARISON_INTRINSICS.project(observer.situation.rays.direction_c[0].numpy())
-        row[0].scatter(*pixels.T, c=observer.situation.rays.label[0].numpy(), s=3, cmap="cool")
+        pixels = COMPARISON_INTRINSICS.project(observer.belief.rays.direction_c[0].numpy())
+        row[0].scatter(*pixels.T, c=observer.belief.rays.label[0].numpy(), s=3, cmap="cool")
         row[0].set(
             title=f"view {k + 1}: $V_f$ = {float(episode.truth[episode.order[k]]):.2f}",
             xlim=(0, 640),

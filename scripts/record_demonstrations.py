@@ -14,9 +14,9 @@ from typing import Any
 import tyro
 
 from maniskill_tomato.errors import TomatoError
-from maniskill_tomato.evaluation.benchmark_policies import PolicySpec
-from maniskill_tomato.learning.envs import make_env
-from maniskill_tomato.planners.demonstrations import record_demonstrations
+from maniskill_tomato.experiments.benchmark_policies import PolicySpec
+from maniskill_tomato.learning.imitation.demonstrations import record_demonstrations
+from maniskill_tomato.learning.rl.envs import make_env
 
 
 @dataclass(frozen=True, kw_only=True)

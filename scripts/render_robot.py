@@ -10,7 +10,8 @@ import numpy as np
 import sapien
 import tyro
 
-from maniskill_tomato.robot import agent, description
+from maniskill_tomato.robot import description
+from maniskill_tomato.tasks.maniskill import agent
 
 SCALE = 2
 """Pictures are rendered this many times larger and averaged."""

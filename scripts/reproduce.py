@@ -19,21 +19,21 @@ import torch
 import tyro
 
 from maniskill_tomato.errors import InvalidInputError, TomatoError
-from maniskill_tomato.evaluation import thesis_figures, thesis_views
-from maniskill_tomato.evaluation.experiments import (
+from maniskill_tomato.experiments import thesis_figures, thesis_views
+from maniskill_tomato.experiments.reproduction import (
+    TABLE_HEADER,
+    Reproduction,
+    RunStoppedError,
+    table_row,
+    untrained_first_steps,
+)
+from maniskill_tomato.experiments.thesis_experiments import (
     EXPERIMENTS,
     Experiment,
     ExperimentName,
     Variant,
     find_variant,
     variants_of,
-)
-from maniskill_tomato.evaluation.reproduction import (
-    TABLE_HEADER,
-    Reproduction,
-    RunStoppedError,
-    table_row,
-    untrained_first_steps,
 )
 
 logger = logging.getLogger("maniskill_tomato.reproduce")

@@ -19,17 +19,17 @@ import tyro
 from torch import Tensor
 
 from maniskill_tomato.errors import TomatoError
-from maniskill_tomato.learning.envs import make_env
-from maniskill_tomato.planners.baselines import RandomStep
-from maniskill_tomato.planners.deep_move_to_see import (
+from maniskill_tomato.learning.rl.envs import make_env
+from maniskill_tomato.policies.baselines import RandomStep
+from maniskill_tomato.policies.deep_move_to_see import (
     MoveToSeeData,
     RegressionConfig,
     network_input,
     save_move_network,
     train_move_network,
 )
-from maniskill_tomato.planners.env_truth import EnvironmentTruth
-from maniskill_tomato.planners.move_to_see import MoveToSee
+from maniskill_tomato.policies.env_truth import EnvironmentTruth
+from maniskill_tomato.policies.move_to_see import MoveToSee
 
 logger = logging.getLogger("train_deep_move_to_see")
 
@@ -62,13 +62,13 @@ def collect(episodes: int, moves: int, seed: int) -> MoveToSeeData:
     for episode in range(episodes):
         env.reset(seed=seed + episode)
         for _ in range(moves):
-            picture, distance = network_input(world.situation)
-            move = teacher.act(world.situation)
+            picture, distance = network_input(world.belief)
+            move = teacher.act(world.belief)
             pictures.append(picture.cpu())
             distances.append(distance.cpu())
             wanted.append(move.cpu())
             follows = bool(move.norm() > 0.0) and float(torch.rand(1, generator=coin)) < 0.5
-            _, _, terminated, truncated, _ = env.step(move if follows else wanderer.act(world.situation))
+            _, _, terminated, truncated, _ = env.step(move if follows else wanderer.act(world.belief))
             if bool(terminated) or bool(truncated):
                 break
         if (episode + 1) % 100 == 0:

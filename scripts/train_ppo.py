@@ -33,19 +33,19 @@ from tqdm import tqdm
 
 import maniskill_tomato
 from maniskill_tomato.errors import TomatoError
-from maniskill_tomato.evaluation.evaluate import write_trajectories
-from maniskill_tomato.evaluation.metrics import make_metrics, write_metrics
-from maniskill_tomato.evaluation.rollout import run_episodes
+from maniskill_tomato.experiments.evaluate import write_trajectories
+from maniskill_tomato.experiments.metrics import make_metrics, write_metrics
+from maniskill_tomato.experiments.rollout import run_episodes
 from maniskill_tomato.files import write_atomically
-from maniskill_tomato.learning.checkpoint import save_checkpoint
-from maniskill_tomato.learning.envs import make_env
-from maniskill_tomato.learning.export import DenseActor, export_actor
-from maniskill_tomato.learning.gymnasium_env import Array, make_gymnasium_env, normalize_observation
-from maniskill_tomato.learning.history import TrainingHistory
 from maniskill_tomato.learning.interrupt import stop_on_signals
-from maniskill_tomato.learning.networks import ObservationNormalizer
-from maniskill_tomato.learning.presets import OBSERVATION_CENTRE, OBSERVATION_HALF_RANGE, get_preset
-from maniskill_tomato.learning.run_folder import check_run_dir
+from maniskill_tomato.learning.rl.checkpoint import save_checkpoint
+from maniskill_tomato.learning.rl.envs import make_env
+from maniskill_tomato.learning.rl.export import DenseActor, export_actor
+from maniskill_tomato.learning.rl.gymnasium_env import Array, make_gymnasium_env, normalize_observation
+from maniskill_tomato.learning.rl.history import TrainingHistory
+from maniskill_tomato.learning.rl.networks import ObservationNormalizer
+from maniskill_tomato.learning.rl.presets import OBSERVATION_CENTRE, OBSERVATION_HALF_RANGE, get_preset
+from maniskill_tomato.learning.rl.run_folder import check_run_dir
 from maniskill_tomato.tasks import GENERAL_IDS, TASK_IDS
 
 SPS_EVERY = 100

@@ -19,14 +19,14 @@ import tyro
 
 from maniskill_tomato.errors import InvalidInputError, TomatoError
 from maniskill_tomato.learning.interrupt import stop_on_signals
-from maniskill_tomato.perception.annotations import AnnotatedImage
-from maniskill_tomato.perception.detection_plots import plot_losses
-from maniskill_tomato.perception.detector_presets import MASK_RCNN_PRESETS, YOLO_PRESET
-from maniskill_tomato.perception.light_training import LightTrainConfig, LightTraining
-from maniskill_tomato.perception.mask_rcnn_training import MaskRcnnTraining
-from maniskill_tomato.perception.resumable_training import CHECKPOINT, ResumableTraining
-from maniskill_tomato.perception.training_pictures import read_place
-from maniskill_tomato.perception.yolo import (
+from maniskill_tomato.segmentation.datasets.annotations import AnnotatedImage
+from maniskill_tomato.segmentation.metrics.detection_plots import plot_losses
+from maniskill_tomato.segmentation.training.detector_presets import MASK_RCNN_PRESETS, YOLO_PRESET
+from maniskill_tomato.segmentation.training.light_training import LightTrainConfig, LightTraining
+from maniskill_tomato.segmentation.training.mask_rcnn_training import MaskRcnnTraining
+from maniskill_tomato.segmentation.training.resumable_training import CHECKPOINT, ResumableTraining
+from maniskill_tomato.segmentation.training.training_pictures import read_place
+from maniskill_tomato.segmentation.yolo import (
     read_history,
     stock_settings,
     thesis_settings,

@@ -15,11 +15,11 @@ from typing import Any
 import tyro
 
 from maniskill_tomato.errors import TomatoError
-from maniskill_tomato.evaluation.benchmark_metrics import summarise_policy
-from maniskill_tomato.evaluation.view_episode import ViewEpisode
-from maniskill_tomato.evaluation.view_rollout import run_view_episode
-from maniskill_tomato.learning.envs import make_env
-from maniskill_tomato.planners.next_best_view import NextBestDirection, NextBestView, NextBestViewConfig
+from maniskill_tomato.experiments.benchmark_metrics import summarise_policy
+from maniskill_tomato.experiments.view_episode import ViewEpisode
+from maniskill_tomato.experiments.view_rollout import run_view_episode
+from maniskill_tomato.learning.rl.envs import make_env
+from maniskill_tomato.policies.next_best_view import NextBestDirection, NextBestView, NextBestViewConfig
 
 
 @dataclass(frozen=True, kw_only=True)

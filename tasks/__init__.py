@@ -49,10 +49,14 @@ def _register(env_id: str, entry_point: str, max_episode_steps: int) -> None:
 
 
 _register(
-    "TomatoViewpointGuided-v1", "maniskill_tomato.tasks.viewpoint:TomatoViewpointGuidedEnv", MAX_EPISODE_STEPS
+    "TomatoViewpointGuided-v1",
+    "maniskill_tomato.tasks.thesis.env:TomatoViewpointGuidedEnv",
+    MAX_EPISODE_STEPS,
 )
 _register(
-    "TomatoViewpointSparse-v1", "maniskill_tomato.tasks.viewpoint:TomatoViewpointSparseEnv", MAX_EPISODE_STEPS
+    "TomatoViewpointSparse-v1",
+    "maniskill_tomato.tasks.thesis.env:TomatoViewpointSparseEnv",
+    MAX_EPISODE_STEPS,
 )
-_register("TomatoViewpoint-v1", "maniskill_tomato.tasks.general:TomatoViewpointGeneralEnv", MAX_GENERAL_STEPS)
-_register("TomatoViewpointRow-v1", "maniskill_tomato.tasks.row_search:TomatoViewpointRowEnv", MAX_ROW_STEPS)
+_register("TomatoViewpoint-v1", "maniskill_tomato.tasks.row.env:TomatoViewpointGeneralEnv", MAX_GENERAL_STEPS)
+_register("TomatoViewpointRow-v1", "maniskill_tomato.tasks.row.row_env:TomatoViewpointRowEnv", MAX_ROW_STEPS)

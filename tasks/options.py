@@ -8,7 +8,7 @@ import torch
 from mani_skill.envs.utils.observations import ALL_VISUAL_TEXTURES
 
 from maniskill_tomato.errors import InvalidInputError
-from maniskill_tomato.rendering import NO_RENDERING_HINT
+from maniskill_tomato.rendering.vulkan_probe import NO_RENDERING_HINT
 
 Motion = Literal["kinematic", "dynamic"]
 

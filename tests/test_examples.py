@@ -14,7 +14,7 @@ import pytest
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
 
 from maniskill_tomato.errors import InvalidInputError
-from maniskill_tomato.learning.gymnasium_env import (
+from maniskill_tomato.learning.rl.gymnasium_env import (
     CENTRE,
     HALF_RANGE,
     Array,

@@ -13,9 +13,9 @@ from maniskill_tomato.deploy.mock.faults import CameraFault
 from maniskill_tomato.deploy.mock.options import TwinOptions, twin_options, twin_world
 from maniskill_tomato.deploy.mock.painter import Painter, make_painter
 from maniskill_tomato.deploy.mock.world import TwinWorld
+from maniskill_tomato.raycast.view_rays import DEPTH_MODE
 from maniskill_tomato.robot.d435 import CameraIntrinsics, min_depth
 from maniskill_tomato.robot.depth_noise import DepthNoise, measure_depth
-from maniskill_tomato.visibility.view_rays import DEPTH_MODE
 
 EXPOSURE = 1.0 / 30.0
 """Between two pictures, in [s]."""

@@ -12,9 +12,9 @@ from maniskill_tomato.deploy.collision import CollisionChecker
 from maniskill_tomato.deploy.errors import ProfileError
 from maniskill_tomato.deploy.interface import Float64
 from maniskill_tomato.deploy.postures import Postures
-from maniskill_tomato.plants.choice import ROW_PLANT
 from maniskill_tomato.plants.episode_list import Episode, load_episodes
 from maniskill_tomato.plants.organs import Plant
+from maniskill_tomato.plants.spec import ROW_PLANT
 from maniskill_tomato.robot.d435 import T_flange_camera_color_optical
 from maniskill_tomato.robot.iiwa14 import JOINT_LOWER, JOINT_UPPER, READY_QPOS
 from maniskill_tomato.robot.inverse_kinematics import Reach

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from maniskill_tomato.deploy.interface import Float64
 from maniskill_tomato.plants.organs import Plant
-from maniskill_tomato.plants.rendering import build_plant_actors
+from maniskill_tomato.rendering.plant_actors import build_plant_actors
 from maniskill_tomato.robot.d435 import CAMERA_FAR, CAMERA_NEAR, R_CAMERA_OPTICAL, CameraIntrinsics
 
 AMBIENT: Final = [0.55, 0.58, 0.60]

@@ -12,12 +12,12 @@ from maniskill_tomato.deploy.interface import Float64, FrameTruth
 from maniskill_tomato.deploy.mock.dynamics import ArmDynamics
 from maniskill_tomato.deploy.mock.episode import TwinEpisode
 from maniskill_tomato.plants.organs import SemanticClass
+from maniskill_tomato.raycast.caster import VisibilityCaster
+from maniskill_tomato.raycast.picture_caster import FIRST_ORGAN_LABEL, Picture, PictureCaster
+from maniskill_tomato.raycast.view_rays import ViewRayCaster
 from maniskill_tomato.robot.d435 import CameraIntrinsics, T_flange_camera_color_optical
 from maniskill_tomato.robot.description import link_meshes
 from maniskill_tomato.robot.kinematics import link_transforms
-from maniskill_tomato.visibility.caster import VisibilityCaster
-from maniskill_tomato.visibility.picture_caster import FIRST_ORGAN_LABEL, Picture, PictureCaster
-from maniskill_tomato.visibility.view_rays import ViewRayCaster
 
 COLORS: Final = {
     SemanticClass.BACKGROUND: (178, 196, 204),

@@ -46,19 +46,19 @@ class Benchmark:
 
     def run(self) -> None:
         """Runs what is missing and says where the results are."""
-        from maniskill_tomato.evaluation.benchmark import BenchmarkConfig, run_benchmark
-        from maniskill_tomato.evaluation.benchmark_conditions import SWEEPS, main_condition, sweep_conditions
-        from maniskill_tomato.evaluation.benchmark_pictures import draw_view_grid
-        from maniskill_tomato.evaluation.benchmark_policies import parse_policies
-        from maniskill_tomato.evaluation.benchmark_report import (
+        from maniskill_tomato.experiments.benchmark import BenchmarkConfig, run_benchmark
+        from maniskill_tomato.experiments.benchmark_conditions import SWEEPS, main_condition, sweep_conditions
+        from maniskill_tomato.experiments.benchmark_pictures import draw_view_grid
+        from maniskill_tomato.experiments.benchmark_policies import parse_policies
+        from maniskill_tomato.experiments.benchmark_report import (
             evaluate_runs,
             markdown_table,
             write_benchmark,
         )
-        from maniskill_tomato.evaluation.benchmark_store import EpisodeStore
-        from maniskill_tomato.planners.registry import PRIVILEGED
+        from maniskill_tomato.experiments.benchmark_store import EpisodeStore
         from maniskill_tomato.plants.episode_list import EPISODE_LISTS, load_episodes
-        from maniskill_tomato.tasks.general_config import GeneralTaskConfig
+        from maniskill_tomato.policies.registry import PRIVILEGED
+        from maniskill_tomato.tasks.row.config import GeneralTaskConfig
 
         specs = parse_policies(self.policies)
         main = main_condition(self.episode_list)

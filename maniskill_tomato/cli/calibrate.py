@@ -105,8 +105,8 @@ class DeployCalibrate:
         from maniskill_tomato.deploy.calibration.hand_eye import MIN_VIEWS
         from maniskill_tomato.deploy.errors import StoppedError
         from maniskill_tomato.deploy.profile import load_profile
-        from maniskill_tomato.deploy.station import make_station, prepare_folder
         from maniskill_tomato.deploy.stops import Stops
+        from maniskill_tomato.deploy.workcell import make_workcell, prepare_folder
 
         if self.confirm and self.unattended:
             raise InvalidInputError("give --confirm or --unattended, not both")
@@ -118,29 +118,29 @@ class DeployCalibrate:
                 f"{folder} holds views already; calculate from them with --views, or choose another --out"
             )
         profile = load_profile(name)
-        station = make_station(profile)
+        workcell = make_workcell(profile)
         plan = CapturePlan(views=self.count)
         stop_file = prepare_folder(profile, self.out)
         with ExitStack() as stack:
             if not moves:
                 folder = Path(stack.enter_context(TemporaryDirectory()))
-            stack.enter_context(station.arm)
-            camera = stack.enter_context(station.camera)
+            stack.enter_context(workcell.arm)
+            camera = stack.enter_context(workcell.camera)
             stops = stack.enter_context(
                 Stops(
                     stop_file=stop_file,
                     keyboard=not self.confirm,
                     heartbeat_s=profile.stop.heartbeat,
-                    on_lost_heartbeat=station.guarded_arm.stop,
+                    on_lost_heartbeat=workcell.guarded_arm.stop,
                 )
             )
             try:
                 taken = capture_views(
-                    station.guarded_arm,
+                    workcell.guarded_arm,
                     camera,
                     self._board(),
                     folder,
-                    station.clock,
+                    workcell.clock,
                     _Operator(asks=self.confirm, goes=self.unattended),
                     plan,
                     profile.T_flange_camera,

@@ -37,9 +37,9 @@ class Dataset:
         """Renders what is missing and says where it is."""
         from tqdm import tqdm
 
-        from maniskill_tomato.perception.formats import read_annotated
-        from maniskill_tomato.perception.synthesis.dataset import DatasetConfig, make_dataset
-        from maniskill_tomato.perception.synthesis.statistics import write_statistics
+        from maniskill_tomato.segmentation.datasets.formats import read_annotated
+        from maniskill_tomato.segmentation.synthesis.dataset import DatasetConfig, make_dataset
+        from maniskill_tomato.segmentation.synthesis.statistics import write_statistics
 
         config = DatasetConfig(
             count=self.count,

@@ -6,7 +6,7 @@ from pathlib import Path
 
 from maniskill_tomato.cli.evaluate import summary
 from maniskill_tomato.cli.train import train
-from maniskill_tomato.learning.presets import PRESETS
+from maniskill_tomato.learning.rl.presets import PRESETS
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -26,8 +26,8 @@ class Demo:
 
     def run(self) -> None:
         """Runs all three parts and names the results."""
-        from maniskill_tomato.evaluation.evaluate import EvaluationConfig, evaluate
-        from maniskill_tomato.learning.policy import load_policy
+        from maniskill_tomato.experiments.evaluate import EvaluationConfig, evaluate
+        from maniskill_tomato.learning.rl.policy import load_policy
 
         env_id = "TomatoViewpointGuided-v1"
         print(f"1/2 training on {env_id}, at most {self.minutes:g} minutes")

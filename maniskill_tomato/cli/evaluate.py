@@ -42,14 +42,14 @@ class Eval:
 
     def run(self) -> None:
         """Evaluates and says where the report is."""
-        from maniskill_tomato.evaluation.evaluate import EvaluationConfig, evaluate
-        from maniskill_tomato.evaluation.exported import open_policy, origin
-        from maniskill_tomato.evaluation.rollout import ActingPolicy
-        from maniskill_tomato.evaluation.viewpoint_policy import open_viewpoint_policy
-        from maniskill_tomato.learning.envs import check_env_id
-        from maniskill_tomato.learning.policy import RandomPolicy
-        from maniskill_tomato.planners.base import Planner
-        from maniskill_tomato.planners.registry import PLANNERS
+        from maniskill_tomato.experiments.evaluate import EvaluationConfig, evaluate
+        from maniskill_tomato.experiments.exported import open_policy, origin
+        from maniskill_tomato.experiments.rollout import ActingPolicy
+        from maniskill_tomato.experiments.viewpoint_policy import open_viewpoint_policy
+        from maniskill_tomato.learning.rl.envs import check_env_id
+        from maniskill_tomato.learning.rl.policy import RandomPolicy
+        from maniskill_tomato.policies.base import Planner
+        from maniskill_tomato.policies.registry import PLANNERS
 
         check_env_id(self.env_id)
         path: Path | None = None

@@ -18,7 +18,7 @@ class Export:
 
     def run(self) -> None:
         """Exports and says where the files are."""
-        from maniskill_tomato.learning.export import export_policy
+        from maniskill_tomato.learning.rl.export import export_policy
 
         for path in [self.policy] if self.policy else [shipped_policy(env_id) for env_id in THESIS_IDS]:
             result = export_policy(path, self.out)

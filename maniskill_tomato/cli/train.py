@@ -10,14 +10,8 @@ import tyro
 
 from maniskill_tomato.cli.options import PlantOptions, merge_options
 from maniskill_tomato.errors import InvalidInputError, SeedsFailedError
-from maniskill_tomato.learning.config_file import RunFile, parse_seeds, read_run_config, read_run_file
-from maniskill_tomato.learning.presets import (
-    MAY_CHANGE,
-    PRESETS,
-    PresetName,
-    TrainConfig,
-    default_preset,
-)
+from maniskill_tomato.learning.rl.config_file import RunFile, parse_seeds, read_run_config, read_run_file
+from maniskill_tomato.learning.rl.presets import MAY_CHANGE, PRESETS, PresetName, TrainConfig, default_preset
 from maniskill_tomato.tasks import TASK_IDS
 
 
@@ -125,8 +119,8 @@ class Train:
             )
 
     def _run_seeds(self, env_id: str, out: Path, seeds: tuple[int, ...], env_options: dict[str, Any]) -> None:
-        from maniskill_tomato.learning.envs import check_env_id
-        from maniskill_tomato.learning.seeds import summary_table, train_seeds
+        from maniskill_tomato.learning.rl.envs import check_env_id
+        from maniskill_tomato.learning.rl.seeds import summary_table, train_seeds
 
         check_env_id(env_id)
         results = train_seeds(
@@ -158,7 +152,7 @@ def train(
     resume: bool = False,
 ) -> Any:
     """Trains in `out`; returns the `TrainResult`."""
-    from maniskill_tomato.learning.run import train as train_run
+    from maniskill_tomato.learning.rl.run import train as train_run
 
     return train_run(env_id, config, out, seed, env_options, overwrite=overwrite, resume=resume)
 

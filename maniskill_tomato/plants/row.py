@@ -8,9 +8,9 @@ from typing import Literal
 import numpy as np
 
 from maniskill_tomato.errors import InvalidInputError
-from maniskill_tomato.plants.draws import Stream, normal, stream
 from maniskill_tomato.plants.generator import Detail, generate_plant
 from maniskill_tomato.plants.organs import Float32, Fruit, MeshPart, Organ, Plant
+from maniskill_tomato.plants.random_streams import Stream, normal, stream
 
 ROW_SPACING = 0.5
 """Distance between the stems of a row, in [m]; usual greenhouse practice is 0.4 to 0.5 m."""

@@ -8,18 +8,18 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from maniskill_tomato.planners.env_truth import EnvironmentTruth
-from maniskill_tomato.planners.lattice_oracle import LatticeOracle
-from maniskill_tomato.visibility.situation import Situation
+from maniskill_tomato.policies.env_truth import EnvironmentTruth
+from maniskill_tomato.policies.lattice_oracle import LatticeOracle
+from maniskill_tomato.sensing.belief import Belief
 
 
 class Student(Protocol):
     """A policy that learns."""
 
-    def begin(self, situation: Situation, env_idx: Tensor) -> None:
+    def begin(self, belief: Belief, env_idx: Tensor) -> None:
         """Forgets the last episode."""
 
-    def act(self, situation: Situation) -> Tensor:
+    def act(self, belief: Belief) -> Tensor:
         """Its move. Shape (1, 3)."""
         ...
 
@@ -66,16 +66,16 @@ def collect_demonstrations(
     for seed in seeds:
         env.reset(seed=seed)
         led = student is not None and np.random.default_rng(seed).uniform() < student_share
-        teacher.begin(world.situation, first)
+        teacher.begin(world.belief, first)
         if student is not None:
-            student.begin(world.situation, first)
+            student.begin(world.belief, first)
         moves, done = 0, False
         while not done:
-            situation: Situation = world.situation
-            wanted = teacher.act(situation)
-            observations.append(situation.observation[0].half())
+            belief: Belief = world.belief
+            wanted = teacher.act(belief)
+            observations.append(belief.observation[0].half())
             actions.append(wanted[0])
-            move = student.act(situation) if led and student is not None else wanted
+            move = student.act(belief) if led and student is not None else wanted
             _, _, terminated, truncated, _ = env.step(move)
             done = bool(terminated) or bool(truncated)
             moves += 1

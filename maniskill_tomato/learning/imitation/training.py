@@ -13,23 +13,23 @@ from torch import Tensor
 import maniskill_tomato
 from maniskill_tomato.errors import InvalidInputError
 from maniskill_tomato.files import write_atomically
-from maniskill_tomato.learning.agent import make_agent
 from maniskill_tomato.learning.blocks import Block, run_blocks
-from maniskill_tomato.learning.checkpoint import make_checkpoint, save_checkpoint
-from maniskill_tomato.learning.envs import make_env
 from maniskill_tomato.learning.imitation.collect import ImitationData, Student, collect_demonstrations
 from maniskill_tomato.learning.imitation.fit import ImitationFitConfig, fit_actor, fit_recurrent
-from maniskill_tomato.learning.policy import load_policy
-from maniskill_tomato.learning.presets import get_preset
-from maniskill_tomato.planners.learned import LearnedPolicy
-from maniskill_tomato.planners.recurrent import (
+from maniskill_tomato.learning.rl.agent import make_agent
+from maniskill_tomato.learning.rl.checkpoint import make_checkpoint, save_checkpoint
+from maniskill_tomato.learning.rl.envs import make_env
+from maniskill_tomato.learning.rl.policy import load_policy
+from maniskill_tomato.learning.rl.presets import get_preset
+from maniskill_tomato.policies.learned import LearnedPolicy
+from maniskill_tomato.policies.recurrent import (
     RecurrentActor,
     RecurrentPolicy,
     columns_of,
     load_recurrent,
     save_recurrent,
 )
-from maniskill_tomato.visibility.observation import ObservationLayout
+from maniskill_tomato.sensing.observation import ObservationLayout
 
 ENV_ID = "TomatoViewpoint-v1"
 

@@ -8,14 +8,14 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from maniskill_tomato.planners.base import Planner
-from maniskill_tomato.planners.moves import Goals
-from maniskill_tomato.planners.next_best_view import NextBestView, NextBestViewConfig
-from maniskill_tomato.planners.quality_features import quality_features
-from maniskill_tomato.planners.quality_network import ViewQualityNetwork
-from maniskill_tomato.planners.view_quality import ViewQuality, ViewQualityConfig
+from maniskill_tomato.policies.base import Planner
+from maniskill_tomato.policies.moves import Goals
+from maniskill_tomato.policies.next_best_view import NextBestView, NextBestViewConfig
+from maniskill_tomato.policies.quality_features import quality_features
+from maniskill_tomato.policies.quality_network import ViewQualityNetwork
+from maniskill_tomato.policies.view_quality import ViewQuality, ViewQualityConfig
 from maniskill_tomato.robot.look_at import look_at_pose
-from maniskill_tomato.visibility.situation import Situation
+from maniskill_tomato.sensing.belief import Belief
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -56,33 +56,33 @@ class _Wanderer(Planner):
         self._rng = rng
         self._network = network
 
-    def begin(self, situation: Situation, env_idx: Tensor) -> None:
+    def begin(self, belief: Belief, env_idx: Tensor) -> None:
         rng = self._rng
         self._astray = rng.uniform(0.0, 0.5)
         if self._network is None or rng.uniform() < 0.25:
             config = NextBestViewConfig(move_cost=10.0 ** rng.uniform(-2.0, -0.7))
-            self._planner: Planner = NextBestView(situation.camera_position.device, config)
+            self._planner: Planner = NextBestView(belief.camera_position.device, config)
         else:
             patience = 10.0 ** rng.uniform(0.5, 1.2)
             self._planner = ViewQuality(self._network, ViewQualityConfig(patience=patience))
-        self._planner.begin(situation, env_idx)
+        self._planner.begin(belief, env_idx)
         self._goals = Goals()
-        self._goals.begin(situation, env_idx)
+        self._goals.begin(belief, env_idx)
         self._on_goal = False
 
-    def act(self, situation: Situation) -> Tensor:
-        planned = self._planner.act(situation)
-        if self._on_goal and not bool(self._goals.ended(situation)[0]):
-            return self._goals.act(situation)
+    def act(self, belief: Belief) -> Tensor:
+        planned = self._planner.act(belief)
+        if self._on_goal and not bool(self._goals.ended(belief)[0]):
+            return self._goals.act(belief)
         self._on_goal = bool(self._rng.uniform() < self._astray)
-        reachable = situation.reachable[0].nonzero()[:, 0]
+        reachable = belief.reachable[0].nonzero()[:, 0]
         if not self._on_goal or not len(reachable):
             self._on_goal = False
             return planned
         k = reachable[int(self._rng.integers(len(reachable)))]
-        candidates = situation.lattice.positions(situation.target_position)
-        self._goals.set(candidates[:, k], torch.ones_like(situation.visible_fraction, dtype=torch.bool))
-        return self._goals.act(situation)
+        candidates = belief.lattice.positions(belief.target_position)
+        self._goals.set(candidates[:, k], torch.ones_like(belief.visible_fraction, dtype=torch.bool))
+        return self._goals.act(belief)
 
 
 def collect_episodes(
@@ -104,24 +104,24 @@ def collect_episodes(
     first = torch.zeros(1, dtype=torch.int64)
     for seed in seeds:
         env.reset(seed=seed)
-        situation: Situation = world.situation
+        belief: Belief = world.belief
         policy = _Wanderer(np.random.default_rng(seed), network)
-        policy.begin(situation, first)
+        policy.begin(belief, first)
         target = torch.full((3,), float("nan"))
         done = False
         while not done:
-            situation = world.situation
-            if not torch.equal(target, situation.target_position[0]):
+            belief = world.belief
+            if not torch.equal(target, belief.target_position[0]):
                 # The candidates stand round where the target is believed to be, which a camera may correct.
-                target = situation.target_position[0].clone()
-                poses = look_at_pose(situation.lattice.positions(target[None])[0], target)
+                target = belief.target_position[0].clone()
+                poses = look_at_pose(belief.lattice.positions(target[None])[0], target)
                 fractions.append(world.ground_truth.visible_fraction(poses).half())
-                reachable.append(situation.reachable[0].clone())
-            seen = quality_features(situation)
+                reachable.append(belief.reachable[0].clone())
+            seen = quality_features(belief)
             maps.append(seen[0][0].half())
             scalars.append(seen[1][0])
             episode.append(len(fractions) - 1)
-            _, _, terminated, truncated, _ = env.step(policy.act(situation))
+            _, _, terminated, truncated, _ = env.step(policy.act(belief))
             done = bool(terminated) or bool(truncated)
     return QualityData(
         maps=torch.stack(maps),

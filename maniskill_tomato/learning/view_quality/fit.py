@@ -10,8 +10,8 @@ from torch.nn import functional
 
 from maniskill_tomato.errors import InvalidInputError, TrainingDivergedError
 from maniskill_tomato.learning.view_quality.collect import QualityData
-from maniskill_tomato.planners.quality_network import ViewQualityNetwork
-from maniskill_tomato.planners.view_quality import new_network
+from maniskill_tomato.policies.quality_network import ViewQualityNetwork
+from maniskill_tomato.policies.view_quality import new_network
 
 
 @dataclass(frozen=True, kw_only=True)

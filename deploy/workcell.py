@@ -1,0 +1,146 @@
+"""The devices of a profile with everything that stands between them and the policy."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from maniskill_tomato.deploy.capture import Capture
+from maniskill_tomato.deploy.clock import CheckedClock, Clock, MonotonicClock, SimulatedClock
+from maniskill_tomato.deploy.drivers import DriverContext, make_arm, make_camera
+from maniskill_tomato.deploy.errors import ProfileError, RecordingError
+from maniskill_tomato.deploy.fruits import open_finder
+from maniskill_tomato.deploy.guarded_arm import GuardedArm
+from maniskill_tomato.deploy.interface import Arm, Camera, Float64
+from maniskill_tomato.deploy.loop import Loop
+from maniskill_tomato.deploy.loop_config import Mode, Proposal
+from maniskill_tomato.deploy.perceive import ImagePerception, Perception, TruthPerception
+from maniskill_tomato.deploy.profile import Profile
+from maniskill_tomato.deploy.safety import Safety
+from maniskill_tomato.deploy.steps import Recorder
+from maniskill_tomato.deploy.stops import Stops
+from maniskill_tomato.policies.base import Planner
+
+TWIN_START = 1_000.0
+"""What the twin's clock shows at first, in [s]."""
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Workcell:
+    """Devices, not connected yet, and what belongs to them."""
+
+    profile: Profile
+    clock: Clock
+    arm: Arm
+    camera: Camera
+    guarded_arm: GuardedArm
+    perception: Perception
+
+    @property
+    def simulated(self) -> bool:
+        """Whether nothing real moves."""
+        return self.arm.simulated
+
+    def target_position(self) -> Float64 | None:
+        """Where the profile says that the target is, world frame, in [m]; None to look for it. Shape (3,).
+
+        Raises:
+            ProfileError: It names the twin's target, and there is no twin.
+        """
+        target = self.profile.target
+        if target.source == "given":
+            assert target.position is not None
+            return np.array(target.position)
+        if target.source == "twin":
+            world: Any = getattr(self.camera, "_world", None)
+            if world is None:
+                raise ProfileError("target.source = 'twin' goes with the camera driver mock only")
+            position: Float64 = world.episode.target_position.double().numpy()
+            return position
+        return None
+
+    def loop(
+        self,
+        policy: Planner,
+        stops: Stops,
+        mode: Mode,
+        recorder: Recorder | None = None,
+        confirm: Callable[[Proposal], bool] = lambda proposal: False,
+    ) -> Loop:
+        """The loop over the devices, which must be connected."""
+        return Loop(
+            arm=self.guarded_arm,
+            camera=self.camera,
+            capture=Capture(self.camera, self.profile.capture, self.clock),
+            perception=self.perception,
+            policy=policy,
+            T_flange_camera=self.profile.T_flange_camera,
+            clock=self.clock,
+            config=self.profile.loop,
+            stops=stops,
+            recorder=recorder,
+            mode=mode,
+            confirm=confirm,
+            target_position=self.target_position(),
+        )
+
+
+def make_perception(profile: Profile) -> Perception:
+    """What the profile's `[perception]` asks for.
+
+    Raises:
+        ProfileError: It cannot be opened.
+    """
+    if profile.perception.sight == "rays":
+        return TruthPerception()
+    return ImagePerception(open_finder(profile.perception.segmenter))
+
+
+def make_workcell(profile: Profile, seed: int = 0, clock: Clock | None = None) -> Workcell:
+    """Makes the devices of a profile without touching any.
+
+    Args:
+        profile: Which.
+        seed: Of simulated devices: the twin's episode.
+        clock: Another clock than the machine's, or for the twin than a simulated one.
+
+    Raises:
+        ProfileError: A driver or an option is wrong.
+    """
+    if clock is None:
+        drivers = {profile.arm_driver, profile.camera_driver}
+        twin = drivers == {"mock"} and not profile.arm_options.get("real_time", False)
+        clock = SimulatedClock(TWIN_START) if twin else MonotonicClock()
+    checked = CheckedClock(clock)
+    context = DriverContext(clock=checked, seed=seed)
+    arm = make_arm(profile.arm_driver, profile.arm_options, context)
+    camera = make_camera(profile.camera_driver, profile.camera_options, context)
+    if camera.simulated and not arm.simulated:
+        raise ProfileError("a simulated camera cannot guide a real arm; use the mock driver for both")
+    return Workcell(
+        profile=profile,
+        clock=checked,
+        arm=arm,
+        camera=camera,
+        guarded_arm=GuardedArm(arm, Safety(profile.safety, profile.T_flange_camera), checked),
+        perception=make_perception(profile),
+    )
+
+
+def prepare_folder(profile: Profile, out: Path) -> Path:
+    """Makes an output folder; the file in it whose appearance stops the run, which an earlier run may have left.
+
+    Raises:
+        RecordingError: It cannot be made or written to.
+    """
+    stop_file = out / profile.stop.file
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+        stop_file.unlink(missing_ok=True)
+    except OSError as error:
+        raise RecordingError(
+            f"cannot use the folder {out}: {error.strerror or error}; choose another --out"
+        ) from error
+    return stop_file

@@ -1,1 +1,0 @@
-"""Episodes to metrics, plots and reports."""

@@ -1,0 +1,1 @@
+"""Episodes of policies, their statistics, reports and films."""

@@ -1,0 +1,237 @@
+"""Plots of training and evaluation, the counterparts of the thesis's Figures 5-1 to 5-8."""
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import matplotlib as mpl
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.ticker import MaxNLocator
+from numpy.typing import ArrayLike, NDArray
+
+from maniskill_tomato.experiments.rollout import Episode
+from maniskill_tomato.learning.rl.history import TrainingCurves
+
+INK, MUTED, GRID = "#1f2a24", "#6b7770", "#e3e7e2"
+TOMATO, LEAF, STRAW, SKY = "#c8402c", "#3f7d4e", "#d9a441", "#3b6ea5"
+
+STYLE: Any = {
+    "axes.edgecolor": "#b9c2bb",
+    "axes.labelcolor": INK,
+    "axes.spines.right": False,
+    "axes.spines.top": False,
+    "axes.grid": True,
+    "axes.axisbelow": True,
+    "axes.titlesize": 10.5,
+    "axes.titleweight": "bold",
+    "axes.titlelocation": "left",
+    "axes.titlecolor": INK,
+    "axes.labelsize": 9,
+    "grid.color": GRID,
+    "grid.linewidth": 0.8,
+    "xtick.color": MUTED,
+    "ytick.color": MUTED,
+    "xtick.labelsize": 8.5,
+    "ytick.labelsize": 8.5,
+    "legend.frameon": False,
+    "legend.fontsize": 8.5,
+    "savefig.dpi": 150,
+    "figure.constrained_layout.use": True,
+}
+
+TRAJECTORY_COLOURS = (SKY, STRAW, LEAF, "#8a5aa5")
+
+ARROW_LENGTH = 0.12
+"""Length of a viewing arrow, in [m]."""
+
+
+def moving_average(values: ArrayLike, window: int) -> NDArray[np.float64]:
+    """Means of `window` successive values; entry i ends at value `i + window - 1`.
+
+    A series shorter than the window is averaged as a whole. Shape (max(len - window + 1, 1),), or (0,) for no
+    values.
+    """
+    series = np.asarray(values, dtype=np.float64)
+    if len(series) == 0:
+        return series
+    window = min(window, len(series))
+    sums = np.concatenate(([0.0], np.cumsum(series)))
+    averages: NDArray[np.float64] = (sums[window:] - sums[:-window]) / window
+    return averages
+
+
+def default_windows(episodes: int, steps: int) -> tuple[int, int]:
+    """Windows in episodes and steps: a 20th and a 17th of the run, which is 12 and 75 for the thesis's guided
+    one."""
+    return max(12, episodes // 20), max(75, steps // 17)
+
+
+def plot_training_curves(curves: TrainingCurves, path: Path, windows: tuple[int, int] | None = None) -> None:
+    """Moving averages of episode loss and reward, step reward and step V_f (Fig. 5-1 to 5-4, 5-14 to 5-17).
+
+    Args:
+        curves: The history of a run.
+        path: The picture to write.
+        windows: Window sizes in episodes and in steps; the thesis used 12 and 75, or 30 and 180.
+    """
+    episode_window, step_window = windows or default_windows(
+        len(curves.episodes["steps"]), len(curves.step_reward)
+    )
+    panels: tuple[tuple[str, NDArray[Any], int, str, str], ...] = (
+        ("Episode loss", curves.episodes["loss_sum"], episode_window, "episode", MUTED),
+        ("Episode reward", curves.episodes["episodic_return"], episode_window, "episode", SKY),
+        ("Step reward", curves.step_reward, step_window, "step", SKY),
+        ("Step visible fraction", curves.step_visible_fraction, step_window, "step", TOMATO),
+    )
+    with mpl.rc_context(STYLE):
+        figure = Figure(figsize=(9.0, 5.6))
+        for axes, (title, values, window, unit, colour) in zip(
+            figure.subplots(2, 2).flat, panels, strict=True
+        ):
+            average = moving_average(values, window)
+            axes.plot(
+                np.arange(len(values) - len(average), len(values)), average, color=colour, linewidth=1.6
+            )
+            axes.set_title(title)
+            note = f"mean of {min(window, max(len(values), 1))} {unit}s"
+            axes.set_title(note, loc="right", fontsize=8.5, fontweight="normal", color=MUTED)
+            axes.set_xlabel(unit)
+            axes.xaxis.set_major_locator(MaxNLocator(nbins=6, integer=True))
+        figure.savefig(path)
+
+
+def plot_steps(episodes: Sequence[Episode], path: Path) -> None:
+    """Steps that each episode needed (Fig. 5-6)."""
+    with mpl.rc_context(STYLE):
+        figure = Figure(figsize=(9.0, 2.9))
+        axes = figure.subplots()
+        colours = [LEAF if e.success else TOMATO for e in episodes]
+        axes.bar(np.arange(1, len(episodes) + 1), [e.steps for e in episodes], color=colours, width=0.78)
+        axes.set_title("Steps per episode")
+        axes.set_xlabel("episode")
+        axes.xaxis.set_major_locator(MaxNLocator(integer=True))
+        axes.set_ylabel("steps")
+        axes.yaxis.set_major_locator(MaxNLocator(integer=True))
+        _outcome_legend(axes)
+        figure.savefig(path)
+
+
+def plot_visible_fraction(episodes: Sequence[Episode], threshold: float, path: Path) -> None:
+    """Visible fraction at the start and the largest one reached, for each episode (Fig. 5-7)."""
+    with mpl.rc_context(STYLE):
+        figure = Figure(figsize=(9.0, 2.9))
+        axes = figure.subplots()
+        index = np.arange(1, len(episodes) + 1)
+        start = [e.visible_fraction[0] for e in episodes]
+        largest = [e.max_visible_fraction for e in episodes]
+        colours = [LEAF if e.success else TOMATO for e in episodes]
+        axes.vlines(index, start, largest, color="#c5cec7", linewidth=1.4, zorder=1)
+        axes.scatter(index, start, s=12, color="#a7b2aa", zorder=2, label="start")
+        axes.scatter(index, largest, s=18, c=colours, zorder=3)
+        axes.axhline(threshold, color=INK, linewidth=1.0, linestyle=(0, (4, 3)))
+        axes.annotate(
+            f"fully visible, V_f > {threshold:g}",
+            (1.0, threshold),
+            xycoords=("axes fraction", "data"),
+            xytext=(-2, -11),
+            textcoords="offset points",
+            ha="right",
+            fontsize=8,
+            color=INK,
+        )
+        axes.set_ylim(-0.03, 1.05)
+        axes.set_title("Largest visible fraction per episode")
+        axes.set_xlabel("episode")
+        axes.xaxis.set_major_locator(MaxNLocator(integer=True))
+        axes.set_ylabel("V_f")
+        _outcome_legend(axes)
+        figure.savefig(path)
+
+
+def plot_trajectories(episodes: Sequence[Episode], path: Path, most: int = len(TRAJECTORY_COLOURS)) -> None:
+    """Ways of the end-effector in space, with viewing arrows at the first, middle and last pose (Fig. 5-8).
+
+    Args:
+        episodes: The first `most` of them are drawn.
+        path: The picture to write.
+        most: How many to draw.
+    """
+    shown = list(episodes[:most])
+    targets = np.stack([e.target for e in shown])
+    points = np.concatenate([targets, np.zeros((1, 3)), *(e.viewpoints[:, :3] for e in shown)])
+    low, high = points.min(axis=0) - 0.08, points.max(axis=0) + 0.08
+    with mpl.rc_context(STYLE):
+        figure = Figure(figsize=(9.0, 4.9))
+        space: Any = figure.add_subplot(1, 2, 1, projection="3d")
+        above = figure.add_subplot(1, 2, 2)
+        for colour, episode in zip(TRAJECTORY_COLOURS, shown, strict=False):
+            _draw_trajectory(space, above, episode, colour)
+        space.scatter(*targets.T, s=90, color=TOMATO, label="target")
+        space.scatter(0.0, 0.0, 0.0, s=60, marker="s", color=INK, label="robot base")
+        above.scatter(targets[:, 0], targets[:, 1], s=90, color=TOMATO, zorder=4)
+        above.scatter(0.0, 0.0, s=60, marker="s", color=INK, zorder=4)
+        space.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), zlim=(low[2], high[2]))
+        space.set_box_aspect(high - low, zoom=0.92)
+        space.view_init(24, -125)
+        space.set(xlabel="x [m]", ylabel="y [m]", zlabel="z [m]", title="In space")
+        space.tick_params(labelsize=7)
+        above.set(xlabel="x [m]", ylabel="y [m]", title="From above")
+        above.set_aspect("equal", adjustable="datalim")
+        figure.legend(loc="outside lower center", ncols=3 + len(shown))
+        figure.savefig(path)
+
+
+def viewing_direction(viewpoints: NDArray[np.float64]) -> NDArray[np.float64]:
+    """The tool's z axis in the world frame: the third column of Rz(yaw) Ry(pitch) Rx(roll).
+
+    Args:
+        viewpoints: x, y, z [m], roll, pitch, yaw [rad]. Shape (N, 6).
+
+    Returns:
+        Unit vectors. Shape (N, 3).
+    """
+    roll, pitch, yaw = viewpoints[:, 3:].T
+    return np.stack(
+        (
+            np.cos(yaw) * np.sin(pitch) * np.cos(roll) + np.sin(yaw) * np.sin(roll),
+            np.sin(yaw) * np.sin(pitch) * np.cos(roll) - np.cos(yaw) * np.sin(roll),
+            np.cos(pitch) * np.cos(roll),
+        ),
+        axis=-1,
+    )
+
+
+def _draw_trajectory(space: Any, above: Axes, episode: Episode, colour: str) -> None:
+    """One way in both pictures; the first, middle and last pose get arrows, later ones stronger."""
+    positions = episode.viewpoints[:, :3]
+    x, y, z = positions.T
+    space.plot(x, y, z, color=colour, linewidth=1.5, label=f"seed {episode.seed}")
+    space.scatter(x, y, z, s=9, color=colour)
+    above.plot(x, y, color=colour, linewidth=1.5, marker="o", markersize=3)
+    marked = sorted({0, episode.steps // 2, episode.steps})
+    directions = viewing_direction(episode.viewpoints)
+    for pose, opacity in zip(marked, np.linspace(0.45, 1.0, len(marked)), strict=True):
+        looks = {"color": colour, "alpha": float(opacity)}
+        space.quiver(
+            *positions[pose],
+            *directions[pose],
+            length=ARROW_LENGTH,
+            linewidth=2.0,
+            arrow_length_ratio=0.35,
+            **looks,
+        )
+        tip = positions[pose] + ARROW_LENGTH * directions[pose]
+        above.annotate(
+            "",
+            (tip[0], tip[1]),
+            (x[pose], y[pose]),
+            arrowprops={"arrowstyle": "-|>", "linewidth": 1.8, "shrinkA": 0, "shrinkB": 0, **looks},
+        )
+
+
+def _outcome_legend(axes: Axes) -> None:
+    for colour, name in ((LEAF, "target fully visible"), (TOMATO, "not")):
+        axes.scatter([], [], s=28, marker="s", color=colour, label=name)
+    axes.legend(loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=3, borderaxespad=0.2, handletextpad=0.3)

@@ -1,0 +1,308 @@
+"""Counterparts of the thesis's figures of chapter 5, with all training seeds in each."""
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import matplotlib as mpl
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.collections import PolyCollection
+from matplotlib.figure import Figure
+from matplotlib.patches import Rectangle
+from matplotlib.ticker import MaxNLocator
+from mpl_toolkits.mplot3d.art3d import Poly3DCollection  # type: ignore[import-untyped]
+from numpy.typing import NDArray
+
+from maniskill_tomato.errors import InvalidInputError
+from maniskill_tomato.experiments.camera_frustum import frustum_faces, frustum_points
+from maniskill_tomato.experiments.plots import INK, MUTED, STYLE, TOMATO, moving_average
+from maniskill_tomato.experiments.reproduction import Reproduction, load_episodes, success_threshold
+from maniskill_tomato.experiments.rollout import Episode
+from maniskill_tomato.experiments.thesis_experiments import THESIS_EPISODES, Experiment
+from maniskill_tomato.learning.rl.history import TrainingCurves, load_history
+from maniskill_tomato.plants.organs import SemanticClass
+from maniskill_tomato.plants.spec import PlantPose, PlantSpec
+from maniskill_tomato.tasks.maniskill.planting import grow
+from maniskill_tomato.tasks.thesis.config import ViewpointTaskConfig, guided_task, sparse_task
+
+SEED_COLOURS = ("#3b6ea5", "#d9a441", "#3f7d4e", "#8a5aa5", "#c8402c", "#4aa3a2", "#7a5230", "#5b6770")
+"""One colour per training seed, reused beyond eight."""
+
+PLANT_COLOURS = {
+    SemanticClass.STEM: "#6d8f5a",
+    SemanticClass.LEAF: "#5f9a62",
+    SemanticClass.FRUIT_RIPE: TOMATO,
+}
+
+FRUSTUM_DEPTH = 0.11
+"""Length of a drawn camera, in [m]."""
+
+SHOWN_TRAJECTORIES = 3
+
+
+def draw_all(reproduction: Reproduction, seeds: Sequence[int], folder: Path) -> list[Path]:
+    """Draws every figure that needs no renderer; returns the files.
+
+    Args:
+        reproduction: Its seeds must be finished.
+        seeds: Which of them to show.
+        folder: Where to write.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    experiment = reproduction.experiment
+    threshold = success_threshold(experiment.env_id)
+    curves = {seed: load_history(reproduction.seed_folder(seed) / "training") for seed in seeds}
+    files = [folder / "training.png", folder / "plants.png"]
+    plot_training(curves, experiment, files[0])
+    plot_plant_positions(experiment, files[1])
+    for evaluation in experiment.evaluations:
+        runs = {seed: load_episodes(reproduction.episodes_path(seed, evaluation)) for seed in seeds}
+        files.append(folder / f"evaluation_{evaluation.name}.png")
+        plot_evaluation(runs, threshold, evaluation.title, files[-1])
+        best = most_successful(runs)
+        files.append(folder / f"trajectories_{evaluation.name}.png")
+        plot_camera_ways(runs[best], f"{evaluation.title}, training seed {best}", files[-1])
+    return files
+
+
+def most_successful(runs: Mapping[int, Sequence[Episode]]) -> int:
+    """The seed whose policy solved the most episodes; the first of equals."""
+    return max(runs, key=lambda seed: sum(e.success for e in runs[seed]))
+
+
+def plot_training(curves: Mapping[int, TrainingCurves], experiment: Experiment, path: Path) -> None:
+    """Moving averages of episode loss and reward, step reward and step V_f (Fig. 5-1 to 5-4, 5-14 to 5-17)."""
+    panels = (
+        ("Episode loss", "loss_sum", "episode"),
+        ("Episode reward", "episodic_return", "episode"),
+        ("Step reward", "step_reward", "step"),
+        ("Step V_f", "step_visible_fraction", "step"),
+    )
+    with mpl.rc_context(STYLE):
+        figure = Figure(figsize=(9.0, 5.8))
+        for axes, (title, name, unit) in zip(figure.subplots(2, 2).flat, panels, strict=True):
+            window = experiment.windows[0 if unit == "episode" else 1]
+            for index, (seed, run) in enumerate(curves.items()):
+                values = run.episodes[name] if unit == "episode" else getattr(run, name)
+                ends, average = averaged_curve(values, window)
+                axes.plot(ends, average, color=_colour(index), linewidth=1.3, label=f"seed {seed}")
+            _mark_thesis(axes, experiment, unit)
+            axes.set_title(title)
+            axes.set_title(
+                f"mean of {window} {unit}s", loc="right", fontsize=8.5, fontweight="normal", color=MUTED
+            )
+            axes.set_xlabel(unit)
+            axes.xaxis.set_major_locator(MaxNLocator(nbins=6, integer=True))
+        handles, labels = figure.axes[0].get_legend_handles_labels()
+        figure.legend(handles, labels, loc="outside lower center", ncols=len(labels))
+        figure.savefig(path)
+
+
+def averaged_curve(values: NDArray[Any], window: int) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+    """The moving average of a series, and the number (from 1) of the value at which each mean ends."""
+    average = moving_average(values, window)
+    return np.arange(len(values) - len(average), len(values)) + 1, average
+
+
+def plot_evaluation(runs: Mapping[int, Sequence[Episode]], threshold: float, title: str, path: Path) -> None:
+    """Steps and largest V_f per episode (Fig. 5-6, 5-7): the thesis's six episodes, and all that were run.
+
+    Args:
+        runs: The evaluation episodes of each training seed, equally many.
+        threshold: V_f above which an episode is solved.
+        title: What is evaluated.
+        path: The picture to write.
+    """
+    with mpl.rc_context(STYLE):
+        figure = Figure(figsize=(9.0, 5.4))
+        grid = figure.subplots(2, 2)
+        offsets = np.linspace(-0.25, 0.25, len(runs)) if len(runs) > 1 else np.zeros(1)
+        count = max(len(episodes) for episodes in runs.values())
+        for row, (name, attribute) in enumerate(
+            (("steps", "steps"), ("largest V_f", "max_visible_fraction"))
+        ):
+            few, many = grid[row]
+            for index, (seed, episodes) in enumerate(runs.items()):
+                first = episodes[:THESIS_EPISODES]
+                few.scatter(
+                    np.arange(1, len(first) + 1) + offsets[index],
+                    [getattr(e, attribute) for e in first],
+                    s=30,
+                    facecolors=[_colour(index) if e.success else "white" for e in first],
+                    edgecolors=_colour(index),
+                    linewidths=1.3,
+                    zorder=3,
+                )
+                solved = sum(e.success for e in episodes)
+                many.plot(
+                    np.arange(1, len(episodes) + 1),
+                    sorted(getattr(e, attribute) for e in episodes),
+                    color=_colour(index),
+                    linewidth=1.5,
+                    label=f"seed {seed}: {solved} of {len(episodes)} solved",
+                )
+            few.set(xlabel="episode", ylabel=name)
+            few.xaxis.set_major_locator(MaxNLocator(integer=True))
+            many.set(xlabel="episodes, sorted", ylabel=name)
+            for axes in (few, many):
+                if row == 0:
+                    axes.set_ylim(0.0, 31.0)
+                else:
+                    axes.set_ylim(-0.03, 1.05)
+                    axes.axhline(threshold, color=INK, linewidth=1.0, linestyle=(0, (4, 3)))
+        grid[0][0].set_title(f"First {THESIS_EPISODES} episodes (filled: solved)")
+        grid[0][1].set_title(f"All {count} episodes")
+        handles, labels = grid[0][1].get_legend_handles_labels()
+        figure.suptitle(title[0].upper() + title[1:], fontsize=11, color=INK, x=0.01, ha="left")
+        figure.legend(handles, labels, loc="outside lower center", ncols=min(len(labels), 3))
+        figure.savefig(path)
+
+
+def plot_camera_ways(episodes: Sequence[Episode], title: str, path: Path) -> None:
+    """Ways of the end-effector with the camera at the first, middle and last pose (Fig. 5-8).
+
+    As in the thesis the first camera is opaque, the middle one transparent and the last one between.
+
+    Args:
+        episodes: The first three of them are drawn.
+        title: What they are.
+        path: The picture to write.
+    """
+    shown = list(episodes[:SHOWN_TRAJECTORIES])
+    if not shown:
+        raise InvalidInputError("a figure of trajectories needs at least one episode")
+    frusta = [[frustum_points(v, FRUSTUM_DEPTH) for v in e.viewpoints[marked_views(e)]] for e in shown]
+    targets = np.stack([e.target for e in shown])
+    points = np.concatenate(
+        [targets, *(e.viewpoints[:, :3] for e in shown), *(f for cameras in frusta for f in cameras)]
+    )
+    low, high = points.min(axis=0) - 0.05, points.max(axis=0) + 0.05
+    with mpl.rc_context(STYLE):
+        figure = Figure(figsize=(9.0, 5.0))
+        for column, (elevation, azimuth) in enumerate(((22, -128), (62, -100)), start=1):
+            space: Any = figure.add_subplot(1, 2, column, projection="3d")
+            for index, (episode, cameras) in enumerate(zip(shown, frusta, strict=True)):
+                x, y, z = episode.viewpoints[:, :3].T
+                label = f"episode {index + 1}: {episode.steps} steps, " + (
+                    "solved" if episode.success else "not solved"
+                )
+                space.plot(
+                    x, y, z, color=_colour(index), linewidth=1.4, marker="o", markersize=2.5, label=label
+                )
+                for camera, opacity in zip(cameras, camera_opacities(len(cameras)), strict=True):
+                    space.add_collection3d(
+                        Poly3DCollection(
+                            frustum_faces(camera),
+                            facecolors=_colour(index),
+                            edgecolors=_colour(index),
+                            linewidths=0.7,
+                            alpha=opacity,
+                        )
+                    )
+            space.scatter(*targets.T, s=70, color=TOMATO, label="target")
+            space.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), zlim=(low[2], high[2]))
+            space.set_box_aspect(high - low, zoom=0.9)
+            space.view_init(elevation, azimuth)
+            space.set(xlabel="x [m]", ylabel="y [m]", zlabel="z [m]")
+            space.tick_params(labelsize=7)
+        handles, labels = figure.axes[0].get_legend_handles_labels()
+        figure.suptitle(title[0].upper() + title[1:], fontsize=11, color=INK, x=0.01, ha="left")
+        figure.legend(handles, labels, loc="outside lower center", ncols=len(labels))
+        figure.savefig(path)
+
+
+def marked_views(episode: Episode) -> list[int]:
+    """The first, the middle and the last view of an episode, each once."""
+    return sorted({0, episode.steps // 2, episode.steps})
+
+
+def camera_opacities(count: int) -> list[float]:
+    """Opacities of the cameras of `marked_views`: opaque first, transparent middle, half-transparent last."""
+    return [0.75, 0.12, 0.4] if count == 3 else [0.75, 0.4][:count]
+
+
+def plot_plant_positions(experiment: Experiment, path: Path) -> None:
+    """Where the plant stands in the training and in each evaluation (Fig. 5-5, 5-10, 5-18)."""
+    task = guided_task() if experiment.name == "guided" else sparse_task()
+    with mpl.rc_context(STYLE):
+        figure = Figure(figsize=(3.1 * len(experiment.evaluations), 5.6))
+        grid = figure.subplots(2, len(experiment.evaluations), sharex="row", sharey="row")
+        for (front, above), evaluation in zip(grid.T, experiment.evaluations, strict=True):
+            options = evaluation.env_options
+            choice = PlantSpec.parse(options.get("plant"), task.plant)
+            pose = PlantPose.parse(options.get("plant_pose"), task.plant_pose)
+            _draw_plant(above, choice, pose, (0, 1), depth_axis=2)
+            _draw_plant(front, choice, pose, (1, 2), depth_axis=0)
+            front.invert_xaxis()
+            _draw_starts(above, task, (0, 1))
+            _draw_starts(front, task, (1, 2))
+            above.scatter(0.0, 0.0, s=60, marker="s", color=INK)
+            front.set(xlabel="y [m]", ylabel="z [m]", xlim=(0.75, -0.55), ylim=(0.0, 1.9), aspect="equal")
+            above.set(xlabel="x [m]", ylabel="y [m]", xlim=(-0.2, 1.3), ylim=(-0.5, 0.75), aspect="equal")
+            front.set_title(evaluation.title.split(" (")[0], fontsize=9)
+            above.set_title(
+                f"x {pose.x:g} m, y {pose.y:g} m, turned {pose.yaw:g} rad",
+                fontsize=8,
+                fontweight="normal",
+                color=MUTED,
+            )
+        figure.savefig(path)
+
+
+def _draw_plant(
+    axes: Axes, choice: PlantSpec, pose: PlantPose, shown: tuple[int, int], depth_axis: int
+) -> None:
+    """The plant's triangles along an axis of the world, the nearest last."""
+    if not isinstance(choice.seed, int):
+        raise InvalidInputError("a plant that changes with every episode has no one position to draw")
+    c, s = np.cos(pose.yaw), np.sin(pose.yaw)
+    rotation = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
+    triangles: list[NDArray[np.float64]] = []
+    colours: list[str] = []
+    for organ in grow(choice, choice.seed).organs:
+        world = organ.vertices.astype(np.float64) @ rotation.T + np.array([pose.x, pose.y, 0.0])
+        triangles.append(world[organ.faces])
+        colours += [PLANT_COLOURS.get(organ.semantic_class, "#a3b95f")] * len(organ.faces)
+    corners = np.concatenate(triangles)
+    towards_viewer = 1.0 if depth_axis == 2 else -1.0
+    order = np.argsort(towards_viewer * corners[:, :, depth_axis].mean(axis=1))
+    axes.add_collection(
+        PolyCollection(
+            list(corners[order][:, :, list(shown)]), facecolors=[colours[i] for i in order], edgecolors="none"
+        )
+    )
+
+
+def _draw_starts(axes: Axes, task: ViewpointTaskConfig, shown: tuple[int, int]) -> None:
+    """The box that episodes start in (Eq. 5-1, 5-7)."""
+    (x0, x1), (y0, y1) = (task.start_position[axis] for axis in shown)
+    axes.add_patch(Rectangle((x0, y0), x1 - x0, y1 - y0, fill=False, edgecolor=INK, linestyle=(0, (3, 2))))
+
+
+def _mark_thesis(axes: Axes, experiment: Experiment, unit: str) -> None:
+    """Where the thesis's own training or exploration ended."""
+    thesis = experiment.thesis
+    if unit == "step" and thesis.total_steps is not None:
+        _mark(axes, thesis.total_steps, "thesis:\nlast step")
+    if thesis.exploration_ends is not None:
+        _mark(axes, thesis.exploration_ends[0 if unit == "episode" else 1], "thesis:\nexploration over")
+
+
+def _mark(axes: Axes, x: float, text: str) -> None:
+    axes.axvline(x, color=MUTED, linewidth=0.9, linestyle=(0, (4, 3)))
+    axes.annotate(
+        text,
+        (x, 1.0),
+        xycoords=("data", "axes fraction"),
+        xytext=(-3, -2),
+        textcoords="offset points",
+        ha="right",
+        va="top",
+        fontsize=7.5,
+        color=MUTED,
+    )
+
+
+def _colour(index: int) -> str:
+    return SEED_COLOURS[index % len(SEED_COLOURS)]

@@ -1,0 +1,88 @@
+"""Demonstrations: a planner's successful episodes in ManiSkill's trajectory format.
+
+`FOLDER/trajectory.h5` and `.json`, as `mani_skill.utils.wrappers.record.RecordEpisode` writes them: observations,
+actions, rewards and states of every episode, and how to reset the environment to its start.
+"""
+
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import torch
+
+from maniskill_tomato.errors import InvalidInputError
+from maniskill_tomato.policies.base import Planner
+
+NAME = "trajectory"
+
+
+@dataclass(frozen=True, kw_only=True)
+class Demonstrations:
+    """What was recorded."""
+
+    path: Path
+    """The .h5 file; the .json file stands beside it."""
+    recorded: int
+    """Successful episodes, which are in the file."""
+    tried: int
+    moves: int
+    """Moves of the recorded episodes together."""
+
+
+def record_demonstrations(
+    env: gym.Env[Any, Any],
+    planner: Planner,
+    episodes: Iterable[int],
+    folder: Path,
+    reset_options: Callable[[int], dict[str, Any] | None] = lambda episode: None,
+) -> Demonstrations:
+    """Runs a planner and keeps the episodes that it solves.
+
+    Args:
+        env: A single environment with a belief; its observations are recorded as they are. It is closed.
+        planner: Whose moves to record, usually the oracle.
+        episodes: Seeds of the resets.
+        folder: Of the files; it must not hold demonstrations yet.
+        reset_options: Options of each reset.
+
+    Raises:
+        InvalidInputError: The folder holds demonstrations.
+    """
+    from mani_skill.utils.wrappers.record import RecordEpisode
+
+    path = folder / f"{NAME}.h5"
+    if path.exists():
+        raise InvalidInputError(f"{path} exists; choose another folder, or delete it")
+    folder.mkdir(parents=True, exist_ok=True)
+    task: Any = env
+    recorder = RecordEpisode(
+        task,
+        output_dir=str(folder),
+        save_video=False,
+        save_on_reset=False,
+        trajectory_name=NAME,
+        source_type="motionplanning",
+        source_desc=f"moves of the planner {planner.name!r} of maniskill-tomato",
+    )
+    world: Any = env.unwrapped
+    recorded = tried = moves = 0
+    everywhere = torch.zeros(1, dtype=torch.int64, device=world.device)
+    for episode in episodes:
+        options = reset_options(episode)
+        recorder.reset(seed=episode, options=options)
+        planner.reseed(episode)
+        planner.begin(world.belief, everywhere)
+        done, success, steps = False, False, 0
+        while not done:
+            _, _, terminated, truncated, info = recorder.step(planner.act(world.belief))
+            steps += 1
+            done = bool(torch.as_tensor(terminated).any()) or bool(torch.as_tensor(truncated).any())
+            success = bool(torch.as_tensor(info["success"]).any())
+        recorder.flush_trajectory(save=success)
+        tried += 1
+        recorded += int(success)
+        moves += steps if success else 0
+    recorder.close()
+    return Demonstrations(path=path, recorded=recorded, tried=tried, moves=moves)

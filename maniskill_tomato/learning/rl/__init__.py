@@ -1,0 +1,1 @@
+"""Reinforcement learning: DDPG and TD3, their training runs and their checkpoints."""

@@ -1,0 +1,290 @@
+"""DDPG (thesis Algorithm 2) and TD3 as one agent and the functions that update it."""
+
+import copy
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor, nn
+
+from maniskill_tomato.learning.rl.auxiliary import AuxiliaryHeads
+from maniskill_tomato.learning.rl.categorical import CategoricalCritic, project
+from maniskill_tomato.learning.rl.networks import Actor, Critic, ObservationNormalizer
+from maniskill_tomato.learning.rl.presets import OBSERVATION_CENTRE, OBSERVATION_HALF_RANGE, TrainConfig
+from maniskill_tomato.learning.rl.replay import Batch
+from maniskill_tomato.learning.rl.running_statistics import RunningStatistics
+from maniskill_tomato.sensing.true_views import TRUE_VIEWS
+
+
+@dataclass(frozen=True, kw_only=True)
+class Agent:
+    """Networks, their slowly following copies and their optimisers."""
+
+    config: TrainConfig
+    actor: Actor
+    critics: nn.ModuleList
+    """One `Critic`, or two with `twin_critics`; each a `CategoricalCritic` where it is configured."""
+    target_actor: Actor
+    target_critics: nn.ModuleList
+    actor_optimizer: torch.optim.Optimizer
+    critic_optimizer: torch.optim.Optimizer
+    normalizer: ObservationNormalizer
+    statistics: RunningStatistics
+    """What a running normaliser follows; unused otherwise."""
+    heads: AuxiliaryHeads
+    """Empty unless auxiliary losses have a weight."""
+
+    def observe(self, observations: Tensor) -> None:
+        """Lets a running normaliser follow what the environments show. Shape (B, observation_dim)."""
+        if self.config.normalize_observations == "running":
+            self.statistics.update(observations[:, : self.actor_dim], self.normalizer)
+
+    @property
+    def actor_dim(self) -> int:
+        """How many of the observed values the actor sees: all but the last ones of a privileged critic."""
+        return len(self.normalizer.centre)
+
+    def actor_input(self, observations: Tensor) -> Tensor:
+        """What the actor sees of observations, normalised. Shape (B, actor_dim)."""
+        normalized: Tensor = self.normalizer(observations[:, : self.actor_dim])
+        return normalized
+
+    def critic_input(self, observations: Tensor) -> Tensor:
+        """What the critics see: the same, and after it the privileged values as they are. Shape (B, dim)."""
+        seen = self.actor_input(observations)
+        if observations.shape[-1] == self.actor_dim:
+            return seen
+        return torch.cat([seen, observations[:, self.actor_dim :]], dim=-1)
+
+    def policy(self, observations: Tensor) -> Tensor:
+        """The policy's actions, in units of the action scale. Shape (B, action_dim)."""
+        with torch.no_grad():
+            actions: Tensor = self.actor(self.actor_input(observations))
+        return actions
+
+
+def make_normalizer(config: TrainConfig, observation_dim: int) -> ObservationNormalizer:
+    """The normaliser that the configuration asks for; a running one starts as the identity."""
+    if config.normalize_observations == "fixed":
+        return ObservationNormalizer(OBSERVATION_CENTRE, OBSERVATION_HALF_RANGE)
+    return ObservationNormalizer.identity(observation_dim)
+
+
+def make_actor(config: TrainConfig, observation_dim: int, action_dim: int) -> Actor:
+    """A freshly initialised actor of the configured size."""
+    return Actor(observation_dim, action_dim, config.actor_hidden, config.actor_output_init)
+
+
+def make_critic(config: TrainConfig, observation_dim: int, action_dim: int) -> Critic:
+    """A freshly initialised critic of the configured size and kind."""
+    dims = (observation_dim, action_dim, config.critic_hidden, config.critic_action_layer)
+    if config.critic == "categorical":
+        return CategoricalCritic(*dims, config.value_atoms, config.value_range)
+    return Critic(*dims)
+
+
+def make_agent(
+    config: TrainConfig, observation_dim: int, action_dim: int, device: torch.device | str = "cpu"
+) -> Agent:
+    """A freshly initialised agent; the weights come from torch's global random state.
+
+    Args:
+        config: How it learns.
+        observation_dim: Number of observed values, a privileged critic's at the end.
+        action_dim: Number of actions.
+        device: Where the networks are.
+    """
+    actor_dim = observation_dim - (TRUE_VIEWS if config.privileged_critic else 0)
+    actor = make_actor(config, actor_dim, action_dim).to(device)
+    critics = nn.ModuleList(
+        make_critic(config, observation_dim, action_dim) for _ in range(2 if config.twin_critics else 1)
+    ).to(device)
+    heads = AuxiliaryHeads(config, actor_dim).to(device)
+    actor_parameters, critic_parameters = (
+        _trained(actor, heads.distance),
+        _trained(critics, heads.visible_fraction),
+    )
+    return Agent(
+        config=config,
+        actor=actor,
+        critics=critics,
+        target_actor=copy.deepcopy(actor).requires_grad_(False),
+        target_critics=copy.deepcopy(critics).requires_grad_(False),
+        actor_optimizer=torch.optim.Adam(actor_parameters, lr=config.actor_learning_rate, fused=True),
+        critic_optimizer=torch.optim.Adam(critic_parameters, lr=config.critic_learning_rate, fused=True),
+        normalizer=make_normalizer(config, actor_dim).to(device),
+        statistics=RunningStatistics(actor_dim).to(device),
+        heads=heads,
+    )
+
+
+@torch.no_grad()
+def td_targets(agent: Agent, batch: Batch, generator: torch.Generator | None = None) -> Tensor:
+    """What the critics should say: y = r, plus gamma Q'(s', mu'(s')) unless the episode terminated.
+
+    With returns over n steps r is their discounted sum, s' comes after the last of them, and gamma^k stands for
+    gamma. A time limit is no termination: those transitions bootstrap. With two critics Q' is the smaller one; with
+    `target_noise` above zero the target action is smoothed by clipped Gaussian noise (TD3).
+
+    Returns:
+        Shape (B,).
+    """
+    next_observations, next_actions = _target_actions(agent, batch, generator)
+    values = torch.stack([critic(next_observations, next_actions) for critic in agent.target_critics])
+    return batch.rewards + _discounts(agent, batch) * values.amin(dim=0)
+
+
+@torch.no_grad()
+def distribution_targets(agent: Agent, batch: Batch, generator: torch.Generator | None = None) -> Tensor:
+    """The same for categorical critics: the distribution of r + gamma Z'(s', mu'(s')) over their atoms.
+
+    With two critics Z' is the one with the smaller mean, row by row (FastTD3).
+
+    Returns:
+        Rows that add up to 1. Shape (B, atoms).
+    """
+    next_observations, next_actions = _target_actions(agent, batch, generator)
+    chosen, smallest, atoms = None, None, None
+    for critic in agent.target_critics:
+        assert isinstance(critic, CategoricalCritic)
+        probabilities = critic.logits(next_observations, next_actions).softmax(dim=-1)
+        means, atoms = critic.mean(probabilities), critic.atoms
+        if chosen is None or smallest is None:
+            chosen, smallest = probabilities, means
+        else:
+            chosen = torch.where((means < smallest)[:, None], probabilities, chosen)
+    assert chosen is not None and atoms is not None
+    return project(chosen, atoms, batch.rewards, _discounts(agent, batch))
+
+
+def _target_actions(agent: Agent, batch: Batch, generator: torch.Generator | None) -> tuple[Tensor, Tensor]:
+    """s' as the critics see it, and what the target actor does there, smoothed where configured."""
+    config = agent.config
+    next_observations = agent.critic_input(batch.next_observations)
+    next_actions = agent.target_actor(next_observations[:, : agent.actor_dim])
+    if config.target_noise > 0.0:
+        noise = torch.randn(next_actions.shape, generator=generator, device=next_actions.device)
+        noise = (noise * config.target_noise).clamp_(-config.target_noise_clip, config.target_noise_clip)
+        next_actions = (next_actions + noise).clamp_(-1.0, 1.0)
+    return next_observations, next_actions
+
+
+def _discounts(agent: Agent, batch: Batch) -> Tensor:
+    """What the value after a transition counts: gamma, or gamma^k, and 0 after a termination. Shape (B,)."""
+    discounts = agent.config.gamma if batch.discounts is None else batch.discounts
+    return discounts * (1.0 - batch.terminations)
+
+
+def update_critic(agent: Agent, batch: Batch, generator: torch.Generator | None = None) -> dict[str, Tensor]:
+    """One Adam step on the critics' loss, summed over the critics.
+
+    It is L = mean (y - Q(s, a))^2 or, for categorical critics, the mean cross-entropy with the target distribution;
+    plus, where it has a weight, the error of the predicted V_f.
+
+    Returns:
+        `qf_loss` (the sum), `qf1_loss`, `qf1_values` and, with two critics, `qf2_loss`, `qf2_values`;
+        `aux_visibility_loss`, a sum too, where it has a weight: scalars.
+    """
+    categorical = agent.config.critic == "categorical"
+    targets = (distribution_targets if categorical else td_targets)(agent, batch, generator)
+    observations = agent.critic_input(batch.observations)
+    total = torch.zeros((), device=targets.device)
+    auxiliary = torch.zeros((), device=targets.device)
+    logs: dict[str, Tensor] = {}
+    for index, critic in enumerate(agent.critics):
+        assert isinstance(critic, Critic)
+        features = critic.features(observations, batch.actions)
+        output: Tensor = critic.output(features)
+        if isinstance(critic, CategoricalCritic):
+            logarithms = output.log_softmax(dim=-1)
+            loss = -(targets * logarithms).sum(dim=-1).mean()
+            values = critic.mean(logarithms.detach().exp())
+        else:
+            values = output.squeeze(-1)
+            loss = torch.nn.functional.mse_loss(values, targets)
+        total = total + loss
+        logs[f"qf{index + 1}_loss"] = loss.detach()
+        logs[f"qf{index + 1}_values"] = values.detach().mean()
+        if agent.heads.visible_fraction is not None:
+            auxiliary = auxiliary + agent.heads.visibility_loss(index, features, batch)
+    logs["qf_loss"] = total.detach()
+    if agent.heads.visible_fraction is not None:
+        logs["aux_visibility_loss"] = auxiliary.detach()
+        total = total + agent.config.aux_visibility_weight * auxiliary
+    _step(agent.critic_optimizer, total, _trained(agent.critics, agent.heads.visible_fraction))
+    return logs
+
+
+def update_actor(agent: Agent, observations: Tensor) -> dict[str, Tensor]:
+    """One Adam step up the sampled policy gradient of Q(s, mu(s)); the critics stay as they are.
+
+    Args:
+        agent: The agent; its first critic judges.
+        observations: Unnormalised observations. Shape (B, observation_dim).
+
+    Returns:
+        `actor_loss`: minus the mean value, plus the penalty on saturated outputs where one is configured;
+        `aux_distance_loss` where it has a weight. Scalars.
+    """
+    seen = agent.critic_input(observations)
+    features = agent.actor.features(seen[:, : agent.actor_dim])
+    pre_activation = agent.actor.output(features)
+    loss = -agent.critics[0](seen, torch.tanh(pre_activation)).mean()
+    if agent.config.pre_tanh_penalty > 0.0:
+        loss = loss + agent.config.pre_tanh_penalty * pre_activation.square().mean()
+    logs = {"actor_loss": loss.detach()}
+    if agent.heads.distance is not None:
+        distance_loss = agent.heads.distance_loss(features, observations)
+        logs["aux_distance_loss"] = distance_loss.detach()
+        loss = loss + agent.config.aux_distance_weight * distance_loss
+    _step(agent.actor_optimizer, loss, _trained(agent.actor, agent.heads.distance))
+    return logs
+
+
+def update_targets(agent: Agent) -> None:
+    """Moves the target networks by the fraction tau towards the trained ones."""
+    polyak_update(agent.critics.parameters(), agent.target_critics.parameters(), agent.config.tau)
+    polyak_update(agent.actor.parameters(), agent.target_actor.parameters(), agent.config.tau)
+
+
+def update(
+    agent: Agent, batch: Batch, index: int, generator: torch.Generator | None = None
+) -> dict[str, Tensor]:
+    """One update in the order of Algorithm 2: critic, actor, targets.
+
+    Args:
+        agent: The agent, changed in place.
+        batch: Transitions from the replay buffer.
+        index: How many updates came before; the actor and the targets move on every `policy_frequency`-th
+            only, the actor after `actor_starts` of them.
+        generator: Source of the target noise.
+
+    Returns:
+        The logs of `update_critic` and, where it ran, `update_actor`.
+    """
+    logs = update_critic(agent, batch, generator)
+    if index >= agent.config.actor_starts and index % agent.config.policy_frequency == 0:
+        logs |= update_actor(agent, batch.observations)
+    if index % agent.config.policy_frequency == 0:
+        update_targets(agent)
+    return logs
+
+
+@torch.no_grad()
+def polyak_update(source: Iterable[Tensor], target: Iterable[Tensor], tau: float) -> None:
+    """target <- tau * source + (1 - tau) * target, in place."""
+    for s, t in zip(source, target, strict=True):
+        t.lerp_(s, tau)
+
+
+def _trained(network: nn.Module, head: nn.Module | None) -> list[nn.Parameter]:
+    """The parameters of a network and of a head on it."""
+    return [*network.parameters(), *(() if head is None else head.parameters())]
+
+
+def _step(optimizer: torch.optim.Optimizer, loss: Tensor, parameters: list[nn.Parameter]) -> None:
+    """One optimiser step on `loss`; gradients of other parameters in the graph are neither computed nor
+    kept."""
+    for parameter, gradient in zip(parameters, torch.autograd.grad(loss, parameters), strict=True):
+        parameter.grad = gradient
+    optimizer.step()

@@ -1,0 +1,143 @@
+"""Checkpoints: weights with everything needed to use them, written whole or not at all."""
+
+import io
+import json
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+import maniskill_tomato
+from maniskill_tomato.errors import CheckpointError
+from maniskill_tomato.files import read_tensors, write_atomically
+from maniskill_tomato.learning.rl.agent import Agent
+from maniskill_tomato.policies.layout import layout_of
+
+FORMAT = 1
+"""Version of the layout that `make_checkpoint` documents."""
+
+REQUIRED_KEYS = (
+    "format",
+    "package_version",
+    "env_id",
+    "config",
+    "observation",
+    "action",
+    "normalizer",
+    "actor",
+    "counters",
+)
+
+TRAINING_PARTS = (
+    "critics",
+    "target_actor",
+    "target_critics",
+    "actor_optimizer",
+    "critic_optimizer",
+    "statistics",
+    "heads",
+)
+"""Parts of an agent that only its further training needs."""
+
+
+def make_checkpoint(
+    agent: Agent,
+    env_id: str,
+    action_bounds: tuple[Tensor, Tensor],
+    counters: dict[str, int | float],
+    with_training_state: bool = True,
+    run: dict[str, Any] | None = None,
+    env_options: dict[str, Any] | None = None,
+) -> dict[str, Any]:
+    """What a checkpoint file holds: tensors, numbers and strings only, so that it loads without running code.
+
+    Args:
+        agent: Its weights.
+        env_id: The task that it was trained on.
+        action_bounds: Low and high of the environment's action space. Each of shape (action_dim,).
+        counters: Steps, episodes, updates, seconds, seed.
+        with_training_state: Also keep critics, target networks and optimisers; a policy to be used needs none
+            of them.
+        run: What else a run needs to go on exactly, kept under `run`; see `Trainer`.
+        env_options: The options that the task was made with, as JSON can hold them; none were given if empty,
+            None if that is not known.
+    """
+    low, high = action_bounds
+    scale = torch.tensor(agent.config.action_scale)
+    observation_dim = len(agent.normalizer.centre)
+    layout = layout_of(env_id)
+    data: dict[str, Any] = {
+        "format": FORMAT,
+        "package_version": maniskill_tomato.__version__,
+        "env_id": env_id,
+        "config": agent.config.to_dict(),
+        "observation": {
+            "names": _names(layout.observation_names, observation_dim),
+            "shape": [observation_dim],
+            "frame": layout.frame,
+            "units": _units(layout.observation_units),
+        },
+        "action": {
+            "names": _names(layout.action_names, len(scale)),
+            "low": low.cpu(),
+            "high": high.cpu(),
+            "scale": scale,
+            "units": _units(layout.action_units),
+        },
+        "normalizer": agent.normalizer.state_dict(),
+        "actor": agent.actor.state_dict(),
+        "counters": counters,
+    }
+    if env_options is not None:
+        data["env_options"] = json.loads(json.dumps(env_options))
+    if with_training_state:
+        for name in TRAINING_PARTS:
+            data[name] = getattr(agent, name).state_dict()
+    if run is not None:
+        data["run"] = run
+    return data
+
+
+def save_checkpoint(path: Path, data: dict[str, Any]) -> None:
+    """Writes `data` to a neighbouring file first and renames it, so that `path` never holds half a
+    checkpoint.
+
+    Raises:
+        CheckpointError: The file cannot be written, for instance because the disk is full; an older file
+            stays.
+    """
+    buffer = io.BytesIO()
+    torch.save(data, buffer)
+    write_atomically(path, buffer.getvalue())
+
+
+def load_checkpoint(path: Path | str, device: torch.device | str = "cpu") -> dict[str, Any]:
+    """The content of a checkpoint file (see `make_checkpoint`).
+
+    Raises:
+        CheckpointError: The file is missing, damaged, not one of ours, or of a newer format.
+    """
+    data = read_tensors(path, device)
+    if not isinstance(data, dict) or any(key not in data for key in REQUIRED_KEYS):
+        raise CheckpointError(
+            f"{path} is not a checkpoint of this package, which would hold {', '.join(REQUIRED_KEYS)}"
+        )
+    checkpoint: dict[str, Any] = data
+    if not isinstance(checkpoint["format"], int) or checkpoint["format"] > FORMAT:
+        raise CheckpointError(
+            f"{path} has checkpoint format {checkpoint['format']}, written by version "
+            f"{checkpoint['package_version']}; "
+            f"this version, {maniskill_tomato.__version__}, reads up to {FORMAT}: upgrade maniskill-tomato",
+            newer_format=True,
+        )
+    return checkpoint
+
+
+def _names(names: tuple[str, ...], count: int) -> list[str]:
+    """The documented names, or numbered ones for spaces of another size."""
+    return list(names) if len(names) == count else [f"value_{i}" for i in range(count)]
+
+
+def _units(units: tuple[str, ...]) -> str:
+    return ", ".join(dict.fromkeys(units))

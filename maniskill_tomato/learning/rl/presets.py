@@ -1,0 +1,169 @@
+"""Training configurations: the thesis's two (Tables 5-1 and 5-2) and good defaults."""
+
+import dataclasses
+import math
+from typing import Literal
+
+from maniskill_tomato.errors import InvalidInputError
+from maniskill_tomato.learning.rl.train_config import MAY_CHANGE as MAY_CHANGE
+from maniskill_tomato.learning.rl.train_config import TrainConfig as TrainConfig
+from maniskill_tomato.learning.rl.train_config import modernise as modernise
+from maniskill_tomato.policies.layout import ACTION_NAMES as ACTION_NAMES
+from maniskill_tomato.policies.layout import OBSERVATION_NAMES as OBSERVATION_NAMES
+from maniskill_tomato.tasks import GENERAL_IDS
+
+OBSERVATION_CENTRE = (0.2, 0.0, 0.8, 0.0, math.pi / 2, 0.0, 0.7, 0.0, 0.8)
+"""What normalisation maps to 0: the middle of the arm's working range in front of the plant, looking along x.
+[m], [rad]."""
+
+OBSERVATION_HALF_RANGE = (0.5, 0.5, 0.5, 1.0, 1.0, 1.0, 0.5, 0.5, 0.5)
+"""What normalisation maps to 1: half the working range. The same for the end-effector and the target, so that
+their difference keeps its meaning. [m], [rad]."""
+
+EPSILON_GREEDY_LOW = (-0.07, -0.2, -0.1, -0.17, -0.17, -0.17)
+"""Lower ends of Eq. 5-6 in the order of `ACTION_NAMES`; the thesis lists pitch before roll. [m], [rad]."""
+
+EPSILON_GREEDY_HIGH = (0.1, 0.1, 0.1, 0.43, 0.17, 0.26)
+"""Upper ends of Eq. 5-6 in the order of `ACTION_NAMES`. [m], [rad]."""
+
+PresetName = Literal[
+    "td3", "fast-td3", "thesis-guided", "thesis-sparse", "general-td3", "general-ddpg", "general-fast-td3"
+]
+
+_TD3 = TrainConfig(
+    total_timesteps=15_000,
+    reward="potential",
+    step_cost=0.05,
+    gamma=0.9,
+    tau=0.01,
+    batch_size=256,
+    buffer_size=100_000,
+    learning_starts=1500,
+    updates_per_step=0.5,
+    actor_learning_rate=1e-3,
+    critic_learning_rate=1e-3,
+    twin_critics=True,
+    policy_frequency=2,
+    target_noise=0.2,
+    pre_tanh_penalty=1e-3,
+    actor_hidden=(128, 128),
+    critic_hidden=(128, 128),
+    critic_action_layer=0,
+    actor_output_init="small",
+    normalize_observations="fixed",
+    action_scale=(0.35, 0.35, 0.35, 0.6, 0.6, 0.6),
+    exploration="look-at-goals",
+    exploration_steps=10_000,
+    exploration_noise=0.3,
+    exploration_noise_end=0.1,
+    exploration_goal_share=0.1,
+)
+
+_FAST_TD3 = dataclasses.replace(
+    _TD3,
+    total_timesteps=3_000_000,
+    tau=0.1,
+    batch_size=8192,
+    buffer_size=1_000_000,
+    learning_starts=10_240,
+    updates_per_step=2 / 1024,
+    actor_learning_rate=3e-4,
+    critic_learning_rate=3e-4,
+    critic="categorical",
+    value_range=(-4.0, 2.0),
+    actor_hidden=(512, 256, 128),
+    critic_hidden=(1024, 512, 256),
+    normalize_observations="running",
+    exploration_steps=1_000_000,
+    exploration_noise=0.4,
+    exploration_noise_end=0.001,
+    exploration_noise_per_env=True,
+    num_envs=1024,
+    checkpoint_every=500_000,
+    checkpoint_seconds=None,
+)
+
+_GENERAL_TD3 = TrainConfig(
+    total_timesteps=60_000,
+    gamma=0.95,
+    tau=0.005,
+    batch_size=256,
+    buffer_size=100_000,
+    learning_starts=2000,
+    updates_per_step=0.5,
+    actor_learning_rate=5e-4,
+    critic_learning_rate=5e-4,
+    twin_critics=True,
+    policy_frequency=2,
+    target_noise=0.2,
+    pre_tanh_penalty=1e-3,
+    actor_hidden=(256, 256),
+    critic_hidden=(256, 256),
+    critic_action_layer=0,
+    actor_output_init="small",
+    action_scale=(1.0, 1.0, 1.0),
+    exploration="correlated",
+    exploration_steps=20_000,
+    exploration_noise=1.0,
+    exploration_noise_end=0.15,
+)
+
+_GENERAL_DDPG = dataclasses.replace(
+    _GENERAL_TD3,
+    gamma=0.99,
+    tau=0.001,
+    batch_size=64,
+    actor_learning_rate=1e-4,
+    critic_learning_rate=1e-3,
+    twin_critics=False,
+    policy_frequency=1,
+    target_noise=0.0,
+    pre_tanh_penalty=0.0,
+)
+
+_GENERAL_FAST_TD3 = dataclasses.replace(
+    _FAST_TD3,
+    reward="task",
+    gamma=0.95,
+    value_range=(-1.0, 2.5),
+    action_scale=(1.0, 1.0, 1.0),
+    exploration="correlated",
+)
+
+PRESETS: dict[PresetName, TrainConfig] = {
+    "td3": _TD3,
+    "fast-td3": _FAST_TD3,
+    "thesis-guided": TrainConfig(
+        total_episodes=240, buffer_size=1000, exploration="epsilon-greedy", exploration_steps=1200
+    ),
+    "thesis-sparse": TrainConfig(
+        total_episodes=500,
+        buffer_size=1500,
+        exploration="decaying-gaussian",
+        exploration_steps=1800,
+        exploration_noise=0.1,
+    ),
+    "general-td3": _GENERAL_TD3,
+    "general-ddpg": _GENERAL_DDPG,
+    "general-fast-td3": _GENERAL_FAST_TD3,
+}
+"""The named configurations. The thesis's are Tables 5-1 and 5-2 on top of the defaults of `TrainConfig`; those for the
+general tasks have three actions and take the observation, which is scaled already, as it is. `general-ddpg` has the
+learning rates, tau, gamma and batch size of Lillicrap et al. (2016)."""
+
+
+def default_preset(env_id: str | None) -> PresetName:
+    """The preset that a task is trained with unless another one is asked for."""
+    return "general-td3" if env_id in GENERAL_IDS else "td3"
+
+
+def get_preset(name: str) -> TrainConfig:
+    """The configuration called `name`.
+
+    Raises:
+        InvalidInputError: There is no such preset; the message lists them.
+    """
+    for known, config in PRESETS.items():
+        if known == name:
+            return config
+    raise InvalidInputError.choice("preset", name, PRESETS)

@@ -1,0 +1,291 @@
+"""Several seeds of one configuration, each trained in a process and a folder of its own."""
+
+import contextlib
+import json
+import logging
+import math
+import os
+import signal
+import subprocess
+import sys
+import threading
+import time
+from collections import deque
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from tqdm import tqdm
+
+import maniskill_tomato
+from maniskill_tomato.errors import InvalidInputError
+from maniskill_tomato.files import write_atomically
+from maniskill_tomato.learning.interrupt import stop_on_signals
+from maniskill_tomato.learning.rl.presets import TrainConfig
+from maniskill_tomato.learning.rl.run_folder import LOG_NAME, check_run_dir, clear_run
+
+logger = logging.getLogger(__name__)
+
+SEEDS_FILE = "seeds.json"
+"""Describes the runs of a folder; `--config` repeats them and `--resume` continues them."""
+
+POLL_SECONDS = 0.1
+LINE_SECONDS = 10.0
+"""How often progress is told where there is no terminal for bars."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class SeedResult:
+    """How one seed's run ended."""
+
+    seed: int
+    run_dir: Path
+    steps: int
+    """Environment steps taken, as far as is known."""
+    episodes: int
+    """Episodes finished, as far as is known."""
+    success: float
+    """Share of its last episodes that succeeded; NaN if none was told."""
+    seconds: float
+    """Training time, all parts of a continued run together; 0 if it failed."""
+    stop_reason: str
+    """As `TrainResult.stop_reason`, or `failed`, or `not started`."""
+    error: str | None = None
+    """Why it failed."""
+
+    @property
+    def policy_path(self) -> Path:
+        """Where its policy is, unless it failed."""
+        return self.run_dir / "policy.pt"
+
+
+def train_seeds(
+    env_id: str,
+    config: TrainConfig,
+    out: Path,
+    seeds: Sequence[int],
+    env_options: dict[str, Any],
+    *,
+    jobs: int | None = None,
+    overwrite: bool = False,
+    resume: bool = False,
+    show_progress: bool = True,
+) -> list[SeedResult]:
+    """Trains every seed in `out/seed-N`; one that fails does not disturb the others.
+
+    Ctrl-C and SIGTERM let the running seeds end as single runs do, saved, and start no more; a second one kills
+    them. Should this process be killed, they end likewise.
+
+    Args:
+        env_id: Id of the task.
+        config: How to learn, the same for all.
+        out: Folder of the runs.
+        seeds: One run each.
+        env_options: Options of the task for `gymnasium.make`.
+        jobs: How many at a time; by default one per processor core.
+        overwrite: Remove earlier runs of these seeds from the folder.
+        resume: Go on with those that were begun.
+        show_progress: Whether to show where each of them is.
+
+    Raises:
+        InvalidInputError: `seeds` is empty, `jobs` is less than 1, or the folder holds runs.
+    """
+    if not seeds:
+        raise InvalidInputError("give one seed or more")
+    if jobs is not None and jobs < 1:
+        raise InvalidInputError(f"jobs must be 1 or more, got {jobs}")
+    if (out / "config.json").exists():
+        raise InvalidInputError(f"{out} holds a single run; choose another --out for several seeds")
+    folders = {seed: out / f"seed-{seed}" for seed in seeds}
+    for folder in folders.values():
+        if overwrite:
+            clear_run(folder)
+        if not resume:
+            check_run_dir(folder)
+    content = {
+        "env_id": env_id,
+        "seeds": list(seeds),
+        "package_version": maniskill_tomato.__version__,
+        "env_options": env_options,
+        "config": config.to_dict(),
+    }
+    write_atomically(out / SEEDS_FILE, (json.dumps(content, indent=2) + "\n").encode())
+    waiting = deque(
+        _Worker(seed, folder, _spec(env_id, config, seed, folder, env_options, resume))
+        for seed, folder in folders.items()
+    )
+    workers = list(waiting)
+    at_once = min(len(workers), jobs or len(os.sched_getaffinity(0)))
+    display = _Display(workers, config, show_progress)
+    try:
+        with stop_on_signals() as stop:
+            asked = False
+            while (waiting and stop.reason is None) or any(w.running for w in workers):
+                while waiting and stop.reason is None and sum(w.running for w in workers) < at_once:
+                    waiting.popleft().start()
+                if stop.reason is not None and not asked:
+                    asked = True
+                    for worker in workers:
+                        worker.ask_to_stop()
+                display.refresh()
+                time.sleep(POLL_SECONDS)
+    finally:
+        display.close()
+        for worker in workers:
+            worker.kill()
+    return [worker.result() for worker in workers]
+
+
+def summary_table(results: Sequence[SeedResult]) -> str:
+    """One line per seed: how it ended, how long it took, its recent success, and where its policy or its log is."""
+    lines = [f"{'seed':>6}  {'ended':<12} {'steps':>8} {'episodes':>8} {'seconds':>8} {'success':>7}  result"]
+    for r in results:
+        success = "-" if math.isnan(r.success) else f"{r.success:.0%}"
+        where = r.error or ("" if r.stop_reason == "not started" else r.policy_path)
+        lines.append(
+            f"{r.seed:>6}  {r.stop_reason:<12} {r.steps:>8} {r.episodes:>8} {r.seconds:>8.0f} {success:>7}  {where}"
+        )
+    return "\n".join(lines)
+
+
+def _spec(
+    env_id: str, config: TrainConfig, seed: int, folder: Path, env_options: dict[str, Any], resume: bool
+) -> dict[str, Any]:
+    return {
+        "env_id": env_id,
+        "config": config.to_dict(),
+        "seed": seed,
+        "run_dir": str(folder),
+        "env_options": env_options,
+        "resume": resume and (folder / "config.json").is_file(),
+    }
+
+
+class _Worker:
+    """A seed's process, what it said last, and its log."""
+
+    def __init__(self, seed: int, run_dir: Path, spec: dict[str, Any]) -> None:
+        self.seed = seed
+        self.run_dir = run_dir
+        self.progress: dict[str, Any] = {}
+        self._spec = spec
+        self._end: dict[str, Any] = {}
+        self._process: subprocess.Popen[str] | None = None
+        self._reader: threading.Thread | None = None
+
+    @property
+    def running(self) -> bool:
+        return self._process is not None and self._process.poll() is None
+
+    def start(self) -> None:
+        self.run_dir.mkdir(parents=True, exist_ok=True)
+        with (self.run_dir / LOG_NAME).open("a") as log:
+            # Ctrl-C in the terminal must reach this process only, which passes it on once.
+            process = subprocess.Popen(
+                [sys.executable, "-m", "maniskill_tomato.learning.rl.seed_worker"],
+                stdin=subprocess.PIPE,
+                stdout=subprocess.PIPE,
+                stderr=log,
+                text=True,
+                start_new_session=True,
+            )
+        self._process = process
+        assert process.stdin is not None
+        with contextlib.suppress(BrokenPipeError):
+            process.stdin.write(json.dumps(self._spec) + "\n")
+            process.stdin.flush()
+        self._reader = threading.Thread(target=self._listen, daemon=True)
+        self._reader.start()
+
+    def _listen(self) -> None:
+        assert self._process is not None and self._process.stdout is not None
+        for line in self._process.stdout:
+            message = json.loads(line)
+            if message["kind"] == "progress":
+                self.progress = message
+            else:
+                self._end = message
+
+    def ask_to_stop(self) -> None:
+        if self._process is not None and self.running:
+            self._process.send_signal(signal.SIGTERM)
+
+    def kill(self) -> None:
+        if self._process is not None and self.running:
+            self._process.kill()
+            self._process.wait()
+
+    def result(self) -> SeedResult:
+        if self._reader is not None:
+            self._reader.join()
+        if self._process is not None and self._process.stdin is not None:
+            with contextlib.suppress(BrokenPipeError):
+                self._process.stdin.close()
+        known = {**self.progress, **self._end}
+        reason, error = str(known.get("stop_reason", "not started")), None
+        status = None if self._process is None else self._process.returncode
+        if status is not None and self._end.get("kind") != "end":
+            if status == -signal.SIGTERM:  # Stopped before its training had begun.
+                reason = "SIGTERM"
+            else:
+                reason = "failed"
+                cause = (
+                    f"ended by {signal.Signals(-status).name}"
+                    if status < 0
+                    else f"ended with status {status}"
+                )
+                error = known.get("message") or f"{cause}; see {self.run_dir / LOG_NAME}"
+        return SeedResult(
+            seed=self.seed,
+            run_dir=self.run_dir,
+            steps=known.get("steps", 0),
+            episodes=known.get("episodes", 0),
+            success=known.get("success", math.nan),
+            seconds=known.get("seconds", 0.0),
+            stop_reason=reason,
+            error=error,
+        )
+
+
+class _Display:
+    """A bar for every seed on a terminal, a line now and then elsewhere."""
+
+    def __init__(self, workers: Sequence[_Worker], config: TrainConfig, show: bool) -> None:
+        self._workers = workers
+        self._key = "episodes" if config.total_timesteps is None and config.total_episodes else "steps"
+        self._total = config.total_episodes if self._key == "episodes" else config.total_timesteps
+        self._lines = show and not sys.stderr.isatty()
+        self._last_line = time.monotonic()
+        self._bars = [
+            tqdm(
+                total=self._total,
+                unit=self._key.removesuffix("s"),
+                desc=f"seed {w.seed}",
+                position=i,
+                dynamic_ncols=True,
+            )
+            for i, w in enumerate(workers)
+            if show and not self._lines
+        ]
+
+    def refresh(self) -> None:
+        for bar, worker in zip(self._bars, self._workers, strict=False):
+            if worker.progress and bar.n != worker.progress[self._key]:
+                bar.n = worker.progress[self._key]
+                success = worker.progress["success"]
+                bar.set_postfix_str("" if math.isnan(success) else f"success {success:.0%}", refresh=False)
+                bar.refresh()
+        if self._lines and time.monotonic() - self._last_line >= LINE_SECONDS:
+            self._last_line = time.monotonic()
+            logger.info("%s", ", ".join(self._where(worker) for worker in self._workers))
+
+    def _where(self, worker: _Worker) -> str:
+        done = worker.progress.get(self._key, 0)
+        of = f" of {self._total}" if self._total else ""
+        return f"seed {worker.seed}: {done}{of} {self._key}"
+
+    def close(self) -> None:
+        self.refresh()
+        for bar in self._bars:
+            bar.close()

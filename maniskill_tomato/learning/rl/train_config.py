@@ -1,0 +1,286 @@
+"""The options of a training run, each with its meaning and its limits."""
+
+import dataclasses
+from dataclasses import dataclass
+from typing import Any, Literal
+
+from maniskill_tomato.errors import InvalidInputError
+
+ExplorationName = Literal["epsilon-greedy", "decaying-gaussian", "look-at-goals", "correlated"]
+
+MAY_CHANGE = (
+    "total_episodes",
+    "total_timesteps",
+    "max_minutes",
+    "checkpoint_every",
+    "checkpoint_seconds",
+    "checkpoints_kept",
+    "wandb_project",
+)
+"""Options that may differ when a run is continued: its length, how often it is saved, where it also logs."""
+
+_AT_LEAST_ONE = (
+    "n_step",
+    "success_threshold_steps",
+    "leaf_density_steps",
+    "batch_size",
+    "buffer_size",
+    "policy_frequency",
+    "exploration_steps",
+    "num_envs",
+    "checkpoint_every",
+    "checkpoints_kept",
+    "torch_threads",
+)
+_NOT_NEGATIVE = (
+    "actor_starts",
+    "hindsight_targets",
+    "aux_distance_weight",
+    "aux_visibility_weight",
+    "learning_starts",
+    "updates_per_step",
+    "step_cost",
+    "target_noise",
+    "target_noise_clip",
+    "pre_tanh_penalty",
+    "exploration_noise",
+    "exploration_noise_end",
+)
+
+_CHOICES = {
+    "critic": ("scalar", "categorical"),
+    "normalize_observations": ("none", "fixed", "running"),
+}
+
+
+@dataclass(frozen=True, kw_only=True)
+class TrainConfig:
+    """Everything that decides how a run learns; CleanRL's names where it has one."""
+
+    # Length of the run; it ends at whichever comes first.
+    total_episodes: int | None = None
+    """Stop after this many episodes; the thesis's M."""
+    total_timesteps: int | None = None
+    """Stop after this many environment steps, counted over all environments."""
+    max_minutes: float | None = None
+    """Stop after this much training time, in [min]."""
+
+    # Learning.
+    reward: Literal["task", "potential"] = "task"
+    """Learn from the task's reward, or from success with V_f as a potential
+    (`learning.rl.rewards.potential_reward`)."""
+    step_cost: float = 0.02
+    """What each step costs with the potential reward."""
+    gamma: float = 0.99
+    """Discount factor."""
+    n_step: int = 1
+    """Steps that a return adds up before it bootstraps; fewer where the episode ends."""
+    tau: float = 0.001
+    """Share by which the target networks follow at each of their updates."""
+    batch_size: int = 32
+    """Transitions per update."""
+    buffer_size: int = 1000
+    """Transitions that the replay buffer holds."""
+    learning_starts: int = 32
+    """Environment steps before the first update; never before the buffer holds a batch."""
+    updates_per_step: float = 1.0
+    """Updates per environment step (Algorithm 2: one)."""
+    actor_learning_rate: float = 1e-4
+    """Adam step size of the actor."""
+    critic_learning_rate: float = 1e-3
+    """Adam step size of the critics."""
+    twin_critics: bool = False
+    """Use the smaller of two critics' targets (TD3)."""
+    critic: Literal["scalar", "categorical"] = "scalar"
+    """What the critics learn: the value, or its distribution over fixed atoms (C51, FastTD3)."""
+    value_atoms: int = 101
+    """Atoms of the categorical critics."""
+    value_range: tuple[float, float] = (-10.0, 10.0)
+    """Smallest and largest value that the categorical critics can tell."""
+    policy_frequency: int = 1
+    """Critic updates per update of the actor and the targets (TD3: 2)."""
+    target_noise: float = 0.0
+    """Standard deviation of the noise on target actions, in units of the action scale (TD3: 0.2)."""
+    target_noise_clip: float = 0.5
+    """Bound of that noise, in units of the action scale."""
+    actor_starts: int = 0
+    """Critic updates before the first update of the actor; a given actor waits for critics that know it."""
+    initial_policy: str | None = None
+    """File of a policy whose actor and normaliser the run begins with, for instance an imitated one."""
+    pre_tanh_penalty: float = 0.0
+    """Weight of the mean squared actor output before tanh, against saturation."""
+    aux_distance_weight: float = 0.0
+    """Weight of predicting the distance to the target, in [m], from the actor's last hidden layer."""
+    aux_visibility_weight: float = 0.0
+    """Weight of predicting V_f after the action from the critics' last hidden layers."""
+    privileged_critic: bool = False
+    """Show the critics, which only training needs, the true V_f around the present view; general tasks only."""
+
+    # Curriculum.
+    leaf_density_start: float | None = None
+    """Highest leaf density of the plants at the start of the run; it rises linearly to the task's. None: no limit."""
+    leaf_density_steps: int = 5000
+    """Steps in which it rises."""
+
+    # Hindsight.
+    hindsight_targets: int = 0
+    """Other ripe tomatoes for which every step is stored once more, as if they had been the target."""
+    success_threshold_start: float | None = None
+    """V_f above which a view counts as a success at the start of the run, potential reward only; it rises linearly
+    to 1, and the task's own threshold holds as soon as it is lower. None: always the task's."""
+    success_threshold_steps: int = 5000
+    """Steps in which it rises."""
+
+    # Networks.
+    actor_hidden: tuple[int, ...] = (100, 100)
+    """Width of the actor's hidden layers."""
+    critic_hidden: tuple[int, ...] = (100, 100)
+    """Width of the critics' hidden layers."""
+    critic_action_layer: int = 1
+    """Hidden layer of the critics that the action enters; 1 is the second, as in the thesis."""
+    actor_output_init: Literal["glorot", "small"] = "glorot"
+    """Initialiser of the actor's last layer: the thesis's, or one whose first actions are nearly zero."""
+    normalize_observations: Literal["none", "fixed", "running"] = "none"
+    """Scale observations by the fixed ranges OBSERVATION_CENTRE and OBSERVATION_HALF_RANGE, or by the mean and
+    standard deviation of those of the run so far."""
+    action_scale: tuple[float, ...] = (1.0, 1.0, 1.0, 1.0, 1.0, 1.0)
+    """The action that an actor output of 1 stands for, in [m] and [rad] (thesis: 1)."""
+
+    # Exploration.
+    exploration: ExplorationName = "epsilon-greedy"
+    """How actions are explored."""
+    exploration_steps: int = 1200
+    """Steps that the schedule spans; the thesis's EXP."""
+    exploration_noise: float = 0.1
+    """Standard deviation of the noise at the start, in units of the action scale."""
+    exploration_noise_end: float = 0.0
+    """Standard deviation at the end of the schedule (look-at goals, correlated), in units of the action scale."""
+    exploration_goal_share: float = 0.0
+    """Share of episodes led through look-at goals at the end of the schedule (look-at goals only)."""
+    exploration_correlation: float = 0.8
+    """Correlation of the noise of one step with that of the step before (correlated only)."""
+    exploration_noise_per_env: bool = False
+    """Every environment draws its own noise level with each episode, uniformly between exploration_noise_end and
+    exploration_noise, instead of the schedule's (FastTD3)."""
+
+    # Running.
+    num_envs: int = 1
+    """Parallel environments; ManiSkill allows more than one on a GPU only."""
+    checkpoint_every: int = 5000
+    """Environment steps between checkpoints."""
+    checkpoint_seconds: float | None = 60.0
+    """Longest time between checkpoints, in [s]; what a crash can cost. None leaves it to `checkpoint_every`."""
+    checkpoints_kept: int = 3
+    """Newest checkpoints that stay on the disk."""
+    torch_threads: int = 1
+    """CPU threads of PyTorch; these networks are too small to gain from more."""
+    wandb_project: str | None = None
+    """Log to this project of Weights & Biases too, which needs the package wandb."""
+
+    def too_short(self) -> bool:
+        """Whether `total_timesteps` end before the first update."""
+        if self.total_timesteps is None:
+            return False
+        # Hindsight stores a transition again for each of its targets.
+        stored = self.total_timesteps * (1 + self.hindsight_targets)
+        return self.total_timesteps < self.learning_starts or stored < self.batch_size
+
+    def __post_init__(self) -> None:
+        for name in ("total_episodes", "total_timesteps", "max_minutes", "checkpoint_seconds"):
+            value = getattr(self, name)
+            if value is not None and not value > 0:
+                raise InvalidInputError(f"{name} must be above 0, got {value}")
+        if self.total_episodes is None and self.total_timesteps is None and self.max_minutes is None:
+            raise InvalidInputError("set at least one of total_episodes, total_timesteps and max_minutes")
+        for name in ("gamma", "exploration_goal_share", "exploration_correlation"):
+            if not 0.0 <= getattr(self, name) < 1.0:
+                raise InvalidInputError(f"{name} must be in [0, 1), got {getattr(self, name)}")
+        if self.success_threshold_start is not None:
+            if not 0.0 < self.success_threshold_start < 1.0:
+                raise InvalidInputError(
+                    f"success_threshold_start must be in (0, 1), got {self.success_threshold_start}"
+                )
+            if self.reward != "potential" or self.n_step != 1:
+                raise InvalidInputError(
+                    "success_threshold_start needs reward 'potential' and n_step 1, because every batch is labelled "
+                    f"anew; got {self.reward!r} and {self.n_step}"
+                )
+        for name in ("tau", "actor_learning_rate", "critic_learning_rate"):
+            if not 0.0 < getattr(self, name) <= 1.0:
+                raise InvalidInputError(f"{name} must be in (0, 1], got {getattr(self, name)}")
+        for name in _AT_LEAST_ONE:
+            if getattr(self, name) < 1:
+                raise InvalidInputError(f"{name} must be 1 or more, got {getattr(self, name)}")
+        for name in _NOT_NEGATIVE:
+            if not getattr(self, name) >= 0:
+                raise InvalidInputError(f"{name} must be 0 or more, got {getattr(self, name)}")
+        at_once = self.num_envs * self.n_step * max(self.hindsight_targets, 1)
+        if self.buffer_size < max(self.batch_size, at_once):
+            raise InvalidInputError(
+                f"buffer_size must be at least batch_size ({self.batch_size}) and num_envs x n_step x "
+                f"hindsight_targets ({at_once}), got {self.buffer_size}"
+            )
+        for name in ("actor_hidden", "critic_hidden"):
+            widths = getattr(self, name)
+            if not widths or min(widths) < 1:
+                raise InvalidInputError(f"{name} must list one or more widths above 0, got {widths}")
+        if not 0 <= self.critic_action_layer < len(self.critic_hidden):
+            raise InvalidInputError(
+                f"critic_action_layer must be in 0 ... {len(self.critic_hidden) - 1}, "
+                f"got {self.critic_action_layer}"
+            )
+        if not self.action_scale or not all(0.0 < scale <= 1.0 for scale in self.action_scale):
+            raise InvalidInputError(f"action_scale must hold values in (0, 1], got {self.action_scale}")
+        if (
+            self.value_atoms < 2
+            or len(self.value_range) != 2
+            or not self.value_range[0] < self.value_range[1]
+        ):
+            raise InvalidInputError(
+                "categorical critics need 2 or more value_atoms over a rising value_range, got "
+                f"{self.value_atoms} over {self.value_range}"
+            )
+        for name, allowed in _CHOICES.items():
+            if getattr(self, name) not in allowed:
+                raise InvalidInputError.choice(name, getattr(self, name), allowed)
+        if self.exploration_noise_per_env and self.exploration == "epsilon-greedy":
+            raise InvalidInputError(
+                "exploration_noise_per_env needs an exploration with noise: decaying-gaussian, look-at-goals or "
+                "correlated; epsilon-greedy has none"
+            )
+
+    @property
+    def needs_visible_fractions(self) -> bool:
+        """Whether the replay must keep V_f."""
+        return self.aux_visibility_weight > 0.0 or self.success_threshold_start is not None
+
+    def to_dict(self) -> dict[str, Any]:
+        """The fields as numbers, strings and lists, ready for JSON."""
+        return {k: list(v) if isinstance(v, tuple) else v for k, v in dataclasses.asdict(self).items()}
+
+    @classmethod
+    def from_dict(cls, values: dict[str, Any]) -> "TrainConfig":
+        """The configuration that `to_dict` described.
+
+        Options are read as `modernise` leaves them.
+
+        Raises:
+            InvalidInputError: A field is unknown (the message lists them) or its value not allowed.
+        """
+        known = {field.name for field in dataclasses.fields(cls)}
+        unknown = sorted(set(values) - known)
+        if unknown:
+            raise InvalidInputError(
+                f"unknown training options: {', '.join(unknown)}; known are {', '.join(sorted(known))}"
+            )
+        values = modernise(values)
+        arguments: dict[str, Any] = {k: tuple(v) if isinstance(v, list) else v for k, v in values.items()}
+        return cls(**arguments)
+
+
+def modernise(values: dict[str, Any]) -> dict[str, Any]:
+    """Options as this version writes them: `normalize_observations` was once a switch, on for `fixed`."""
+    normalize = values.get("normalize_observations")
+    if isinstance(normalize, bool):
+        return {**values, "normalize_observations": "fixed" if normalize else "none"}
+    return values

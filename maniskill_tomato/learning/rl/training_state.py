@@ -1,0 +1,114 @@
+"""Everything that changes while a run goes on, and how a checkpoint keeps it."""
+
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from maniskill_tomato.errors import CheckpointError
+from maniskill_tomato.learning.rl.agent import make_agent
+from maniskill_tomato.learning.rl.checkpoint import TRAINING_PARTS
+from maniskill_tomato.learning.rl.env_state import (
+    env_state,
+    set_env_state,
+    set_tensor_attributes,
+    tensor_attributes,
+)
+from maniskill_tomato.learning.rl.envs import LearnerEnv
+from maniskill_tomato.learning.rl.experience import Experience, make_replay
+from maniskill_tomato.learning.rl.exploration import make_exploration
+from maniskill_tomato.learning.rl.history import TrainingHistory
+from maniskill_tomato.learning.rl.presets import TrainConfig
+from maniskill_tomato.learning.rl.random_state import global_random_state, set_global_random_state
+from maniskill_tomato.learning.rl.run_folder import RUN_STATE_FORMAT
+
+
+class TrainingState:
+    """The agent, its memory, its environments and its counters at one moment of a run."""
+
+    def __init__(
+        self,
+        env: LearnerEnv,
+        config: TrainConfig,
+        dims: tuple[int, int],
+        seed: int,
+        observations: Tensor,
+        info: dict[str, Any],
+    ) -> None:
+        """The state at the start of a run.
+
+        Args:
+            env: The environments, just reset.
+            config: How to learn.
+            dims: Number of observed values and of actions.
+            seed: Seed of the replay, the exploration and the target noise.
+            observations: What the reset gave. Shape (num_envs, observation_dim).
+            info: What it gave beside them.
+        """
+        device = observations.device
+        self.env = env
+        self.agent = make_agent(config, *dims, device)
+        self.replay = make_replay(config, *dims, device)
+        self.experience = Experience(config, self.replay, env.num_envs, dims, device)
+        self.experience.begin(info)
+        self.generator = torch.Generator(device=device).manual_seed(seed)
+        self.exploration = make_exploration(config, self.generator, device)
+        self.history = TrainingHistory(env.num_envs)
+        self.observations = observations
+        self.visible_fraction: Tensor = info["visible_fraction"]
+        """V_f of the present views. Shape (num_envs,)."""
+        self.episode_starts = torch.ones(env.num_envs, dtype=torch.bool, device=device)
+        self.step = 0
+        """Environment steps, counted over all environments."""
+        self.updates = 0
+        self.updates_owed = 0.0
+        """Part of an update that the steps so far add up to."""
+        self.episodes = 0
+
+    def run_state(self, log_state: dict[str, Any]) -> dict[str, Any]:
+        """What a run needs beside its networks and counters to go on exactly: data only, on the CPU."""
+        return {
+            "format": RUN_STATE_FORMAT,
+            "torch_version": str(torch.__version__),
+            "updates_owed": self.updates_owed,
+            "replay": self.replay.state_dict(),
+            "experience": self.experience.state_dict(),
+            "exploration": tensor_attributes(self.exploration),
+            "history": self.history.state_dict(),
+            "log": log_state,
+            "observations": self.observations.cpu(),
+            "visible_fraction": self.visible_fraction.cpu(),
+            "episode_starts": self.episode_starts.cpu(),
+            "generator": self.generator.get_state().cpu(),
+            "env": env_state(self.env),
+            "random": global_random_state(),
+        }
+
+    def restore(self, saved: dict[str, Any]) -> None:
+        """Puts everything back to the moment of the checkpoint `saved`.
+
+        Raises:
+            CheckpointError: It is of another run.
+        """
+        run, counters, device = saved["run"], saved["counters"], self.observations.device
+        try:
+            for name in ("actor", "normalizer", *TRAINING_PARTS):
+                getattr(self.agent, name).load_state_dict(saved[name])
+            self.replay.load_state_dict(run["replay"])
+            self.experience.load_state_dict(run["experience"])
+            set_tensor_attributes(self.exploration, run["exploration"], device)
+            self.history.load_state_dict(run["history"])
+            self.observations = run["observations"].to(device)
+            self.visible_fraction = run["visible_fraction"].to(device)
+            self.episode_starts = run["episode_starts"].to(device)
+            self.step = counters["steps"]
+            self.episodes, self.updates = counters["episodes"], counters["updates"]
+            self.updates_owed = run["updates_owed"]
+            set_env_state(self.env, run["env"])
+            self.generator.set_state(run["generator"])
+            set_global_random_state(run["random"])
+        except (KeyError, TypeError, ValueError, RuntimeError, AttributeError) as error:
+            raise CheckpointError(
+                f"the checkpoint of step {counters['steps']} does not fit this run: {error!r}; "
+                "train again with --overwrite"
+            ) from error

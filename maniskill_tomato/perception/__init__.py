@@ -1,1 +1,0 @@
-"""From pixels to how much of the target is seen: datasets, segmenters, occlusion models and their measures."""

@@ -1,0 +1,194 @@
+"""Which plant stands where: the `plant=` and `plant_pose=` options of the tasks, checked."""
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, fields, replace
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from maniskill_tomato.errors import InvalidInputError
+from maniskill_tomato.plants.config import PRESETS
+from maniskill_tomato.plants.generator import generate_plant
+from maniskill_tomato.plants.organs import Plant
+from maniskill_tomato.plants.row import generate_row, leaf_density_of
+
+SEED_SPLITS: dict[str, tuple[int, int]] = {
+    "train": (0, 1_000_000),
+    "validation": (1_000_000, 2_000_000),
+    "held_out": (2_000_000, 3_000_000),
+}
+"""Half-open, disjoint ranges of plant seeds; a choice with a split's name as seed takes a new plant at every
+reset."""
+
+ROW_NEIGHBOURS = 32
+"""Neighbours in a row are among this number of plants of each split, so that a new row takes one new plant."""
+
+MAX_SEED = 2**24 - 1
+"""The largest plant seed: a saved state holds it as a float32."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class PlantSpec:
+    """The identity of a plant, or a rule that draws a new one at every reset."""
+
+    preset: str = "one_tomato"
+    """One of `maniskill_tomato.plants.config.PRESETS`."""
+    seed: int | str = 0
+    """The plant's seed, or the name of a split of `SEED_SPLITS`: then each reset draws a seed from it."""
+    pool: int | None = None
+    """With a split, draw only from this number of its seeds, the first ones; None draws from all. A plant that was
+    seen before is ready at once, a new one takes 0.1 to 0.2 s to grow."""
+    leaf_density: float | tuple[float, float] | None = None
+    """Share of the preset's leaves, 0 or more; a range, from which each plant draws its own by its seed; None keeps
+    the preset's own."""
+    detail: Literal["training", "picture"] = "training"
+    """Level of the triangles, both rendered and cast against."""
+    row: bool = False
+    """Whether the plant stands between two neighbours of its row (`plants.row`), drawn by its seed from the first
+    `ROW_NEIGHBOURS` seeds of the same split."""
+
+    def __post_init__(self) -> None:
+        if self.preset not in PRESETS:
+            raise InvalidInputError.choice("plant preset", self.preset, PRESETS)
+        if isinstance(self.seed, str):
+            if self.seed not in SEED_SPLITS:
+                raise InvalidInputError(
+                    f"plant seed must be an integer from 0 to {MAX_SEED} or one of {', '.join(SEED_SPLITS)}; "
+                    f"got {self.seed!r}"
+                )
+        elif isinstance(self.seed, bool) or not 0 <= self.seed <= MAX_SEED:
+            raise InvalidInputError(f"plant seed must be an integer from 0 to {MAX_SEED}; got {self.seed!r}")
+        if self.pool is not None and not self._pool_fits():
+            raise InvalidInputError(
+                "plant pool must be an integer from 1 to the size of a split, and needs a split's name as seed; "
+                f"got pool={self.pool!r} with seed={self.seed!r}"
+            )
+        if isinstance(self.leaf_density, list):
+            object.__setattr__(self, "leaf_density", tuple(self.leaf_density))
+        if self.leaf_density is not None and not _is_density(self.leaf_density):
+            raise InvalidInputError(
+                "leaf_density must be a finite number of 0 or more, or a range (low, high) of such; "
+                f"got {self.leaf_density!r}"
+            )
+        if self.detail not in ("training", "picture"):
+            raise InvalidInputError.choice("plant detail", self.detail, ("training", "picture"))
+
+    def _pool_fits(self) -> bool:
+        if not isinstance(self.seed, str) or not isinstance(self.pool, int) or isinstance(self.pool, bool):
+            return False
+        low, high = SEED_SPLITS[self.seed]
+        return 1 <= self.pool <= high - low
+
+    @property
+    def changes(self) -> bool:
+        """Whether every reset draws a new plant."""
+        return isinstance(self.seed, str)
+
+    def grow(self, seed: int) -> Plant:
+        """Grows the plant of a seed, with its neighbours if it has any."""
+        if not self.row:
+            return generate_plant(self.preset, seed, self.detail, leaf_density_of(self.leaf_density, seed))
+        low = next((low for low, high in SEED_SPLITS.values() if low <= seed < high), 0)
+        neighbours = (low, low + ROW_NEIGHBOURS)
+        return generate_row(self.preset, seed, self.detail, self.leaf_density, seeds=neighbours)
+
+    def draw_seed(self, rng: np.random.RandomState) -> int:
+        """The seed itself, or one drawn from the split with `rng`."""
+        if isinstance(self.seed, int):
+            return self.seed
+        low, high = SEED_SPLITS[self.seed]
+        return int(rng.randint(low, high if self.pool is None else low + self.pool))
+
+    @classmethod
+    def parse(
+        cls, value: "PlantSpec | Mapping[str, object] | str | None", default: "PlantSpec"
+    ) -> "PlantSpec":
+        """A choice from what a user may write.
+
+        Args:
+            value: None for the default; a preset's name; a mapping with any of this class's fields, which
+            replace the
+                default's.
+            default: The task's own plant.
+
+        Raises:
+            InvalidInputError: The value is of another form; the message lists what is allowed.
+        """
+        if value is None:
+            return default
+        if isinstance(value, PlantSpec):
+            return value
+        if isinstance(value, str):
+            return replace(default, preset=value)
+        if isinstance(value, Mapping):
+            names = [f.name for f in fields(cls)]
+            unknown = sorted(set(value) - set(names))
+            if unknown:
+                raise InvalidInputError(
+                    f"plant has no field {', '.join(map(repr, unknown))}; the fields are {', '.join(names)}"
+                )
+            replaced = dict(value)
+            if not isinstance(replaced.get("seed", ""), str):
+                replaced.setdefault("pool", None)  # The default's pool is one of its split.
+            return cls(**{**asdict(default), **replaced})
+        raise InvalidInputError(
+            f"plant must be None, a preset's name ({', '.join(PRESETS)}) or a mapping of "
+            f"{', '.join(f.name for f in fields(cls))}; got {value!r}"
+        )
+
+
+def _is_density(value: object) -> bool:
+    bounds = value if isinstance(value, tuple) else (value, value)
+    numbers = [float(v) for v in bounds if isinstance(v, int | float) and math.isfinite(v) and v >= 0.0]
+    return len(bounds) == len(numbers) == 2 and numbers[0] <= numbers[1]
+
+
+@dataclass(frozen=True, kw_only=True)
+class PlantPose:
+    """Where a plant stands on the ground, in the world frame."""
+
+    x: float
+    """Stem base, in [m]."""
+    y: float
+    """Stem base, in [m]."""
+    yaw: float = 0.0
+    """Rotation about the vertical, in [rad]; at 0 the plant's -x side faces the robot."""
+
+    def __post_init__(self) -> None:
+        if not all(math.isfinite(v) for v in (self.x, self.y, self.yaw)):
+            raise InvalidInputError(f"plant_pose must be finite; got x={self.x}, y={self.y}, yaw={self.yaw}")
+        if not 0.3 <= math.hypot(self.x, self.y) <= 3.0:
+            raise InvalidInputError(
+                f"plant_pose must put the stem 0.3 to 3 m from the robot's base axis; got x={self.x}, y={self.y}"
+            )
+
+    @classmethod
+    def parse(cls, value: "PlantPose | Sequence[float] | None", default: "PlantPose") -> "PlantPose":
+        """A pose from None (the default) or `(x, y, yaw)` in [m, m, rad].
+
+        Raises:
+            InvalidInputError: The value is of another form or not finite.
+        """
+        if value is None:
+            return default
+        if isinstance(value, PlantPose):
+            return value
+        try:
+            numbers = [float(v) for v in value]
+        except (TypeError, ValueError):
+            numbers = []
+        if len(numbers) != 3:
+            raise InvalidInputError(
+                f"plant_pose must be three numbers (x [m], y [m], yaw [rad]); got {value!r}"
+            )
+        return cls(x=numbers[0], y=numbers[1], yaw=numbers[2])
+
+    def as_array(self) -> NDArray[np.float64]:
+        """(x, y, yaw). Shape (3,)."""
+        return np.array([self.x, self.y, self.yaw])
+
+
+ROW_PLANT = PlantSpec(preset="full", leaf_density=(0.8, 1.8), row=True)
+"""The kind of plant of the general tasks and their lists of episodes; a seed or a split says which."""

@@ -1,0 +1,1 @@
+"""Policies that choose the next viewpoint: planners, learned ones, exported ones."""

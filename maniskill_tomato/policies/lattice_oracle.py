@@ -1,0 +1,47 @@
+"""The nearest candidate of the lattice that truly shows the target: a cheap oracle, and a teacher for imitation."""
+
+import torch
+from torch import Tensor
+
+from maniskill_tomato.policies.base import GroundTruth, Planner
+from maniskill_tomato.policies.moves import Candidates, moves_needed
+from maniskill_tomato.robot.look_at import look_at_pose
+from maniskill_tomato.robot.look_at_move import MAX_MOVE
+from maniskill_tomato.sensing.belief import Belief
+
+
+class LatticeOracle(Planner):
+    """Goes to the reachable candidate above the threshold that the fewest moves reach, among those the nearest.
+
+    It knows the true V_f of the candidates alone, where the oracle knows that of any place; what it needs beyond the
+    oracle's moves is what the lattice costs. Where no candidate is good it goes to the best one.
+    """
+
+    name = "lattice_oracle"
+    needs_truth = True
+
+    def __init__(self, ground_truth: GroundTruth, threshold: float) -> None:
+        self._truth = ground_truth
+        self._threshold = threshold
+        self.tried = Candidates()
+        self.seen = torch.zeros(0, 0)
+        """True V_f of every candidate. Shape (B, K)."""
+
+    def begin(self, belief: Belief, env_idx: Tensor) -> None:
+        if self.seen.shape != belief.reachable.shape:
+            self.seen = torch.zeros(belief.reachable.shape, device=belief.reachable.device)
+        candidates = belief.lattice.positions(belief.target_position)
+        for i in env_idx.tolist():
+            poses = look_at_pose(candidates[i], belief.target_position[i])
+            self.seen[i] = self._truth.visible_fraction(poses, i)
+        self.tried.begin(belief, env_idx)
+
+    def act(self, belief: Belief) -> Tensor:
+        """Towards that candidate."""
+        position, target = belief.camera_position, belief.target_position
+        self.tried.note_refusals(belief)
+        candidates = belief.lattice.positions(target)
+        way = (candidates - position[:, None]).norm(dim=-1)
+        near = -moves_needed(way) - way / (1e3 * MAX_MOVE)
+        worth = torch.where(self.seen > self._threshold, near, self.seen - 1e3)
+        return self.tried.move_to_best(belief, candidates, worth, belief.reachable)

@@ -1,0 +1,133 @@
+"""A learned map of how good views are, and a search on it: the policy that looks where a full view is likely and near.
+
+The network has seen, for thousands of hidden tomatoes, what the memory knew after a few looks and how much of the
+target every candidate view would really have shown. At each step the policy moves towards the candidate with the
+largest P(full view) x `patience` - moves: with moves as the cost, `patience` is what it expects to need from here if
+a look fails, the rule that is best when looks succeed or fail independently and their number is not bounded.
+"""
+
+import math
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any, Final
+
+import torch
+from torch import Tensor
+
+from maniskill_tomato.errors import InvalidInputError
+from maniskill_tomato.policies.base import Planner
+from maniskill_tomato.policies.moves import Candidates, moves_needed
+from maniskill_tomato.policies.network_file import holds, load_network, save_network
+from maniskill_tomato.policies.quality_features import MAP_CHANNELS, SCALARS, quality_features
+from maniskill_tomato.policies.quality_network import ViewQualityNetwork
+from maniskill_tomato.sensing.belief import Belief
+from maniskill_tomato.sensing.view_lattice import DISTANCES
+
+FORMAT: Final = "view-quality-1"
+
+
+@dataclass(frozen=True, kw_only=True)
+class ViewQualityConfig:
+    """How the policy weighs."""
+
+    patience: float = 8.0
+    """Moves that are worth a certain full view."""
+
+    def __post_init__(self) -> None:
+        if not 0.0 < self.patience < math.inf:
+            raise InvalidInputError(f"patience must be a positive number, got {self.patience}")
+
+
+class ViewQuality(Planner):
+    """Moves towards the view that the network thinks most of."""
+
+    name = "view_quality"
+
+    def __init__(
+        self,
+        network: ViewQualityNetwork,
+        config: ViewQualityConfig | None = None,
+        facts: dict[str, Any] | None = None,
+    ) -> None:
+        """Keeps the network.
+
+        Args:
+            network: Judges the candidates.
+            config: How the policy weighs.
+            facts: Numbers and strings about its training.
+        """
+        self.network = network.eval().requires_grad_(False)
+        self.config = config or ViewQualityConfig()
+        self.facts = facts or {}
+        self.tried = Candidates()
+
+    @classmethod
+    def shipped(cls, device: str | torch.device = "cpu") -> "ViewQuality":
+        """The policy that ships with the package.
+
+        Raises:
+            InvalidInputError: None ships with this version.
+        """
+        from maniskill_tomato.assets import asset_path
+
+        try:
+            path = asset_path("policies/TomatoViewpoint-v1.pt")
+        except FileNotFoundError as error:
+            raise InvalidInputError(
+                "no view-quality policy ships with this version; train one with scripts/train_view_quality.py and give "
+                "its file"
+            ) from error
+        return load_view_quality(path, device)
+
+    def begin(self, belief: Belief, env_idx: Tensor) -> None:
+        self.tried.begin(belief, env_idx)
+
+    def success_probability(self, belief: Belief) -> Tensor:
+        """P(full view) of every candidate. Shape (B, K)."""
+        with torch.no_grad():
+            logits, _ = self.network(*quality_features(belief))
+        probability: Tensor = logits.flatten(1).sigmoid()
+        return probability
+
+    def act(self, belief: Belief) -> Tensor:
+        """Towards the best view."""
+        position, target = belief.camera_position, belief.target_position
+        self.tried.note_refusals(belief)
+        candidates = belief.lattice.positions(target)
+        way = (candidates - position[:, None]).norm(dim=-1)
+        worth = self.config.patience * self.success_probability(belief) - moves_needed(way)
+        return self.tried.move_to_best(belief, candidates, worth, belief.reachable)
+
+
+def save_view_quality(path: Path, policy: ViewQuality) -> None:
+    """Writes the network, the settings and the facts."""
+    network = policy.network
+    save_network(
+        path, FORMAT, network.sizes, network.state_dict(), config=asdict(policy.config), facts=policy.facts
+    )
+
+
+def load_view_quality(path: Path, device: str | torch.device = "cpu") -> ViewQuality:
+    """Reads what `save_view_quality` wrote.
+
+    Raises:
+        CheckpointError: The file is missing, damaged, or of something else.
+    """
+
+    def build(data: dict[str, Any]) -> tuple[ViewQuality, ViewQualityNetwork]:
+        network = ViewQualityNetwork(**data["sizes"])
+        return ViewQuality(network, ViewQualityConfig(**data["config"]), dict(data["facts"])), network
+
+    return load_network(
+        path, FORMAT, device, build, "view-quality policy; scripts/train_view_quality.py makes one"
+    )
+
+
+def is_view_quality(data: object) -> bool:
+    """Whether the content of a file is of `save_view_quality`."""
+    return holds(data, FORMAT)
+
+
+def new_network(width: int = 32, blocks: int = 3) -> ViewQualityNetwork:
+    """A fresh network for the features of `quality_features`."""
+    return ViewQualityNetwork(MAP_CHANNELS, SCALARS, DISTANCES, width, blocks)

@@ -1,1 +1,0 @@
-"""Trained policies away from the trainer: needs NumPy and ONNX Runtime, neither PyTorch nor ManiSkill."""

@@ -1,0 +1,1 @@
+"""Finding fruits in images: detectors, their data sets, training and metrics."""

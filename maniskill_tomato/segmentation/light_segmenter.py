@@ -1,0 +1,300 @@
+"""The light segmenter that ships: one small network, boxes, masks, ripeness and whole boxes in one pass on a CPU."""
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+from torch.nn import functional
+from torchvision.ops import nms
+
+from maniskill_tomato.assets import asset_path
+from maniskill_tomato.errors import CheckpointError, InvalidInputError
+from maniskill_tomato.segmentation.fruit_network import (
+    SIZE_MULTIPLE,
+    STRIDE,
+    FruitMaps,
+    FruitNetwork,
+    FruitNetworkConfig,
+    place_centres,
+)
+from maniskill_tomato.segmentation.fruit_session import FruitSession
+from maniskill_tomato.segmentation.instances import (
+    FRUIT_CATEGORIES,
+    TOMATO,
+    Image,
+    Instances,
+    box_ellipse,
+    joined,
+)
+from maniskill_tomato.segmentation.segmenter import check_image
+from maniskill_tomato.segmentation.weights import load_weights
+
+SHIPPED_WEIGHTS = "perception/light_segmenter.pt"
+
+MOST_FRUITS = 300
+"""Fruits that are looked at in one image, the best ones."""
+
+PADDING_COLOUR = 110.0
+
+THOROUGH: dict[str, Any] = {"scales": (1.5, 0.75, 0.4), "mirrored": True}
+"""Options for those who have time: finds more of the small fruits in 4.5 times the time."""
+
+COARSE_SIDES = (32.0, 192.0)
+"""Fruits with a side longer than the second, in [px] of the network's input, are left to the next smaller image, where
+those with a side shorter than the first are left out."""
+
+
+class LightSegmenter:
+    """A `Segmenter` over `FruitNetwork`; colours only, depth is not used."""
+
+    def __init__(
+        self,
+        network: FruitNetwork,
+        boxes_only: bool = False,
+        score_threshold: float = 0.3,
+        overlap_threshold: float = 0.55,
+        longest_side: int = 640,
+        scales: tuple[float, ...] = (1.0, 0.5),
+        mirrored: bool = False,
+    ) -> None:
+        """Takes a trained network.
+
+        Args:
+            network: As it is now; it is set to evaluation mode.
+            boxes_only: It was trained on boxes alone: its masks are the ellipses in its boxes, its fruits are all
+                `tomato`, and it tells no whole boxes.
+            score_threshold: Fruits below this are left out.
+            overlap_threshold: Of two boxes with a larger intersection over union only the better one stays.
+            longest_side: Larger images are made smaller first, in [px].
+            scales: Factors on the image's size at which it is looked at, falling: the network was trained on fruits of
+                limited size, so that a fruit close to the camera is found in a smaller image.
+            mirrored: Look at each mirror image too, in twice the time, and take the mean of what the network says.
+
+        Raises:
+            InvalidInputError: A threshold is not between 0 and 1, or the side is too short.
+        """
+        for name, value in (("score_threshold", score_threshold), ("overlap_threshold", overlap_threshold)):
+            if not 0 <= value <= 1:
+                raise InvalidInputError(f"{name} must be between 0 and 1, got {value}")
+        if longest_side < SIZE_MULTIPLE:
+            raise InvalidInputError(f"longest_side must be at least {SIZE_MULTIPLE} px, got {longest_side}")
+        if not scales or min(scales) <= 0 or list(scales) != sorted(scales, reverse=True):
+            raise InvalidInputError(f"scales must be positive and fall, got {scales}")
+        self.network = network
+        self._session = FruitSession(network)
+        self.boxes_only = boxes_only
+        self.score_threshold = score_threshold
+        self.overlap_threshold = overlap_threshold
+        self.longest_side = longest_side
+        self.scales = scales
+        self.mirrored = mirrored
+
+    def __call__(self, image: Image, depth_m: NDArray[np.float32] | None = None) -> Instances:
+        """The fruits in an image; see `Segmenter`."""
+        check_image(image, depth_m)
+        height, width = image.shape[:2]
+        largest = min(1.0, self.longest_side / max(height, width))
+        x = torch.from_numpy(np.ascontiguousarray(image)).permute(2, 0, 1)[None].float()
+        looks = []
+        with torch.inference_mode():
+            for number, scale in enumerate(self.scales):
+                found = self._look(x, largest * scale)
+                sides = (found.boxes[:, 2:] - found.boxes[:, :2]) * largest * scale
+                kept = np.ones(len(found), bool)
+                if number > 0:
+                    kept &= sides.min(axis=1, initial=np.inf) >= COARSE_SIDES[0]
+                if number + 1 < len(self.scales):
+                    kept &= sides.max(axis=1, initial=0) <= COARSE_SIDES[1]
+                looks.append(found.chosen(kept))
+        together = joined(looks)
+        boxes, scores = torch.from_numpy(together.boxes), torch.from_numpy(together.scores)
+        return together.chosen(nms(boxes, scores, self.overlap_threshold).numpy())
+
+    def _look(self, x: Tensor, factor: float) -> Instances:
+        """The fruits in an image (1, 3, H, W), seen at a factor of its size."""
+        height, width = x.shape[2:]
+        size = max(round(height * factor), 1), max(round(width * factor), 1)
+        if size != (height, width):
+            x = functional.interpolate(x, size, mode="bilinear", antialias=True, align_corners=False)
+        padding = [-size[1] % SIZE_MULTIPLE, -size[0] % SIZE_MULTIPLE]
+        x = functional.pad(x, (0, padding[0], 0, padding[1]), value=PADDING_COLOUR)
+        maps = self._session(x)
+        if self.mirrored:
+            maps = mean_of(maps, mirror(self._session(x.flip(3))))
+        found = find_fruits(maps, self.score_threshold, self.overlap_threshold)
+        scale = torch.tensor([width / size[1], height / size[0]] * 2)
+        limit = torch.tensor([width, height] * 2, dtype=torch.float32)
+        boxes = (found["boxes"] * scale).clamp(min=torch.zeros(4), max=limit)
+        kept = ((boxes[:, 2:] - boxes[:, :2]) >= 1).all(1)
+        boxes = boxes[kept]
+        whole = found["whole"][kept] * scale
+        if self.boxes_only:
+            masks = ellipses(boxes, height, width)
+        else:
+            fruit, votes = full_maps(maps, size, (height, width))
+            masks = split_by_votes(fruit, votes, boxes.numpy())
+        kinds = found["category"][kept].tolist()
+        return Instances(
+            boxes=boxes.numpy(),
+            scores=found["scores"][kept].numpy(),
+            categories=tuple(TOMATO if self.boxes_only else FRUIT_CATEGORIES[k] for k in kinds),
+            masks=masks,
+            amodal_boxes=None if self.boxes_only else enclosing(whole, boxes).numpy(),
+        )
+
+
+def mirror(maps: FruitMaps) -> FruitMaps:
+    """What the network says about the mirror image of an image, as of the image itself."""
+    centre, box, whole, category, fruit, vote = (part.flip(3) for part in maps)
+    sides = [2, 1, 0, 3]  # Left and right change places.
+    return FruitMaps(
+        centre,
+        box[:, sides],
+        whole[:, sides],
+        category,
+        fruit,
+        vote * torch.tensor([-1.0, 1.0])[:, None, None],
+    )
+
+
+def mean_of(a: FruitMaps, b: FruitMaps) -> FruitMaps:
+    """The mean of two opinions about one image."""
+    return FruitMaps(*((one + other) / 2 for one, other in zip(a, b, strict=True)))
+
+
+def full_maps(
+    maps: FruitMaps, size: tuple[int, int], full: tuple[int, int]
+) -> tuple[NDArray[np.bool_], NDArray[np.float32]]:
+    """Fruit pixels (H, W) and the centres they vote for (2, H, W), in the image's pixels.
+
+    Args:
+        maps: What the network says about the image made to `size` and padded.
+        size: Height and width without the padding, in [px].
+        full: Height and width of the image, in [px].
+    """
+    x, y = place_centres(maps.vote.shape[2], maps.vote.shape[3])
+    votes = torch.stack([x, y]) + maps.vote[0]
+    both = torch.cat([maps.fruit[0], votes])[None]
+    padded = both.shape[2] * STRIDE, both.shape[3] * STRIDE
+    both = functional.interpolate(both, padded, mode="bilinear", align_corners=False)
+    both = both[:, :, : size[0], : size[1]]
+    if size != full:
+        both = functional.interpolate(both, full, mode="bilinear", align_corners=False)
+    scale = torch.tensor([full[1] / size[1], full[0] / size[0]])
+    return (both[0, 0] > 0).numpy(), (both[0, 1:] * scale[:, None, None]).numpy()
+
+
+def open_light(
+    weights: Path | str | None = None,
+    score_threshold: float = 0.3,
+    overlap_threshold: float = 0.55,
+    longest_side: int = 640,
+    scales: tuple[float, ...] = (1.0, 0.5),
+    mirrored: bool = False,
+) -> LightSegmenter:
+    """Opens the shipped weights, or those in a file.
+
+    Raises:
+        CheckpointError: The file is missing, damaged or of something else.
+        InvalidInputError: A threshold is out of its range.
+    """
+    try:
+        path = Path(weights) if weights is not None else asset_path(SHIPPED_WEIGHTS)
+    except FileNotFoundError as error:
+        raise CheckpointError(
+            f"the shipped weights are missing: {error}; install the package again"
+        ) from error
+    data = load_weights(path, "light")
+    try:
+        network = FruitNetwork(FruitNetworkConfig.from_dict(data["config"]))
+        network.load_state_dict(data["state"])
+    except (TypeError, RuntimeError) as error:
+        raise CheckpointError(
+            f"{path} does not fit this version's network ({str(error).splitlines()[0]})"
+        ) from error
+    boxes_only = bool(data["training"].get("boxes_only", False))
+    return LightSegmenter(
+        network, boxes_only, score_threshold, overlap_threshold, longest_side, scales, mirrored
+    )
+
+
+def find_fruits(maps: FruitMaps, score_threshold: float, overlap_threshold: float) -> dict[str, Tensor]:
+    """Fruits at the local maxima of the first image's heat map, best first.
+
+    Returns:
+        boxes (N, 4) and whole (N, 4) as left, top, right, bottom in the network's [px], scores (N,), category (N,).
+    """
+    heat = maps.centre[0, 0].sigmoid()
+    peak = functional.max_pool2d(heat[None, None], 3, 1, 1)[0, 0] == heat
+    scores = torch.where(peak, heat, torch.zeros_like(heat)).flatten()
+    scores, places = scores.topk(min(MOST_FRUITS, scores.numel()))
+    chosen = scores >= max(score_threshold, 1e-6)
+    scores, places = scores[chosen], places[chosen]
+    x, y = (c.flatten()[places] for c in place_centres(heat.shape[0], heat.shape[1]))
+
+    def corners(distances: Tensor) -> Tensor:
+        left, top, right, bottom = distances[0].flatten(1)[:, places]
+        return torch.stack([x - left, y - top, x + right, y + bottom], dim=1)
+
+    boxes = corners(maps.box)
+    kept = nms(boxes, scores, overlap_threshold)
+    return {
+        "boxes": boxes[kept],
+        "whole": corners(maps.whole)[kept],
+        "scores": scores[kept],
+        "category": maps.category[0].flatten(1)[:, places].argmax(0)[kept],
+    }
+
+
+def split_by_votes(
+    fruit: NDArray[np.bool_], votes: NDArray[np.float32], boxes: NDArray[np.float32], margin: float = 0.1
+) -> NDArray[np.bool_]:
+    """Gives each fruit pixel to the fruit, among those whose box it lies in, whose centre its vote is nearest to.
+
+    Distances count in sizes of the box. A fruit without a pixel gets the ellipse in its box.
+
+    Args:
+        fruit: Pixels of any fruit. Shape (H, W).
+        votes: Where each says that its fruit is centred, x and y in [px]. Shape (2, H, W).
+        boxes: Left, top, right, bottom of each fruit in [px]. Shape (N, 4).
+        margin: Share of its size by which a box is widened on each side.
+
+    Returns:
+        Masks of shape (N, H, W).
+    """
+    height, width = fruit.shape
+    nearest = np.full((height, width), np.inf, np.float32)
+    owner = np.full((height, width), -1)
+    for index, (left, top, right, bottom) in enumerate(boxes):
+        size_x, size_y = right - left, bottom - top
+        rows = slice(max(int(top - margin * size_y), 0), min(int(np.ceil(bottom + margin * size_y)), height))
+        columns = slice(
+            max(int(left - margin * size_x), 0), min(int(np.ceil(right + margin * size_x)), width)
+        )
+        to_x = (votes[0, rows, columns] - (left + right) / 2) / size_x
+        to_y = (votes[1, rows, columns] - (top + bottom) / 2) / size_y
+        distance = to_x**2 + to_y**2
+        closer = distance < nearest[rows, columns]
+        nearest[rows, columns][closer] = distance[closer]
+        owner[rows, columns][closer] = index
+    masks: NDArray[np.bool_] = (owner[None] == np.arange(len(boxes))[:, None, None]) & fruit
+    for empty in np.flatnonzero(~masks.any(axis=(1, 2))).tolist():
+        masks[empty] = box_ellipse(boxes[empty], height, width)
+    return masks
+
+
+def ellipses(boxes: Tensor, height: int, width: int) -> NDArray[np.bool_]:
+    """The ellipses in boxes. Shape (N, H, W)."""
+    return np.array([box_ellipse(box, height, width) for box in boxes.numpy()], bool).reshape(
+        -1, height, width
+    )
+
+
+def enclosing(whole: Tensor, visible: Tensor) -> Tensor:
+    """Whole boxes, widened where the visible ones reach further. Shape (N, 4)."""
+    return torch.cat(
+        [torch.minimum(whole[:, :2], visible[:, :2]), torch.maximum(whole[:, 2:], visible[:, 2:])], dim=1
+    )

@@ -1,0 +1,156 @@
+"""Mask R-CNN (He et al., 2017) as torchvision builds it, with the thesis's settings.
+
+Deviations from the thesis, whose implementation was in Keras: torchvision initialises its heads and samples its regions
+in its own way, and pads with the mean colour's zero; without pretrained weights the backbone's batch normalisation is
+trained, since frozen statistics of random weights mean nothing.
+"""
+
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+from torchvision.models import mobilenet_v3_large
+from torchvision.models.detection import MaskRCNN
+from torchvision.models.detection.anchor_utils import AnchorGenerator
+from torchvision.models.detection.backbone_utils import BackboneWithFPN, resnet_fpn_backbone
+from torchvision.models.detection.faster_rcnn import FastRCNNPredictor
+from torchvision.models.detection.mask_rcnn import MaskRCNNHeads, MaskRCNNPredictor
+from torchvision.ops import MultiScaleRoIAlign
+from torchvision.ops.feature_pyramid_network import FeaturePyramidNetwork, LastLevelMaxPool
+from torchvision.ops.misc import FrozenBatchNorm2d
+
+from maniskill_tomato.errors import MissingWeightsError
+from maniskill_tomato.segmentation.efficientnet_lite import FEATURE_WIDTHS, FIXED_BLOCKS, EfficientNetLite0
+from maniskill_tomato.segmentation.training.detector_presets import MaskRcnnConfig
+
+ASPECT_RATIOS = (0.5, 1.0, 2.0)
+"""Height over width of the anchors; the implementation that the thesis built on has these."""
+
+LIGHT_WIDTH = 96
+"""Channels of the light pyramid."""
+
+MOBILENET_LAYERS = {"2": "0", "4": "1", "7": "2", "13": "3"}
+"""Blocks of MobileNetV3 (large) whose output has strides 4, 8, 16 and 32."""
+
+
+class Lite0Pyramid(nn.Module):
+    """EfficientNet-Lite0 under a light pyramid; takes colours from 0 to 255."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.body = EfficientNetLite0()
+        self.out_channels = LIGHT_WIDTH
+        self.fpn = FeaturePyramidNetwork(
+            list(FEATURE_WIDTHS), LIGHT_WIDTH, extra_blocks=LastLevelMaxPool(), norm_layer=nn.BatchNorm2d
+        )
+
+    def forward(self, image: Tensor) -> dict[str, Tensor]:
+        """Features by level. Shape (B, 3, H, W) to five of (B, `LIGHT_WIDTH`, h, w)."""
+        features: dict[str, Tensor] = self.fpn({str(i): f for i, f in enumerate(self.body(image))})
+        return features
+
+
+class BoxHead(nn.Module):
+    """Two fully connected layers, each with dropout after it (4-2-3)."""
+
+    def __init__(self, inputs: int, width: int, dropout: float) -> None:
+        super().__init__()
+        self.layers = nn.Sequential(
+            nn.Flatten(),
+            nn.Linear(inputs, width),
+            nn.ReLU(inplace=True),
+            nn.Dropout(dropout),
+            nn.Linear(width, width),
+            nn.ReLU(inplace=True),
+            nn.Dropout(dropout),
+        )
+
+    def forward(self, regions: Tensor) -> Tensor:
+        """Features of regions. Shape (N, C, 7, 7) to (N, width)."""
+        features: Tensor = self.layers(regions)
+        return features
+
+
+def build_mask_rcnn(config: MaskRcnnConfig, pretrained: bool = False) -> MaskRCNN:
+    """A network with random weights, or on a backbone with ImageNet weights.
+
+    Args:
+        config: Its settings.
+        pretrained: Download the backbone's weights; those of EfficientNet-Lite0 come from an installed package.
+
+    Raises:
+        MissingWeightsError: They cannot be downloaded.
+        MissingPackageError: The package is not installed.
+    """
+    try:
+        backbone = _backbone(config, pretrained)
+    except OSError as error:
+        raise MissingWeightsError(
+            f"the ImageNet weights of {config.backbone} cannot be downloaded ({error}); "
+            "train from random weights, or put them into torchvision's cache"
+        ) from error
+    lite0 = config.backbone == "efficientnet_lite0"
+    light = lite0 or config.backbone == "mobilenet"
+    width = LIGHT_WIDTH if light else 256
+    representation = 256 if light else 1024
+    classes = len(config.categories) + 1
+    levels = ["0", "1", "2", "3"]
+    return MaskRCNN(
+        backbone,
+        min_size=config.shortest_side,
+        max_size=config.longest_side,
+        image_mean=[0.0] * 3 if lite0 else None,
+        image_std=[1 / 255] * 3 if lite0 else None,
+        # A square of the longest side, so that several pictures fit one batch.
+        size_divisible=config.longest_side if config.longest_side % 32 == 0 else 32,
+        rpn_anchor_generator=AnchorGenerator(
+            tuple((side,) for side in config.anchor_sides), (ASPECT_RATIOS,) * len(config.anchor_sides)
+        ),
+        rpn_nms_thresh=config.proposal_nms,
+        rpn_pre_nms_top_n_train=500 if light else 2000,
+        rpn_post_nms_top_n_train=500 if light else 2000,
+        rpn_pre_nms_top_n_test=500 if light else 1000,
+        rpn_post_nms_top_n_test=300 if light else 1000,
+        box_head=BoxHead(width * 7 * 7, representation, config.dropout),
+        box_predictor=FastRCNNPredictor(representation, classes),
+        box_score_thresh=config.least_confidence,
+        box_batch_size_per_image=config.rois_per_image,
+        mask_roi_pool=MultiScaleRoIAlign(levels, 14, 2),
+        mask_head=MaskRCNNHeads(width, (width,) * (2 if light else 4), 1),
+        mask_predictor=MaskRCNNPredictor(width, width, classes),
+    )
+
+
+def _backbone(config: MaskRcnnConfig, pretrained: bool) -> nn.Module:
+    """Features at strides 4 to 32, and one more level by pooling."""
+    if config.backbone == "efficientnet_lite0":
+        pyramid = Lite0Pyramid()
+        if pretrained:
+            pyramid.body.load_imagenet()
+            pyramid.body.keep_fixed(FIXED_BLOCKS)
+        return pyramid
+    weights: Any = "IMAGENET1K_V1" if pretrained else None
+    if config.backbone != "mobilenet":
+        residual: nn.Module = resnet_fpn_backbone(
+            backbone_name=config.backbone,
+            weights=weights,
+            norm_layer=FrozenBatchNorm2d if pretrained else nn.BatchNorm2d,
+            trainable_layers=5,
+        )
+        return residual
+    features = mobilenet_v3_large(weights=weights).features
+    with torch.no_grad():
+        channels, x = {}, torch.zeros(1, 3, 64, 64)
+        for name, block in features.eval().named_children():
+            x = block(x)
+            channels[name] = x.shape[1]
+    features.train()
+    mobile: nn.Module = BackboneWithFPN(
+        features,
+        MOBILENET_LAYERS,
+        [channels[name] for name in MOBILENET_LAYERS],
+        LIGHT_WIDTH,
+        extra_blocks=LastLevelMaxPool(),
+        norm_layer=nn.BatchNorm2d,
+    )
+    return mobile

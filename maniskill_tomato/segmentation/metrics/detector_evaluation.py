@@ -1,0 +1,110 @@
+"""How good a segmenter is on annotated images: numbers, curves, pictures."""
+
+import time
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from maniskill_tomato.errors import InvalidInputError
+from maniskill_tomato.segmentation.datasets.annotations import BEHIND, AnnotatedImage
+from maniskill_tomato.segmentation.instances import Image
+from maniskill_tomato.segmentation.metrics.coco_metrics import CocoScore
+from maniskill_tomato.segmentation.metrics.detection_metrics import (
+    DetectionScore,
+    Overlap,
+    PrecisionRecall,
+    image_truth,
+    without_narrow,
+)
+from maniskill_tomato.segmentation.metrics.detection_plots import plot_precision_recall
+from maniskill_tomato.segmentation.pictures import contact_sheet, draw_instances, write_picture
+from maniskill_tomato.segmentation.segmenter import Segmenter
+from maniskill_tomato.segmentation.training.training_pictures import SMALLEST_SHARE
+
+PICTURES = 16
+"""Images on the sheet of results."""
+
+WORKING_SCORE = 0.3
+"""Score above which precision and recall are also given."""
+
+
+def evaluate_segmenter(
+    segmenter: Segmenter,
+    images: Sequence[AnnotatedImage],
+    out: Path,
+    limit: int | None = None,
+    smallest_share: float = SMALLEST_SHARE,
+) -> dict[str, float]:
+    """Runs a segmenter over images and compares with their annotation; all fruits count, ripe or not.
+
+    Writes `precision_recall.png` (Fig. 4-20, 4-24) and `pictures.jpg` (Fig. 4-21 to 4-27). Masks are compared if every
+    image has them.
+
+    Args:
+        segmenter: What to judge.
+        images: Annotated images.
+        out: Folder of the figures.
+        limit: Look at this many images only, spread evenly.
+        smallest_share: Rendered fruits narrower than this share of the image's longer side are set aside, and
+            narrower detections where there is no other fruit.
+
+    Returns:
+        `box_AP50` and `mask_AP50` (Eq. 4-3 at an overlap of 0.5), precision and recall at `WORKING_SCORE`, COCO's
+        metrics as `coco_box_...` and `coco_mask_...`, counts, seconds an image; in rendered images with rows behind
+        also `front_box_AP50` and `front_mask_AP50`, of the fruits of the row in front alone.
+
+    Raises:
+        InvalidInputError: There is no image, or one cannot be read.
+        MissingPackageError: pycocotools is not installed.
+    """
+    if not images:
+        raise InvalidInputError("there must be annotated images to evaluate on")
+    if limit is not None:
+        images = [images[i] for i in np.linspace(0, len(images) - 1, min(limit, len(images))).astype(int)]
+    sheet = set(np.linspace(0, len(images) - 1, min(PICTURES, len(images))).astype(int).tolist())
+    drawn: list[Image] = []
+    with_masks = all(f.visible_mask is not None for image in images for f in image.fruits)
+    overlaps: tuple[Overlap, ...] = ("box", "mask") if with_masks else ("box",)
+    scores: dict[Overlap, DetectionScore] = {overlap: DetectionScore(overlap) for overlap in overlaps}
+    coco = {overlap: CocoScore(overlap) for overlap in overlaps}
+    with_rows = any((f.name or "").startswith(BEHIND) for image in images for f in image.fruits)
+    front = {overlap: DetectionScore(overlap) for overlap in overlaps} if with_rows else {}
+    seconds = []
+    for number, image in enumerate(images):
+        picture = image.load()
+        depth = image.load_depth()
+        start = time.perf_counter()
+        found = segmenter(picture, None if depth is None else depth.astype(np.float32))
+        seconds.append(time.perf_counter() - start)
+        truth = image_truth(image, smallest_share)
+        counted = without_narrow(found, truth)
+        for overlap in overlaps:
+            scores[overlap].add(counted, truth)
+            coco[overlap].add(counted, truth)
+        nearby = image_truth(image, smallest_share, rows_behind=False)
+        for score in front.values():
+            score.add(without_narrow(found, nearby), nearby)
+        if number in sheet:
+            drawn.append(draw_instances(picture, found, WORKING_SCORE))
+    metrics: dict[str, float] = {"images": len(images), "fruits": scores["box"].fruits}
+    curves: dict[str, PrecisionRecall] = {}
+    for overlap, score in scores.items():
+        curve = score.precision_recall()
+        precision, recall = curve.at_score(WORKING_SCORE)
+        curves[overlap] = curve
+        metrics |= {
+            f"{overlap}_AP50": curve.average_precision,
+            f"{overlap}_precision": precision,
+            f"{overlap}_recall": recall,
+        }
+        metrics |= {f"coco_{overlap}_{k}": v for k, v in coco[overlap].metrics().items()}
+    for overlap, score in front.items():
+        metrics |= {
+            "front_fruits": score.fruits,
+            f"front_{overlap}_AP50": score.precision_recall().average_precision,
+        }
+    metrics["median_seconds"] = float(np.median(seconds))
+    plot_precision_recall(curves, out / "precision_recall.png")
+    write_picture(out / "pictures.jpg", contact_sheet(drawn))
+    return metrics

@@ -1,0 +1,128 @@
+"""Segmenters: an image goes in, fruits come out.
+
+`make_segmenter` opens one by its name or by the file of its weights.
+"""
+
+import importlib
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, Protocol, cast
+
+import numpy as np
+from numpy.typing import NDArray
+
+from maniskill_tomato.errors import CheckpointError, InvalidInputError
+from maniskill_tomato.segmentation.instances import Image, Instances
+
+SEGMENTERS = {
+    "light": "maniskill_tomato.segmentation.light_segmenter:open_light",
+    "colour": "maniskill_tomato.segmentation.colour_segmenter:open_colour",
+    "ground_truth": "maniskill_tomato.segmentation.ground_truth_segmenter:open_ground_truth",
+    "mask_rcnn": "maniskill_tomato.segmentation.mask_rcnn_segmenter:open_mask_rcnn",
+    "yolo": "maniskill_tomato.segmentation.yolo:open_yolo",
+}
+"""Name of each kind of segmenter, and the function that opens it."""
+
+DEFAULT_SEGMENTER = "light"
+
+
+class Segmenter(Protocol):
+    """Finds fruits in images."""
+
+    def __call__(self, image: Image, depth_m: NDArray[np.float32] | None = None) -> Instances:
+        """The fruits in an image.
+
+        Args:
+            image: Colours red, green, blue. Shape (H, W, 3).
+            depth_m: Depth of each pixel in [m], 0 or NaN where unknown. Shape (H, W).
+
+        Raises:
+            InvalidInputError: The image or the depth has another shape or type.
+        """
+        ...
+
+
+def make_segmenter(name_or_path: str | Path = DEFAULT_SEGMENTER, **options: Any) -> Segmenter:
+    """Opens a segmenter.
+
+    Args:
+        name_or_path: A name from `SEGMENTERS`, or a file of weights (`.pt`), which says what it is for.
+        **options: What this kind of segmenter takes, for instance `score_threshold`.
+
+    Raises:
+        InvalidInputError: There is no segmenter of this name, and no such file, or an option is not one of its.
+        CheckpointError: The file of weights is missing or damaged.
+        MissingPackageError: It needs a package that is not installed.
+    """
+    name = str(name_or_path)
+    if name not in SEGMENTERS:
+        path = Path(name)
+        if not path.suffix and not path.exists():
+            raise InvalidInputError.choice("segmenter", name, [*SEGMENTERS, "FILE.pt"])
+        options["weights"] = path
+        name = weights_kind(path)
+        if name not in SEGMENTERS:
+            raise CheckpointError(f"{path} is for a segmenter {name!r}, which this version does not know")
+    module, function = SEGMENTERS[name].split(":")
+    opener = cast(Callable[..., Segmenter], getattr(importlib.import_module(module), function))
+    try:
+        return opener(**options)
+    except TypeError as error:
+        if "unexpected keyword" not in str(error) and "required" not in str(error):
+            raise
+        raise InvalidInputError(f"segmenter {name!r}: {str(error).split('() ', 1)[-1]}") from error
+
+
+def open_for_files(name: str, score_threshold: float, thorough: bool) -> Segmenter:
+    """Opens a segmenter that looks at images in files, where there is no hurry.
+
+    Args:
+        name: Name of a segmenter, or a file of weights.
+        score_threshold: Least score, of segmenters that give scores.
+        thorough: Whether the light segmenter looks at each image more often.
+
+    Raises:
+        InvalidInputError: There is no such segmenter, or the threshold is out of its range.
+        CheckpointError: The weights are missing or damaged.
+        MissingPackageError: The segmenter needs a package that is not installed.
+    """
+    options: dict[str, Any] = {} if name == "colour" else {"score_threshold": score_threshold}
+    if thorough and (name == "light" or (Path(name).is_file() and weights_kind(Path(name)) == "light")):
+        from maniskill_tomato.segmentation.light_segmenter import THOROUGH
+
+        options |= THOROUGH
+    return make_segmenter(name, **options)
+
+
+def weights_kind(path: Path) -> str:
+    """Which segmenter a file of weights is for: what it says, or `yolo` for a file that Ultralytics wrote.
+
+    Raises:
+        CheckpointError: The file is missing or damaged.
+    """
+    from maniskill_tomato.segmentation.weights import read_kind
+
+    return read_kind(path)
+
+
+def check_image(image: Image, depth_m: NDArray[np.float32] | None = None) -> None:
+    """Accepts an image that a segmenter can work on.
+
+    Raises:
+        InvalidInputError: A shape or a type is another one than `Segmenter` documents.
+    """
+    if not isinstance(image, np.ndarray) or image.ndim != 3 or image.shape[2] != 3 or image.dtype != np.uint8:
+        shape = getattr(image, "shape", None)
+        raise InvalidInputError(
+            "an image must have shape (H, W, 3), red, green, blue, as uint8 from 0 to 255; "
+            f"got shape {shape} of {getattr(image, 'dtype', type(image).__name__)}"
+        )
+    if image.size == 0:
+        raise InvalidInputError(f"an image must have pixels; got shape {image.shape}")
+    if depth_m is not None and (
+        depth_m.shape != image.shape[:2] or not np.issubdtype(depth_m.dtype, np.floating)
+    ):
+        raise InvalidInputError(
+            f"depth must be floats in [m] of the image's shape {image.shape[:2]}; "
+            f"got shape {depth_m.shape} of {depth_m.dtype}"
+        )

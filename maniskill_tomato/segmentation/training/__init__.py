@@ -1,0 +1,1 @@
+"""Training of the detectors: pictures, augmentation, presets, resumable loops."""

@@ -1,0 +1,1 @@
+"""Estimators of the visible fraction from an image with depth and masks."""

@@ -1,0 +1,115 @@
+"""What every occlusion model takes and gives."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from maniskill_tomato.errors import InvalidInputError
+from maniskill_tomato.robot.d435 import CameraIntrinsics
+from maniskill_tomato.segmentation.masks import BinaryMask
+
+Float64 = NDArray[np.float64]
+UInt8 = NDArray[np.uint8]
+
+
+@dataclass(frozen=True, kw_only=True)
+class TomatoView:
+    """One image of tomatoes, checked."""
+
+    rgb: UInt8
+    """Shape (height, width, 3)."""
+    depth_m: Float64
+    """Along the optical axis, in [m]; 0 where there is no measurement. Shape (height, width)."""
+    masks: tuple[BinaryMask, ...]
+    """The visible pixels of each detected tomato. Each of shape (height, width)."""
+    intrinsics: CameraIntrinsics
+    """The colour camera's; the depth is aligned to it."""
+
+    def __post_init__(self) -> None:
+        if self.rgb.dtype != np.uint8 or self.rgb.ndim != 3 or self.rgb.shape[2] != 3 or self.rgb.size == 0:
+            raise InvalidInputError(
+                f"rgb must be a uint8 image of shape (height, width, 3), got {self.rgb.dtype} {self.rgb.shape}"
+            )
+        shape = self.rgb.shape[:2]
+        if self.depth_m.shape != shape or not np.issubdtype(self.depth_m.dtype, np.floating):
+            raise InvalidInputError(
+                f"depth_m must be a floating-point image of shape {shape}, in metres; "
+                f"got {self.depth_m.dtype} {self.depth_m.shape}"
+            )
+        for mask in self.masks:
+            if mask.shape != shape or mask.dtype != np.bool_:
+                raise InvalidInputError(
+                    f"a mask must be a boolean image of shape {shape}, got {mask.dtype} {mask.shape}"
+                )
+        if (self.intrinsics.height, self.intrinsics.width) != shape:
+            raise InvalidInputError(
+                f"the intrinsics are for {self.intrinsics.width} x {self.intrinsics.height} pixels, "
+                f"the image has {shape[1]} x {shape[0]}"
+            )
+        # NaN and infinity are what some drivers give where nothing was measured.
+        sane = np.where(np.isfinite(self.depth_m) & (self.depth_m > 0), self.depth_m, 0.0)
+        object.__setattr__(self, "depth_m", np.asarray(sane, dtype=np.float64))
+
+
+@dataclass(frozen=True, kw_only=True)
+class Estimate:
+    """What is known of one tomato; NaN fields and no mask where the model found nothing."""
+
+    visible: float
+    """V: visible pixels."""
+    total: float
+    """T: pixels of the whole silhouette."""
+    whole: BinaryMask | None
+    """The whole silhouette inside the image. Shape (height, width)."""
+    centre_optical: tuple[float, float, float] | None = None
+    """The tomato's centre in the optical frame, in [m], if the model knows it."""
+
+    @property
+    def visible_fraction(self) -> float:
+        """V_f = V / T (Eq. 4-4), at most 1; NaN where the model failed."""
+        if not self.total > 0:
+            return float("nan")
+        return min(self.visible / self.total, 1.0)
+
+    @classmethod
+    def failed(cls) -> "Estimate":
+        """Nothing could be said."""
+        return cls(visible=float("nan"), total=float("nan"), whole=None)
+
+
+class OcclusionModel(Protocol):
+    """From an image to one estimate for each of its masks, in their order."""
+
+    def __call__(self, view: TomatoView) -> Sequence[Estimate]:
+        """Estimates V and T of every mask."""
+        ...
+
+
+def fruit_depth(depth_m: Float64, mask: BinaryMask) -> float:
+    """The median depth of a mask's pixels, in [m]; NaN without a measurement."""
+    values = depth_m[mask]
+    values = values[values > 0]
+    return float(np.median(values)) if len(values) else float("nan")
+
+
+def filled_depth(depth_m: Float64) -> Float64:
+    """Depth without holes: each takes the farther of the nearest measurements beside it in its row.
+
+    A D435's holes beside an edge are the shadow of the nearer side, so that they show the farther one.
+    """
+    valid = depth_m > 0
+    width = depth_m.shape[1]
+    columns = np.arange(width, dtype=np.int32)[None]
+    left = np.maximum.accumulate(np.where(valid, columns, np.int32(-1)), axis=1)
+    right = np.minimum.accumulate(np.where(valid, columns, np.int32(width))[:, ::-1], axis=1)[:, ::-1]
+    filled = np.array(depth_m, dtype=np.float64)
+    rows, holes = np.nonzero(~valid)
+    from_left, from_right = left[rows, holes], right[rows, holes]
+    filled[rows, holes] = np.maximum(
+        np.where(from_left >= 0, depth_m[rows, np.maximum(from_left, 0)], 0.0),
+        np.where(from_right < width, depth_m[rows, np.minimum(from_right, width - 1)], 0.0),
+    )
+    return filled

@@ -1,0 +1,110 @@
+"""The thesis's own proposals (6-2) on its occlusion model.
+
+Each tomato is handled in a window of its own, with kernels from its size in pixels; only leaves in front of it count;
+touching tomatoes are separated by a watershed from their masks.
+"""
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+from maniskill_tomato.errors import InvalidInputError
+from maniskill_tomato.segmentation.masks import BinaryMask
+from maniskill_tomato.sensing.visible_fraction import steps
+from maniskill_tomato.sensing.visible_fraction.estimate import (
+    Estimate,
+    Float64,
+    TomatoView,
+    UInt8,
+    filled_depth,
+    fruit_depth,
+)
+
+
+@dataclass(frozen=True, kw_only=True)
+class ImprovedConfig:
+    """Sizes relative to the tomato's own, in place of pixels."""
+
+    diameter_m: float = 0.058
+    """Diameter of a tomato, in [m]; with its depth it gives the size in pixels that all kernels follow."""
+    kernel_share: float = 0.5
+    """Width of the kernel that bridges occluders over that size."""
+    margin: float = 0.75
+    """The window reaches so many diameters beyond the mask."""
+    behind_share: float = 0.5
+    """How far behind the tomato's own depth a pixel is background, in diameters."""
+
+    def __post_init__(self) -> None:
+        for name in ("diameter_m", "kernel_share", "margin", "behind_share"):
+            if not getattr(self, name) > 0:
+                raise InvalidInputError(f"{name} must be positive, got {getattr(self, name)}")
+
+
+class ImprovedModel:
+    """The thesis's chain with kernels by size, occluders by depth and a watershed."""
+
+    def __init__(self, config: ImprovedConfig | None = None) -> None:
+        """Keeps the constants."""
+        self.config = config or ImprovedConfig()
+
+    def __call__(self, view: TomatoView) -> list[Estimate]:
+        """Estimates V and T of every mask; one without depth has failed."""
+        depth = filled_depth(view.depth_m)
+        return [self._one(view, depth, k) for k in range(len(view.masks))]
+
+    def _one(self, view: TomatoView, depth: Float64, k: int) -> Estimate:
+        c, mask = self.config, view.masks[k]
+        own = fruit_depth(view.depth_m, mask)
+        if not np.isfinite(own):
+            return Estimate.failed()
+        size = c.diameter_m * view.intrinsics.fx / own
+        rows, columns = np.flatnonzero(mask.any(1)), np.flatnonzero(mask.any(0))
+        reach = int(np.ceil(c.margin * size))
+        window = (
+            slice(max(rows[0] - reach, 0), rows[-1] + reach + 1),
+            slice(max(columns[0] - reach, 0), columns[-1] + reach + 1),
+        )
+        here, z = mask[window], depth[window]
+        others = [m[window] for j, m in enumerate(view.masks) if j != k and m[window].any()]
+        in_front = (z > 0) & (z < own + 0.1 * c.diameter_m) & ~here
+        allowed = here | in_front
+        grown = self._bridged(here, allowed, size)
+        if others:
+            grown = _separated(view.rgb[window], grown, here, others)
+        pieces = steps.outlines(grown, 1.0)
+        if not pieces:
+            return Estimate.failed()
+        ellipse = steps.fit_ellipse(np.asarray(cv2.convexHull(np.concatenate(pieces)), np.int32))
+        inside = steps.fill_ellipse(ellipse, here.shape) if ellipse is not None else grown
+        inside = steps.remove_deeper(inside, z, own + c.behind_share * c.diameter_m)
+        for other in others:
+            # A touching tomato is not part of this one unless it is the nearer of the two.
+            theirs = fruit_depth(depth[window], other)
+            if not theirs < own:
+                inside[other] = 0
+        whole = np.zeros(mask.shape, dtype=bool)
+        whole[window] = (inside > 0) | here
+        return Estimate(visible=int(np.count_nonzero(mask)), total=int(np.count_nonzero(whole)), whole=whole)
+
+    def _bridged(self, here: BinaryMask, allowed: BinaryMask, size: float) -> UInt8:
+        width = max(3, round(self.config.kernel_share * size) | 1)
+        kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (width, width))
+        padded = cv2.copyMakeBorder(
+            here.astype(np.uint8) * 255, width, width, width, width, cv2.BORDER_CONSTANT
+        )
+        closed = cv2.morphologyEx(padded, cv2.MORPH_CLOSE, kernel)[width:-width, width:-width]
+        return np.asarray(np.where(allowed, closed, 0), dtype=np.uint8)
+
+
+def _separated(rgb: UInt8, grown: UInt8, here: BinaryMask, others: list[BinaryMask]) -> UInt8:
+    """The part of a grown mask that a watershed gives to its own seed and not to other tomatoes."""
+    markers = np.zeros(here.shape, dtype=np.int32)
+    reached = grown > 0
+    for other in others:
+        markers[other] = 2
+        reached = reached | other
+    markers[~reached] = 3
+    markers[here] = 1
+    cv2.watershed(np.ascontiguousarray(rgb), markers)
+    return np.asarray(((markers == 1) | here).astype(np.uint8) * 255)

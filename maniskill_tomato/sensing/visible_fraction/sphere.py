@@ -1,0 +1,361 @@
+"""An amodal model without learning: each tomato is a sphere, found from its outline and its depth.
+
+The edge of a visible mask is the tomato's own outline where the image gets deeper beyond it, and an occluder's where it
+gets nearer. A circle (the sphere's silhouette) must pass through the former, hold all pixels of the mask, leave out
+background that is seen beside the tomato, and bulge towards the camera as the depth does; a prior on the radius in
+metres decides what remains open. T counts the mask and those pixels of the circle that something nearer hides or that
+lie outside the image, so that a tomato that is not quite round but wholly visible gets V_f = 1.
+"""
+
+from dataclasses import dataclass, replace
+from functools import lru_cache
+from typing import Any, Final
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from maniskill_tomato.errors import InvalidInputError
+from maniskill_tomato.segmentation.masks import BinaryMask
+from maniskill_tomato.sensing.visible_fraction.estimate import (
+    Estimate,
+    Float64,
+    TomatoView,
+    filled_depth,
+    fruit_depth,
+)
+
+Floats = NDArray[np.floating[Any]]
+
+SAMPLES: Final = 64
+"""Points of each kind that a circle is judged by."""
+
+ROUNDS: Final = 4
+"""Rounds of the cross-entropy search for the best circle (Rubinstein 1999)."""
+
+DRAWS: Final = 64
+"""Circles drawn in each round."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class SphereConfig:
+    """What is known of tomatoes beforehand, and how much each kind of evidence weighs."""
+
+    radius_m: float = 0.026
+    """Median radius of tomatoes before an image is seen, in [m]."""
+    radius_spread: float = 0.4
+    """Standard deviation of the logarithm of the radius, over all crops."""
+    crop_spread: float = 0.15
+    """The same within one crop: tomatoes with a clear outline say how large the others in their image are."""
+    clear_share: float = 0.6
+    """Share of the outline that must be seen for that."""
+    edge_step_m: float = 0.012
+    """By how much the image must get deeper beyond the mask's edge for it to be the tomato's own outline, in [m]."""
+    edge_error: float = 0.03
+    """Standard deviation of the outline about a circle, in radii: tomatoes are not quite round."""
+    inside_error: float = 0.03
+    """The same for pixels of the mask outside the circle, and for background inside."""
+    depth_error_m: float = 0.003
+    """Standard deviation of the depth about the sphere, in [m]."""
+
+    def __post_init__(self) -> None:
+        for name in (
+            "radius_m",
+            "radius_spread",
+            "edge_step_m",
+            "edge_error",
+            "inside_error",
+            "depth_error_m",
+        ):
+            if not getattr(self, name) > 0:
+                raise InvalidInputError(f"{name} must be positive, got {getattr(self, name)}")
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Evidence:
+    edge: Floats
+    mask: Floats
+    background: Floats
+    mask_depth: Floats
+
+    def single(self) -> "_Evidence":
+        """The same in 32 bits."""
+        return _Evidence(**{k: v.astype(np.float32) for k, v in vars(self).items()})
+
+
+class SphereModel:
+    """Fits a sphere to every mask."""
+
+    def __init__(self, config: SphereConfig | None = None) -> None:
+        """Keeps the prior."""
+        self.config = config or SphereConfig()
+
+    def __call__(self, view: TomatoView) -> list[Estimate]:
+        """Estimates V and T of every mask; an empty one has failed. Without depth the outline alone decides."""
+        depth = filled_depth(view.depth_m)
+        fits = [_Fit.prepare(view, depth, mask, self.config) for mask in view.masks]
+        for fit in fits:
+            if fit is not None:
+                fit.search(self.config)
+        clear = [
+            f for f in fits if f is not None and f.measured and f.outline_share() >= self.config.clear_share
+        ]
+        if clear:
+            own = float(np.median([f.radius_m for f in clear]))
+            crop = replace(self.config, radius_m=own, radius_spread=self.config.crop_spread)
+            for fit in fits:
+                if fit is not None and fit.measured and not any(fit is f for f in clear):
+                    fit.search(crop)
+        shown = depth
+        if len(fits) > 1:
+            # Of two tomatoes that touch, the nearer one as a whole hides the other.
+            shown = depth.copy()
+            for fit in fits:
+                if fit is not None and fit.measured:
+                    shown[fit.mask] = fit.own
+        fruits = np.zeros(depth.shape, dtype=bool)
+        for mask in view.masks:
+            fruits |= mask
+        return [
+            Estimate.failed() if fit is None else fit.estimate(view, shown, self.config, fruits)
+            for fit in fits
+        ]
+
+
+class _Fit:
+    """The circle of one mask."""
+
+    def __init__(
+        self,
+        mask: BinaryMask,
+        evidence: _Evidence,
+        corner: tuple[int, int],
+        own: float,
+        measured: bool,
+        focal: float,
+    ) -> None:
+        self.mask, self.evidence, self.corner = mask, evidence, corner
+        self.own, self.measured, self.focal = own, measured, focal
+        self.circle = np.zeros(3)
+
+    @classmethod
+    def prepare(
+        cls, view: TomatoView, depth: Float64, mask: BinaryMask, config: SphereConfig
+    ) -> "_Fit | None":
+        """Collects the evidence in a window; None for an empty mask."""
+        first_x, first_y, width, height = cv2.boundingRect(mask.view(np.uint8))
+        if not width:
+            return None
+        focal = view.intrinsics.fx
+        box = (slice(first_y, first_y + height), slice(first_x, first_x + width))
+        own = fruit_depth(view.depth_m[box], mask[box])
+        measured = bool(np.isfinite(own))
+        if not measured:
+            # Nearer than the camera measures; the mask's own extent then stands for the size.
+            own = config.radius_m * focal / (0.5 * (max(width, height) + 1))
+        size = config.radius_m * focal / own
+        reach = int(np.ceil(1.4 * size)) + 4
+        top, left = max(first_y - reach, 0), max(first_x - reach, 0)
+        window = (slice(top, first_y + height + reach), slice(left, first_x + width + reach))
+        z = depth[window] if measured else np.zeros_like(depth[window])
+        evidence = _collect(mask[window], z, view.depth_m[window], own, size, config.edge_step_m)
+        return cls(mask, evidence, (left, top), own, measured, focal)
+
+    @property
+    def radius_m(self) -> float:
+        """In [m]."""
+        return float(self.circle[2]) * self.own / self.focal
+
+    def outline_share(self) -> float:
+        """The share of the circle, by angle, near which the tomato's own outline is seen."""
+        edge = self.evidence.edge
+        if not len(edge):
+            return 0.0
+        away = edge - self.circle[:2]
+        near = np.abs(np.hypot(away[:, 0], away[:, 1]) / self.circle[2] - 1) < 0.08
+        angles = np.arctan2(away[near, 1], away[near, 0])
+        return len(np.unique(np.floor(angles / (2 * np.pi) * 24))) / 24
+
+    def search(self, config: SphereConfig) -> None:
+        """Finds the best circle."""
+        self.circle = _fit(self.evidence, self.own, self.focal, config)
+
+    def estimate(
+        self, view: TomatoView, shown: Float64, config: SphereConfig, fruits: BinaryMask
+    ) -> Estimate:
+        """V and T under the circle.
+
+        Args:
+            view: The image.
+            shown: Its depth, that of whole tomatoes in their masks. Shape (height, width).
+            config: What is known beforehand.
+            fruits: The pixels of all tomatoes. Shape (height, width).
+        """
+        mask, i = self.mask, view.intrinsics
+        x, y, radius = self.circle[0] + self.corner[0], self.circle[1] + self.corner[1], self.circle[2]
+        low_x, low_y = int(np.floor(x - radius)) - 1, int(np.floor(y - radius)) - 1
+        side = int(np.ceil(2 * radius)) + 3
+        u, v = np.meshgrid(low_x + np.arange(side) + 0.5, low_y + np.arange(side) + 0.5)
+        disc = (u - x) ** 2 + (v - y) ** 2 < radius**2
+        height, width = mask.shape
+        inside = (u >= 0) & (u < width) & (v >= 0) & (v < height)
+        outside = int(np.count_nonzero(disc & ~inside))
+        chosen = disc & inside
+        rows, columns = v[chosen].astype(int), u[chosen].astype(int)
+        if self.measured:
+            there = shown[rows, columns]
+            step = np.where(fruits[rows, columns], 0.0, config.edge_step_m)
+            hidden = (there > 0) & (there <= self.own + step)
+            rows, columns = rows[hidden], columns[hidden]
+        whole = mask.copy()
+        whole[rows, columns] = True
+        centre = None
+        if self.measured:
+            z = _centre_depth(self.evidence.mask_depth, self.circle, self.own, self.focal)
+            centre = ((x - i.cx) / i.fx * z, (y - i.cy) / i.fy * z, z)
+        return Estimate(
+            visible=int(np.count_nonzero(mask)),
+            total=int(np.count_nonzero(whole)) + outside,
+            whole=whole,
+            centre_optical=centre,
+        )
+
+
+def _collect(
+    here: BinaryMask, z: Float64, measured: Float64, own: float, size: float, step: float
+) -> _Evidence:
+    """Samples of the four kinds of evidence, as x, y in the window, in [px].
+
+    Args:
+        here: The mask in the window.
+        z: Depth without holes there, in [m].
+        measured: Depth with holes, in [m].
+        own: The tomato's depth, in [m].
+        size: Its radius, in [px], about.
+        step: By how much the image gets deeper at an outline, in [m].
+    """
+    image = here.astype(np.uint8)
+    ring = np.ones((3, 3), np.uint8)
+    inner_edge = (image > 0) & (cv2.erode(image, ring, borderValue=1) == 0)
+    # Masks and depth disagree by a pixel or two at edges, so that the depth is asked a little further out.
+    beyond = cv2.GaussianBlur(image.astype(np.float32), (0, 0), 2.0)
+    gy, gx = np.gradient(beyond)
+    ey, ex = np.nonzero(inner_edge)
+    length = np.hypot(gx[ey, ex], gy[ey, ex]) + 1e-9
+    deeper = np.ones(len(ey), dtype=bool)
+    probe = float(np.clip(0.12 * size, 1.5, 3.0))
+    for distance in (probe, 1.7 * probe):
+        ox = np.round(ex - distance * gx[ey, ex] / length).astype(int)
+        oy = np.round(ey - distance * gy[ey, ex] / length).astype(int)
+        in_window = (ox >= 0) & (oy >= 0) & (ox < here.shape[1]) & (oy < here.shape[0])
+        out = z[np.clip(oy, 0, here.shape[0] - 1), np.clip(ox, 0, here.shape[1] - 1)]
+        deeper &= in_window & ((out > own + step) | (out == 0))
+    edge = np.stack([ex + 0.5, ey + 0.5], 1).astype(np.float64)[deeper]
+    grown = cv2.dilate(image, np.ones((5, 5), np.uint8)) > 0
+    behind = (z > own + 2 * step) & ~grown
+    core = cv2.erode(image, np.ones((5, 5), np.uint8)) > 0
+    my, mx = np.nonzero(here)
+    cy, cx = np.nonzero(core & (measured > 0))
+    by, bx = np.nonzero(behind)
+    centres = np.stack([mx + 0.5, my + 0.5], 1).astype(np.float64)
+    rim = np.stack([ex + 0.5, ey + 0.5], 1).astype(np.float64)
+    return _Evidence(
+        edge=_thinned(edge),
+        mask=_thinned(rim if len(rim) else centres),
+        background=_thinned(np.stack([bx + 0.5, by + 0.5], 1).astype(np.float64), 2 * SAMPLES),
+        mask_depth=_thinned(np.stack([cx + 0.5, cy + 0.5, measured[cy, cx]], 1).astype(np.float64)),
+    )
+
+
+def _fit(evidence: _Evidence, own: float, focal: float, c: SphereConfig) -> Float64:
+    """The best circle: x, y, radius in the window, in [px]. Shape (3,)."""
+    size = c.radius_m * focal / own
+    # Half the precision, half the time: 0.01 px of a window are far below what an outline tells.
+    evidence = evidence.single()
+    points = evidence.mask
+    start = np.array([*points.mean(0), size])
+    spread = np.array([0.6 * size, 0.6 * size, 1.5 * c.radius_spread * size])
+    extra = _circles(evidence.edge)
+    best, best_cost = start, np.inf
+    for number, noise in enumerate(_noise()):
+        drawn = start + spread * noise
+        if number == 0 and len(extra):
+            drawn = np.concatenate([drawn, extra])
+        drawn[:, 2] = np.clip(drawn[:, 2], 0.3 * size, 2.5 * size)
+        cost = _cost(drawn.astype(np.float32), evidence, own, focal, c)
+        order = np.argsort(cost)[:12]
+        if cost[order[0]] < best_cost:
+            best, best_cost = drawn[order[0]], float(cost[order[0]])
+        start = drawn[order].mean(0)
+        spread = np.maximum(drawn[order].std(0), 0.004 * size)
+    return np.asarray(best, np.float64)
+
+
+def _cost(circles: Floats, evidence: _Evidence, own: float, focal: float, c: SphereConfig) -> Float64:
+    """Negative log likelihood of circles. Shape (N,)."""
+    radius = circles[:, 2:3]
+
+    def away(points: Floats) -> Floats:
+        # Several times as quick as np.hypot.
+        across, down = points[:, 0] - circles[:, 0:1], points[:, 1] - circles[:, 1:2]
+        across *= across
+        down *= down
+        across += down
+        return np.asarray(np.sqrt(across, out=across))
+
+    radius_m = circles[:, 2] * own / focal
+    cost = 0.5 * (np.log(radius_m / c.radius_m) / c.radius_spread) ** 2
+    if len(evidence.edge):
+        error = (away(evidence.edge) / radius - 1) / c.edge_error
+        # Points of the outline are not independent: together they weigh as a few dozen.
+        cost = cost + 24 * (len(evidence.edge) / SAMPLES) * np.mean(np.minimum(0.5 * error**2, 4.5), 1)
+    error = np.maximum(away(evidence.mask) / radius - 1, 0) / c.inside_error
+    cost = cost + 24 * np.mean(np.minimum(0.5 * error**2, 8.0), 1)
+    if len(evidence.background):
+        error = np.maximum(1 - away(evidence.background) / radius, 0) / c.inside_error
+        cost = cost + 24 * np.mean(np.minimum(0.5 * error**2, 8.0), 1)
+    if len(evidence.mask_depth) >= 12:
+        z = evidence.mask_depth[:, 2]
+        across = away(evidence.mask_depth) * own / focal
+        bulge = np.sqrt(np.maximum(radius_m[:, None] ** 2 - across**2, 0))
+        centre = z + bulge
+        error = (centre - np.median(centre, 1, keepdims=True)) / c.depth_error_m
+        cost = cost + 12 * np.mean(np.minimum(0.5 * error**2, 4.5), 1)
+    return np.asarray(cost)
+
+
+def _centre_depth(points: Floats, circle: Float64, own: float, focal: float) -> float:
+    """Depth of a sphere's centre from points of its surface: x, y in [px] and depth in [m]. Shape (N, 3)."""
+    radius_m = circle[2] * own / focal
+    if not len(points):
+        return own + 0.7 * float(radius_m)
+    across = np.hypot(points[:, 0] - circle[0], points[:, 1] - circle[1]) * own / focal
+    return float(np.median(points[:, 2] + np.sqrt(np.maximum(radius_m**2 - across**2, 0))))
+
+
+def _thinned(points: Float64, count: int = SAMPLES) -> Float64:
+    if len(points) <= count:
+        return points
+    return np.asarray(points[np.linspace(0, len(points) - 1, count).astype(int)])
+
+
+@lru_cache(maxsize=1)
+def _noise() -> NDArray[np.float64]:
+    # Always the same draws, so that the same image gives the same answer.
+    return np.asarray(np.random.default_rng(5).standard_normal((ROUNDS, DRAWS, 3)))
+
+
+def _circles(edge: Floats) -> Floats:
+    """Circles through triples of outline points, well apart. Shape (N, 3)."""
+    n = len(edge)
+    if n < 12:
+        return np.zeros((0, 3))
+    i = np.random.default_rng(7).integers(0, n, (64, 3))
+    a, b, c = edge[i[:, 0]], edge[i[:, 1]], edge[i[:, 2]]
+    d = 2 * (a[:, 0] * (b[:, 1] - c[:, 1]) + b[:, 0] * (c[:, 1] - a[:, 1]) + c[:, 0] * (a[:, 1] - b[:, 1]))
+    ok = np.abs(d) > 1.0
+    a, b, c, d = a[ok], b[ok], c[ok], d[ok]
+    a2, b2, c2 = (a**2).sum(1), (b**2).sum(1), (c**2).sum(1)
+    x = (a2 * (b[:, 1] - c[:, 1]) + b2 * (c[:, 1] - a[:, 1]) + c2 * (a[:, 1] - b[:, 1])) / d
+    y = (a2 * (c[:, 0] - b[:, 0]) + b2 * (a[:, 0] - c[:, 0]) + c2 * (b[:, 0] - a[:, 0])) / d
+    return np.stack([x, y, np.hypot(a[:, 0] - x, a[:, 1] - y)], 1)

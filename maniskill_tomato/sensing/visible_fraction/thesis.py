@@ -1,0 +1,123 @@
+"""The thesis's occlusion model: the ten steps of 4-2-4, with constants for all images."""
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+from maniskill_tomato.errors import InvalidInputError
+from maniskill_tomato.sensing.visible_fraction import steps
+from maniskill_tomato.sensing.visible_fraction.estimate import Estimate, TomatoView, UInt8, fruit_depth
+from maniskill_tomato.sensing.visible_fraction.steps import Contour, Ellipse
+
+
+@dataclass(frozen=True, kw_only=True)
+class ThesisConfig:
+    """The constants, which the thesis does not give; these are for images 640 pixels wide."""
+
+    leaf_threshold: int = 10
+    """By how much green must exceed red for a leaf, of 255."""
+    inpaint_radius: float = 3.0
+    """Neighbourhood that the inpainting draws from, in [px]."""
+    erosion: int = 5
+    """Kernel that removes noise, in [px]."""
+    dilation: int = 9
+    """Kernel that fills holes, in [px]."""
+    behind_m: float = 0.04
+    """How far behind the tomatoes' own depth a pixel is taken for background, in [m]."""
+    smallest: float = 60.0
+    """Smallest contour, in [px]."""
+
+    def __post_init__(self) -> None:
+        for name in ("inpaint_radius", "erosion", "dilation", "behind_m", "smallest"):
+            if not getattr(self, name) > 0:
+                raise InvalidInputError(f"{name} must be positive, got {getattr(self, name)}")
+
+
+@dataclass(frozen=True, kw_only=True)
+class ThesisSteps:
+    """Every image of Fig. 4-28."""
+
+    tomatoes: UInt8
+    """(b) I_tom_masks."""
+    leaves: UInt8
+    """(c) I_leaves."""
+    inpainted: UInt8
+    """(d) I_inpaint, RGB."""
+    binary: UInt8
+    """(e) I_bin."""
+    contours: tuple[Contour, ...]
+    """(f) of I_bin."""
+    ellipses: tuple[Ellipse, ...]
+    """(g) fitted to them."""
+    whole: tuple[UInt8, ...]
+    """(h) the ellipses without background, one binary image each."""
+    fractions: tuple[float, ...]
+    """(h) V / T of each."""
+
+
+class ThesisModel:
+    """Inpainting, red minus green, ellipses, depth: works for red tomatoes that do not touch."""
+
+    def __init__(self, config: ThesisConfig | None = None) -> None:
+        """Keeps the constants."""
+        self.config = config or ThesisConfig()
+
+    def run(self, view: TomatoView) -> ThesisSteps:
+        """All steps of one image."""
+        c = self.config
+        shape = view.rgb.shape[:2]
+        tomatoes = steps.combine_masks(view.masks, shape)
+        leaves = steps.leaf_image(view.rgb, c.leaf_threshold)
+        inpainted = steps.inpaint(view.rgb, leaves, c.inpaint_radius)
+        binary = steps.clean(steps.red_image(inpainted), c.erosion, c.dilation)
+        depths = [d for mask in view.masks if np.isfinite(d := fruit_depth(view.depth_m, mask))]
+        farthest = max(depths) + c.behind_m if depths else np.inf
+        binary = steps.remove_deeper(binary, view.depth_m, farthest)
+        contours, ellipses, whole, fractions = [], [], [], []
+        for contour in steps.outlines(binary, c.smallest):
+            ellipse = steps.fit_ellipse(contour)
+            if ellipse is None:
+                continue
+            inside = steps.fill_ellipse(ellipse, shape)
+            own = fruit_depth(view.depth_m, (inside > 0) & (tomatoes > 0))
+            if not np.isfinite(own):
+                continue
+            # Only the largest of the new contours is the tomato; the depth filter leaves crumbs.
+            filtered = steps.remove_deeper(inside, view.depth_m, own + c.behind_m)
+            pieces = steps.outlines(filtered, c.smallest)
+            if not pieces:
+                continue
+            new = np.zeros(shape, dtype=np.uint8)
+            cv2.drawContours(new, [max(pieces, key=cv2.contourArea)], -1, 255, -1)
+            total = int(np.count_nonzero(new))
+            contours.append(contour)
+            ellipses.append(ellipse)
+            whole.append(new)
+            fractions.append(int(np.count_nonzero((new > 0) & (tomatoes > 0))) / total)
+        return ThesisSteps(
+            tomatoes=tomatoes,
+            leaves=leaves,
+            inpainted=inpainted,
+            binary=binary,
+            contours=tuple(contours),
+            ellipses=tuple(ellipses),
+            whole=tuple(whole),
+            fractions=tuple(fractions),
+        )
+
+    def __call__(self, view: TomatoView) -> list[Estimate]:
+        """Each mask gets V and T of the contour that holds most of it; masks that no contour holds have failed."""
+        result = self.run(view)
+        estimates = []
+        for mask in view.masks:
+            shares = [int(np.count_nonzero(whole[mask])) for whole in result.whole]
+            if not shares or max(shares) < 0.25 * np.count_nonzero(mask):
+                estimates.append(Estimate.failed())
+                continue
+            k = int(np.argmax(shares))
+            total = int(np.count_nonzero(result.whole[k]))
+            estimates.append(
+                Estimate(visible=result.fractions[k] * total, total=total, whole=result.whole[k] > 0)
+            )
+        return estimates

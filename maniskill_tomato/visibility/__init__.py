@@ -1,1 +1,0 @@
-"""How much of a fruit a camera sees."""

@@ -1,0 +1,1 @@
+"""The ManiSkill side of the tasks: robot agent, controllers, actors, scene."""

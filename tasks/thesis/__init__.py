@@ -1,0 +1,1 @@
+"""The thesis's two tasks: one or three tomatoes, a reward per view."""

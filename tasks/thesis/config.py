@@ -1,0 +1,85 @@
+"""What tells the thesis's tasks apart: start ranges, thresholds, reward terms, what happens outside the
+workspace."""
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Literal
+
+from torch import Tensor
+
+from maniskill_tomato.plants.spec import PlantPose, PlantSpec
+from maniskill_tomato.tasks.thesis import rewards
+
+Range = tuple[float, float]
+VisualReward = Callable[[Tensor, Tensor, Tensor, Tensor], Tensor]
+PosePenalty = Callable[[Tensor, Tensor], Tensor]
+
+
+@dataclass(frozen=True, kw_only=True)
+class ViewpointTaskConfig:
+    """One viewpoint task."""
+
+    plant: PlantSpec
+    """The plant that the task uses unless it is given another."""
+    plant_pose: PlantPose
+    """Where that plant stands."""
+    start_position: tuple[Range, Range, Range]
+    """Ranges of the end-effector's x, y, z at the start of an episode, in [m], world frame (Eq. 5-1, 5-7)."""
+    start_rpy: tuple[Range, Range, Range]
+    """Ranges of its roll, pitch, yaw, in [rad] (Eq. 5-2, 5-8)."""
+    full_visibility: float
+    """The target is fully visible, and the episode a success, when V_f is above this."""
+    outside_workspace: Literal["home", "end"]
+    """An unreachable pose sends the arm home (all joints 0) or ends the episode."""
+    neighbour_poses: bool
+    """Whether a reachable pose close to an unreachable one is taken instead; otherwise it counts as
+    unreachable."""
+    visual_reward: VisualReward
+    """R_v from V_f, target seen, any tomato seen, reach."""
+    pose_penalty: PosePenalty
+    """P_p from reach, forbidden zone."""
+    reward_bounds: Range
+    """R = R_v + P_p is clipped to these; the upper one is the best reward of a step."""
+
+
+def guided_task() -> ViewpointTaskConfig:
+    """The guided-reward task (section 5-1, Eq. 5-1 ... 5-6, Table 5-1).
+
+    The thesis prints neither its plant nor where it stood. Here the tomato is in reach at y = 0.2 m, where the
+    yaw range of Eq. 5-2 looks from y < 0, and of the first twelve seeds this one hides it from every start (mean
+    V_f 0.15) while a fifth of the views around it are good.
+    """
+    return ViewpointTaskConfig(
+        plant=PlantSpec(preset="one_tomato", seed=1),
+        plant_pose=PlantPose(x=0.85, y=0.2, yaw=0.0),
+        start_position=((-0.1, 0.2), (-0.35, 0.1), (0.65, 1.15)),
+        start_rpy=((0.0, 0.0), (0.45 * math.pi, 0.7 * math.pi), (0.0, 0.25 * math.pi)),
+        full_visibility=0.85,
+        outside_workspace="home",
+        neighbour_poses=True,
+        visual_reward=rewards.guided_visual_reward,
+        pose_penalty=rewards.guided_pose_penalty,
+        reward_bounds=(-math.inf, 1.5),
+    )
+
+
+def sparse_task() -> ViewpointTaskConfig:
+    """The sparse-reward task (section 5-2, Eq. 5-7 ... 5-11, Table 5-2).
+
+    Eq. 5-10 has no case for a neighbour pose, so any pose that cannot be reached exactly is outside the
+    workspace. The plant is one of the first twelve seeds that hides all three tomatoes from every start while each
+    can be seen from 15 % or more of the views around it.
+    """
+    return ViewpointTaskConfig(
+        plant=PlantSpec(preset="three_tomatoes", seed=4),
+        plant_pose=PlantPose(x=0.85, y=0.0, yaw=0.0),
+        start_position=((-0.1, 0.2), (-0.25, 0.25), (0.65, 1.15)),
+        start_rpy=((0.0, 0.0), (0.45 * math.pi, 0.7 * math.pi), (-math.pi / 8, math.pi / 8)),
+        full_visibility=0.8,
+        outside_workspace="end",
+        neighbour_poses=False,
+        visual_reward=rewards.sparse_visual_reward,
+        pose_penalty=rewards.sparse_pose_penalty,
+        reward_bounds=(-1.0, 1.0),
+    )

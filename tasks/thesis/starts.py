@@ -1,0 +1,103 @@
+"""Where episodes start: viewpoints drawn from the task's ranges until the arm can reach one, or given."""
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from maniskill_tomato.errors import InvalidInputError
+from maniskill_tomato.robot.inverse_kinematics import IkSolution, InverseKinematics, Reach
+from maniskill_tomato.robot.kinematics import viewpoint_transform
+from maniskill_tomato.tasks.maniskill.agent import Iiwa14D435
+from maniskill_tomato.tasks.thesis.config import ViewpointTaskConfig
+
+CANDIDATES = 16
+"""Poses drawn at a time; the first one in reach is taken, so the number does not change the distribution."""
+
+MAX_DRAWS = 64
+"""Draws of `CANDIDATES` poses after which the ranges count as out of reach."""
+
+
+class Starts:
+    """Start viewpoints of one task, with the joints that take them."""
+
+    def __init__(self, task: ViewpointTaskConfig, device: torch.device) -> None:
+        """Keeps the ranges.
+
+        Args:
+            task: The task, whose `start_position` and `start_rpy` are drawn from.
+            device: Where results go.
+        """
+        self._task = task
+        self._device = device
+        self._low, self._high = np.array((*task.start_position, *task.start_rpy)).T
+        self._inverse_kinematics = InverseKinematics(device=str(device))
+        ready = Iiwa14D435.keyframes["ready"].qpos
+        self._ready = torch.tensor(ready, dtype=torch.float64, device=device)
+
+    def draw(self, rngs: Sequence[np.random.RandomState]) -> tuple[Tensor, Tensor]:
+        """One start per generator, uniform over the part of the ranges in reach (Eq. 5-1, 5-2, 5-7, 5-8).
+
+        Args:
+            rngs: The generator of each environment, b of them.
+
+        Returns:
+            Viewpoints (x, y, z [m], roll, pitch, yaw [rad]) of shape (b, 6) and joints [rad] of shape (b, 7).
+
+        Raises:
+            InvalidInputError: The arm reaches nothing of the ranges.
+        """
+        b, device = len(rngs), self._device
+        viewpoint = torch.zeros(b, 6, device=device)
+        qpos = torch.zeros(b, 7, device=device)
+        found = torch.zeros(b, dtype=torch.bool, device=device)
+        rows = torch.arange(b, device=device)
+        for _ in range(MAX_DRAWS):
+            draws = np.stack([rng.uniform(self._low, self._high, (CANDIDATES, 6)) for rng in rngs])
+            candidates = torch.as_tensor(draws, dtype=torch.float32, device=device)
+            solution = self._solve(candidates.reshape(-1, 6))
+            reachable = (solution.reach == int(Reach.REACHABLE)).reshape(b, CANDIDATES)
+            first = reachable.int().argmax(dim=-1)
+            new = reachable.any(dim=-1) & ~found
+            viewpoint[new] = candidates[rows, first][new]
+            qpos[new] = solution.qpos.reshape(b, CANDIDATES, 7)[rows, first][new].float()
+            found |= new
+            if bool(found.all()):
+                return viewpoint, qpos
+        raise InvalidInputError(
+            f"none of {MAX_DRAWS * CANDIDATES} start poses could be reached; the task's ranges "
+            f"{self._task.start_position} [m] and {self._task.start_rpy} [rad] lie outside the arm's workspace"
+        )
+
+    def given(self, viewpoint: Any, batch: int) -> tuple[Tensor, Tensor]:
+        """The same start for all environments being reset.
+
+        Args:
+            viewpoint: x, y, z [m], roll, pitch, yaw [rad]. Shape (6,).
+            batch: How many environments, b.
+
+        Returns:
+            As `draw`.
+
+        Raises:
+            InvalidInputError: It is not six finite numbers, or the arm cannot reach it.
+        """
+        values = np.asarray(viewpoint, dtype=np.float64)
+        if values.shape != (6,) or not np.isfinite(values).all():
+            raise InvalidInputError(
+                "reset option viewpoint must be six finite numbers (x, y, z [m], roll, pitch, yaw [rad]); "
+                f"got {viewpoint!r}"
+            )
+        start = torch.as_tensor(values, dtype=torch.float32, device=self._device).expand(batch, 6)
+        solution = self._solve(start)
+        if bool((solution.reach != int(Reach.REACHABLE)).any()):
+            raise InvalidInputError(
+                f"the arm cannot reach the reset option viewpoint {viewpoint!r}; give one inside its workspace"
+            )
+        return start, solution.qpos.float()
+
+    def _solve(self, viewpoint: Tensor) -> IkSolution:
+        poses, reference = viewpoint_transform(viewpoint), self._ready.expand(len(viewpoint), 7)
+        return self._inverse_kinematics.solve(poses, reference, neighbour=False)

@@ -1,0 +1,352 @@
+"""The command line on the real tasks, without rendering unless a test is marked."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import imageio.v2 as imageio
+import numpy as np
+import pytest
+import torch
+
+from maniskill_tomato import cli
+from maniskill_tomato.cli import main, parse
+from maniskill_tomato.learning.rl.agent import make_agent
+from maniskill_tomato.learning.rl.checkpoint import load_checkpoint, make_checkpoint, save_checkpoint
+from maniskill_tomato.learning.rl.policy import load_policy
+from maniskill_tomato.learning.rl.presets import get_preset
+from maniskill_tomato.tasks import THESIS_IDS
+
+ROOT = Path(__file__).resolve().parents[2]
+GUIDED, SPARSE = THESIS_IDS
+SHORT = (
+    "--total-timesteps",
+    "100",
+    "--learning-starts",
+    "50",
+    "--batch-size",
+    "32",
+    "--checkpoint-every",
+    "50",
+)
+
+
+def make_policy(path: Path, env_id: str = GUIDED) -> Path:
+    """An untrained policy, good enough to be evaluated."""
+    agent = make_agent(get_preset("td3"), 9, 6)
+    save_checkpoint(path, make_checkpoint(agent, env_id, (-torch.ones(6), torch.ones(6)), {"steps": 0}))
+    return path
+
+
+def fails(capsys: pytest.CaptureFixture[str], *arguments: str) -> str:
+    """Runs a command that must end with status 2; returns what it said."""
+    with pytest.raises(SystemExit) as ended:
+        main(arguments)
+    assert ended.value.code == 2
+    message = capsys.readouterr().err
+    assert "Traceback" not in message
+    return message
+
+
+def command(*arguments: str) -> subprocess.Popen[str]:
+    """The command in a process of its own."""
+    return subprocess.Popen(
+        [sys.executable, "-m", "maniskill_tomato.cli", *arguments],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        cwd=ROOT,
+    )
+
+
+def test_help_is_quick_and_loads_neither_torch_nor_the_simulator() -> None:
+    program = (
+        "import sys\nfrom maniskill_tomato.cli import main\n"
+        "try:\n    main(['--help'])\nexcept SystemExit as e:\n    status = e.code\n"
+        "print([m for m in ('torch', 'sapien', 'mani_skill', 'matplotlib') if m in sys.modules], status)"
+    )
+    result = subprocess.run(
+        [sys.executable, "-c", program], capture_output=True, text=True, cwd=ROOT, check=True
+    )
+    assert result.stdout.splitlines()[-1] == "[] 0"
+    assert all(word in result.stdout for word in ("train", "eval", "demo", "export"))
+
+
+def test_a_reader_that_goes_away_gets_no_traceback() -> None:
+    command = f"{sys.executable} -m maniskill_tomato.cli train --help | head -n 1; exit ${{PIPESTATUS[0]}}"
+    done = subprocess.run(["bash", "-c", command], capture_output=True, text=True, check=False)
+    assert done.stderr == "" and done.stdout.count("\n") == 1
+    assert done.returncode in (0, 141)  # All of the text may fit into the pipe before its reader goes.
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        ("--hindsight-targets", "2", "--n-step", "3", "--aux-visibility-weight", "0.1"),
+        ("--success-threshold-start", "0.3", "--normalize-observations", "running"),
+        ("--preset", "fast-td3", "--num-envs", "1", "--updates-per-step", "0.2", "--batch-size", "16"),
+    ],
+    ids=["hindsight", "threshold", "fast-td3"],
+)
+def test_options_of_the_learner_are_flags(tmp_path: Path, options: tuple[str, ...]) -> None:
+    main(["train", THESIS_IDS[1], "--out", str(tmp_path / "run"), *SHORT, *options])
+    config = json.loads((tmp_path / "run" / "config.json").read_text())
+    for flag, value in zip(options[::2], options[1::2], strict=True):
+        if flag != "--preset":
+            assert str(config["config"][flag.removeprefix("--").replace("-", "_")]) == value
+    assert config["env_options"] == {}
+    main(["train", "--resume", str(tmp_path / "run"), "--total-timesteps", "120"])
+    policy = load_policy(tmp_path / "run" / "policy.pt")
+    assert policy.counters["steps"] == 120 and policy.counters["updates"] > 0
+
+
+@pytest.mark.parametrize("env_id", THESIS_IDS)
+def test_training_a_hundred_steps_writes_a_run(
+    tmp_path: Path, env_id: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    main(["train", env_id, "--out", str(tmp_path / "run"), "--seed", "4", *SHORT])
+    assert f"policy  {tmp_path / 'run' / 'policy.pt'}" in capsys.readouterr().out
+    written = {path.name for path in (tmp_path / "run").iterdir()}
+    assert written == {
+        "checkpoints",
+        "config.json",
+        "episodes.csv",
+        "history.npz",
+        "policy.pt",
+        "tensorboard",
+    }
+    checkpoint = load_checkpoint(tmp_path / "run/policy.pt")
+    assert checkpoint["env_id"] == env_id
+    assert (checkpoint["counters"]["steps"], checkpoint["counters"]["seed"]) == (100, 4)
+    assert json.loads((tmp_path / "run/config.json").read_text())["config"]["total_timesteps"] == 100
+    assert (tmp_path / "run/policy.pt").stat().st_size < 1_000_000
+
+
+def test_one_seed_trains_one_policy_on_the_real_task(tmp_path: Path) -> None:
+    weights = []
+    for name in ("a", "b"):
+        main(
+            [
+                "train",
+                GUIDED,
+                "--out",
+                str(tmp_path / name),
+                "--preset",
+                "thesis-guided",
+                "--total-timesteps",
+                "60",
+            ]
+        )
+        weights.append(load_checkpoint(tmp_path / name / "policy.pt")["actor"]["output.weight"])
+    torch.testing.assert_close(weights[0], weights[1], rtol=0.0, atol=0.0)
+
+
+def test_options_start_from_the_asked_preset() -> None:
+    train = parse(["train", GUIDED, "--preset", "thesis-sparse", "--gamma", "0.9"])
+    assert isinstance(train, cli.Train)
+    assert (train.config.buffer_size, train.config.exploration_steps, train.config.gamma) == (1500, 1800, 0.9)
+    train = parse(["train", GUIDED, "--preset=thesis-guided"])
+    assert isinstance(train, cli.Train)
+    assert train.config == get_preset("thesis-guided")
+
+
+def test_another_plant_can_be_asked_for() -> None:
+    command = parse(
+        ["eval", GUIDED, "--plant", "full", "--plant-seed", "held_out", "--plant-pose", "0.8", "0", "1.5"]
+    )
+    assert isinstance(command, cli.Eval)
+    options = {"plant": {"preset": "full", "seed": "held_out"}, "plant_pose": (0.8, 0.0, 1.5)}
+    assert command.plants.env_options() == options
+    assert cli.PlantOptions(plant_seed="7").env_options() == {"plant": {"seed": 7}}
+    assert cli.PlantOptions().env_options() == {}
+
+
+def test_evaluation_writes_metrics_that_follow_from_its_trajectories(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    policy = make_policy(tmp_path / "policy.pt")
+    out = tmp_path / "out"
+    main(
+        [
+            "eval",
+            GUIDED,
+            "--policy",
+            str(policy),
+            "--episodes",
+            "3",
+            "--seed",
+            "5",
+            "--out",
+            str(out),
+            "--no-video",
+        ]
+    )
+    metrics = json.loads((out / "metrics.json").read_text())
+    assert (metrics["env_id"], metrics["episodes"], metrics["seed"]) == (GUIDED, 3, 5)
+    assert metrics["success_threshold"] == 0.85
+    with np.load(out / "trajectories.npz") as data:
+        views = np.split(data["visible_fraction"], data["first_view"][1:])
+        seeds = data["seed"].tolist()
+    assert seeds == [5, 6, 7] == metrics["per_episode"]["seed"]
+    largest = [view[1:].max() for view in views]
+    assert metrics["success_rate"] == pytest.approx(np.mean([v > 0.85 for v in largest]))
+    assert metrics["mean_steps"] == pytest.approx(np.mean([len(view) - 1 for view in views]))
+    assert metrics["mean_max_visible_fraction"] == pytest.approx(np.mean(largest))
+    assert "success_rate" in metrics["random_actions"]
+    assert (out / "report.html").is_file()
+    assert f"report  {out / 'report.html'}" in capsys.readouterr().out
+    main(
+        [
+            "eval",
+            GUIDED,
+            "--policy",
+            str(policy),
+            "--episodes",
+            "3",
+            "--seed",
+            "5",
+            "--out",
+            str(out),
+            "--no-video",
+        ]
+    )
+    again = json.loads((out / "metrics.json").read_text())
+    assert again["per_episode"] == metrics["per_episode"]
+
+
+def test_a_run_on_another_plant_leaves_policies_that_say_so(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    plant = ("--plant", "three_tomatoes", "--plant-seed", "4", "--plant-pose", "0.8", "0.1", "0.5")
+    main(["train", GUIDED, "--out", str(tmp_path), *plant, *SHORT])
+    options = {"plant": {"preset": "three_tomatoes", "seed": 4}, "plant_pose": [0.8, 0.1, 0.5]}
+    (newest, *_) = sorted((tmp_path / "checkpoints").iterdir(), reverse=True)
+    for path in (tmp_path / "policy.pt", newest):
+        assert load_policy(path).env_options == options
+    capsys.readouterr()
+    short = ("--episodes", "1", "--no-video", "--no-baseline", "--out", str(tmp_path / "eval"))
+    main(["eval", GUIDED, "--policy", str(tmp_path / "policy.pt"), *short])
+    assert f"policy  TD3, trained on {GUIDED} with plant={{" in capsys.readouterr().out
+    assert json.loads((tmp_path / "eval/metrics.json").read_text())["policy"]["trained_with"] == options
+
+
+def test_the_demo_names_its_report_and_its_policy(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    for _ in range(2):  # A second demo replaces the first.
+        main(["demo", "--out", str(tmp_path), "--minutes", "0.05", "--episodes", "2", "--no-video"])
+    said = capsys.readouterr().out.splitlines()
+    assert said[-3:] == [
+        f"report  {tmp_path / 'report.html'}",
+        "video   not wanted",
+        f"policy  {tmp_path / 'training' / 'policy.pt'}",
+    ]
+    assert load_policy(tmp_path / "training/policy.pt").env_id == GUIDED
+    page = (tmp_path / "report.html").read_text()
+    assert "Training" in page and 'href="training/policy.pt"' in page
+
+
+@pytest.mark.render
+def test_the_demo_films_episodes_when_it_can_render(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    main(["demo", "--out", str(tmp_path), "--minutes", "0.02", "--episodes", "1"])
+    assert f"video   {tmp_path / 'video.mp4'}" in capsys.readouterr().out
+    reader = imageio.get_reader(tmp_path / "video.mp4")
+    assert reader.get_meta_data()["duration"] > 1.0
+    frame = np.asarray(reader.get_data(5))
+    assert frame.shape == (544, 1280, 3)
+    assert frame[:480, :640].std() > 10.0 and frame[:480, 640:].std() > 10.0
+    for name in ("first_view", "last_view", "first_pose", "last_pose"):
+        assert imageio.imread(tmp_path / f"{name}.png").shape == (480, 640, 3)
+    page = (tmp_path / "report.html").read_text()
+    assert 'src="video.mp4"' in page and "First view of the wrist camera" in page
+
+
+def test_an_unknown_task_lists_the_known_ones(capsys: pytest.CaptureFixture[str]) -> None:
+    for verb in ("train", "eval"):
+        message = fails(capsys, verb, "Tomato-v9")
+        assert message.startswith("error: the environment id must be one of")
+        assert GUIDED in message and SPARSE in message and "'Tomato-v9'" in message
+
+
+def test_a_policy_that_is_missing_damaged_or_of_another_task_is_an_error(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = ("--out", str(tmp_path / "out"), "--episodes", "1", "--no-video")
+    assert "no checkpoint at" in fails(capsys, "eval", GUIDED, "--policy", str(tmp_path / "no.pt"), *out)
+    (tmp_path / "bad.pt").write_bytes(b"PK\x03\x04 nonsense")
+    assert "not a readable checkpoint" in fails(
+        capsys, "eval", GUIDED, "--policy", str(tmp_path / "bad.pt"), *out
+    )
+    other = make_policy(tmp_path / "other.pt", SPARSE)
+    message = fails(capsys, "eval", GUIDED, "--policy", str(other), *out)
+    assert "trained on TomatoViewpointSparse-v1" in message and "--allow-other-task" in message
+    main(["eval", GUIDED, "--policy", str(other), "--allow-other-task", "--no-baseline", *out])
+    assert "random_actions" not in json.loads((tmp_path / "out/metrics.json").read_text())
+
+
+@pytest.mark.parametrize("env_id", THESIS_IDS)
+def test_the_shipped_policy_solves_its_task(tmp_path: Path, env_id: str) -> None:
+    main(["eval", env_id, "--episodes", "50", "--out", str(tmp_path), "--no-video", "--no-baseline"])
+    metrics = json.loads((tmp_path / "metrics.json").read_text())
+    assert metrics["policy"]["trained_on"] == env_id
+    assert metrics["success_rate"] >= 0.9
+    assert metrics["mean_steps"] <= 3.0
+
+
+def test_without_a_shipped_policy_the_message_says_what_to_do(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    monkeypatch.setattr("maniskill_tomato.assets.ASSETS_DIR", tmp_path)
+    message = fails(capsys, "eval", GUIDED, "--episodes", "1")
+    assert f"maniskill-tomato train {GUIDED}" in message and "--policy" in message
+
+
+@pytest.mark.parametrize(
+    ("arguments", "expected"),
+    [
+        (("train", GUIDED, "--gamma", "2"), "gamma must be in"),
+        (("train", GUIDED, "--preset", "sac"), "td3"),
+        (("train", GUIDED, "--num-envs", "4"), "num_envs must be 1 without a CUDA device"),
+        (("eval", GUIDED, "--policy", "random", "--episodes", "0"), "episodes must be 1 or more"),
+        (("eval", GUIDED, "--policy", "random", "--plant", "oak"), "oak"),
+        (("fly",), "fly"),
+    ],
+)
+def test_bad_options_are_answered_in_words(
+    arguments: tuple[str, ...], expected: str, capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    if "--num-envs" in arguments and torch.cuda.is_available():
+        pytest.skip("a GPU simulates many environments")
+    if arguments[0] in ("train", "eval"):
+        arguments = (*arguments, "--out", str(tmp_path / "out"))
+    assert expected in fails(capsys, *arguments)
+    assert not (tmp_path / "out/config.json").exists()
+
+
+def test_a_run_is_not_overwritten_unless_asked(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    run = ("train", GUIDED, "--out", str(tmp_path), *SHORT)
+    (tmp_path / "notes.txt").write_text("mine")
+    main(run)
+    assert "already holds a run" in fails(capsys, *run)
+    main([*run, "--overwrite"])
+    assert (tmp_path / "notes.txt").read_text() == "mine"
+
+
+def test_ctrl_c_in_the_terminal_saves_the_policy(tmp_path: Path) -> None:
+    process = command("train", GUIDED, "--out", str(tmp_path / "run"), "--total-timesteps", "1000000")
+    try:
+        deadline = time.monotonic() + 120
+        while not list(tmp_path.glob("run/tensorboard/*")) and time.monotonic() < deadline:
+            time.sleep(0.1)
+        time.sleep(1.0)
+        os.kill(process.pid, signal.SIGINT)
+        output, errors = process.communicate(timeout=60)
+    finally:
+        process.kill()
+    assert process.returncode == 0, errors
+    assert "(SIGINT)" in output
+    assert load_policy(tmp_path / "run/policy.pt").counters["steps"] > 0

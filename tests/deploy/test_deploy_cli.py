@@ -1,0 +1,169 @@
+"""`maniskill-tomato deploy` as a user runs it."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from maniskill_tomato.cli import main, parse
+from maniskill_tomato.deploy.stops import Stops
+
+BLOCKED = """
+import sys
+
+class Blocked:
+    def find_spec(self, name, path=None, target=None):
+        if name.split(".")[0] in ("mani_skill", "sapien", "pyrealsense2", "torchvision", "ultralytics"):
+            raise ImportError(f"{name} is not installed here")
+
+sys.meta_path.insert(0, Blocked())
+from maniskill_tomato.cli import main
+try:
+    main(sys.argv[1:])
+finally:
+    loaded = sorted(
+        name for name in sys.modules
+        if name.split(".")[0] in ("mani_skill", "sapien") or name.startswith(
+            ("maniskill_tomato.learning.rl.agent", "maniskill_tomato.learning.rl.trainer", "maniskill_tomato.tasks.")
+        )
+    )
+    print("LOADED", loaded)
+"""
+
+
+def test_the_twin_runs_without_sapien_and_maniskill(tmp_path: Path) -> None:
+    """Every import of either fails in this process, and none of the simulator's modules is loaded."""
+    command = [sys.executable, "-c", BLOCKED, "deploy", "run", "--profile", "mock", "--seed", "6"]
+    done = subprocess.run([*command, "--out", str(tmp_path)], capture_output=True, text=True, timeout=500)
+    assert done.returncode == 0, done.stderr
+    assert "LOADED []" in done.stdout
+    content = json.loads((tmp_path / "result.json").read_text())
+    assert content["success"] is True and content["reason"] == "success"
+    assert content["visible_fraction"] > 0.8 and content["moves"] >= 1 and content["seconds"] > 0.0
+    assert (tmp_path / "report.png").stat().st_size > 10_000
+    assert (tmp_path / "run.mcap").stat().st_size > 10_000
+
+
+def test_sigterm_ends_a_run_in_a_defined_state(tmp_path: Path) -> None:
+    profile = tmp_path / "slow.toml"
+    profile.write_text(
+        '[arm]\ndriver = "mock"\n[camera]\ndriver = "mock"\n[twin]\nwidth = 160\nheight = 120\nreal_time = true\n'
+        '[perception]\nsegmenter = "ground_truth"\n[target]\nsource = "twin"\n[safety]\nspeed_fraction = 0.02\n'
+    )
+    command = [sys.executable, "-m", "maniskill_tomato.cli", "deploy", "run", "--profile", str(profile)]
+    out = tmp_path / "out"
+    with subprocess.Popen(
+        [*command, "--seed", "9", "--out", str(out)],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    ) as running:
+        recording, deadline = out / "run.mcap", time.monotonic() + 300
+        while time.monotonic() < deadline and not recording.exists():
+            time.sleep(0.2)
+        time.sleep(2.0)
+        running.send_signal(signal.SIGTERM)
+        stdout, stderr = running.communicate(timeout=300)
+    assert running.returncode == 128 + signal.SIGTERM, stderr
+    content = json.loads((out / "result.json").read_text())
+    assert (content["reason"], content["detail"], content["success"]) == ("stopped", "SIGTERM", False)
+    assert "holds its position" in content["end_state"]
+
+
+def test_ctrl_c_while_views_of_a_calibration_are_taken_ends_it_with_its_status(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    listen = Stops.__enter__
+
+    def listen_and_press(self: Stops) -> Stops:
+        listen(self)
+        os.kill(os.getpid(), signal.SIGINT)
+        return self
+
+    monkeypatch.setattr(Stops, "__enter__", listen_and_press)
+    with pytest.raises(SystemExit) as end:
+        main(["deploy", "calibrate", "--profile", "mock", "--unattended", "--out", str(tmp_path)])
+    assert end.value.code == 128 + signal.SIGINT
+    assert "stopped (SIGINT) after 0 views; the arm holds its position" in capsys.readouterr().out
+
+
+def test_a_fault_has_its_own_exit_status(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    profile = tmp_path / "broken.toml"
+    profile.write_text(
+        '[arm]\ndriver = "mock"\n[camera]\ndriver = "mock"\n[twin]\nwidth = 160\nheight = 120\n'
+        'faults = { camera = "unplugged", camera_from_read = 1 }\n'
+        '[perception]\nsegmenter = "ground_truth"\n[target]\nsource = "twin"\n'
+    )
+    with pytest.raises(SystemExit) as end:
+        main(["deploy", "run", "--profile", str(profile), "--seed", "9", "--out", str(tmp_path / "out")])
+    assert end.value.code == 3
+    captured = capsys.readouterr()
+    assert captured.err.strip().endswith("error: the camera is gone; is its USB cable plugged in?")
+    assert json.loads((tmp_path / "out" / "result.json").read_text())["reason"] == "not_connected"
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["run", "--profile", "nothing"], "give the path of a TOML file or one of"),
+        (["run", "--policy", "missing.pt"], "no policy at 'missing.pt'"),
+        (["run", "--policy", ""], "no policy at ''"),
+        (["run", "--policy", "oracle"], "in simulation only"),
+        (["run", "--confirm", "--unattended"], "not several"),
+        (["run", "--seed", "-1"], "the seed must be 0 or more"),
+        (["run", "--out", "/dev/null/x"], "cannot use the folder"),
+        (["calibrate", "--profile", "mock", "--out", "/dev/null/x"], "cannot use the folder"),
+        (["calibrate", "--views", "missing"], "no views.json in missing"),
+        (["profiles", "--show", "missing"], "no profile 'missing'"),
+        (["replay", "/dev/null"], "no recording at /dev/null"),
+        (["replay", "missing.mcap"], "no recording at missing.mcap"),
+    ],
+)
+def test_what_cannot_begin_is_one_line_and_exit_status_2(
+    arguments: list[str], words: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with pytest.raises(SystemExit) as end:
+        main(["deploy", *arguments])
+    assert end.value.code == 2
+    error = capsys.readouterr().err
+    assert error.startswith("error: ") and words in error and error.count("\n") == 1
+
+
+def test_profiles_are_listed_and_shown(capsys: pytest.CaptureFixture[str]) -> None:
+    main(["deploy", "profiles"])
+    listed = capsys.readouterr().out
+    assert "mock " in listed and "iiwa14_d435" in listed
+    main(["deploy", "profiles", "--show", "mock"])
+    assert '[arm]\ndriver = "mock"' in capsys.readouterr().out
+
+
+def test_check_looks_at_everything_and_moves_nothing(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    main(["deploy", "check", "--seed", "9", "--out", str(tmp_path)])
+    told = capsys.readouterr().out
+    for what in (
+        "profile",
+        "policy",
+        "calibration",
+        "arm",
+        "limits",
+        "camera",
+        "picture",
+        "target",
+        "decision",
+    ):
+        assert f"ok    {what}" in told
+    assert "FAIL" not in told
+    assert (tmp_path / "check.png").stat().st_size > 1000
+
+
+def test_the_defaults_of_the_command_are_the_mock_profile() -> None:
+    command = parse(["deploy", "run"])
+    assert getattr(command, "command").profile == "mock"  # noqa: B009
+    assert os.fspath(getattr(command, "command").out) == "runs/deploy"  # noqa: B009

@@ -1,0 +1,453 @@
+"""The loop over the digital twin: how runs end, and what every fault does."""
+
+import os
+import signal
+import time
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, get_type_hints
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+
+from maniskill_tomato.assets import asset_path
+from maniskill_tomato.deploy.clock import SimulatedClock
+from maniskill_tomato.deploy.errors import ProfileError
+from maniskill_tomato.deploy.fruits import TruthFinder
+from maniskill_tomato.deploy.guarded_arm import GuardedArm
+from maniskill_tomato.deploy.interface import Frame, JointMove
+from maniskill_tomato.deploy.loop import Loop
+from maniskill_tomato.deploy.loop_config import Proposal
+from maniskill_tomato.deploy.mock.episode import load_episode
+from maniskill_tomato.deploy.perceive import ImagePerception, View
+from maniskill_tomato.deploy.policies import default_policy, open_policy
+from maniskill_tomato.deploy.profile import Profile, load_profile, parse_profile, profile_names
+from maniskill_tomato.deploy.steps import KeptSteps, RunResult
+from maniskill_tomato.deploy.stops import Stops
+from maniskill_tomato.deploy.workcell import Workcell, make_workcell
+from maniskill_tomato.errors import PolicyError
+from maniskill_tomato.policies.base import Planner
+from maniskill_tomato.robot.d435 import T_flange_camera_color_optical
+from maniskill_tomato.robot.kinematics import forward_kinematics
+from maniskill_tomato.sensing.belief import Belief
+
+EPISODE = 9
+
+TEXT = """
+[arm]
+driver = "mock"
+[camera]
+driver = "mock"
+[twin]
+width = 160
+height = 120
+{twin}
+[perception]
+segmenter = "ground_truth"
+[target]
+source = "twin"
+[loop]
+max_moves = 6
+{loop}
+"""
+
+
+def profile(twin: str = "", loop: str = "", more: str = "") -> Profile:
+    return parse_profile(TEXT.format(twin=twin, loop=loop) + more, Path("test.toml"))
+
+
+class Towards(Planner):
+    """Always the same move."""
+
+    name = "towards"
+
+    def __init__(self, action: tuple[float, ...] = (0.3, 0.2, 0.1)) -> None:
+        self.action = action
+        self.asked = 0
+
+    def act(self, belief: Belief) -> Tensor:
+        self.asked += 1
+        return torch.tensor([self.action])
+
+
+def go(
+    of: Profile,
+    policy: Planner | None = None,
+    clock: Any = None,
+    stops: Stops | None = None,
+    seed: int = EPISODE,
+    **options: Any,
+) -> tuple[RunResult, Workcell]:
+    workcell = make_workcell(of, seed, clock)
+    options.setdefault("mode", "unattended")
+    clock_works = not isinstance(clock, JumpingClock)
+    with workcell.arm, workcell.camera, stops or Stops() as listening:
+        loop = workcell.loop(policy or Towards(), listening, **options)
+        result = loop.run()
+        world: Any = workcell.arm
+        speeds = np.abs(world._world.arm.joint_velocities)
+        assert not clock_works or speeds.max() < 1e-3, "the arm stands at the end"
+    return result, workcell
+
+
+def test_a_planner_finds_the_tomato_and_the_run_ends_with_success() -> None:
+    result, _ = go(profile(loop="threshold = 0.8"), open_policy("nbv"), seed=6)
+    assert result.success and result.reason == "success" and not result.is_fault
+    assert result.visible_fraction > 0.8 >= max(result.visible_fractions[:-1])
+    assert result.moves == len(result.visible_fractions) - 1
+    assert result.end_state == "the arm stands and holds its position"
+
+
+def test_a_view_that_never_gets_better_ends_with_the_budget() -> None:
+    result, _ = go(profile(), open_policy("stay"))
+    assert (result.reason, result.moves, result.is_fault, result.success) == ("budget", 6, False, False)
+    assert len(set(result.visible_fractions)) == 1
+
+
+@pytest.mark.parametrize(
+    ("fault", "reason"),
+    [
+        ("unplugged", "not_connected"),
+        ("frozen", "stale"),
+        ("late", "stale"),
+        ("black", "bad_picture"),
+        ("wrong_size", "bad_picture"),
+        ("silent", "timeout"),
+    ],
+)
+def test_a_camera_that_fails_ends_the_run_before_the_next_move(fault: str, reason: str) -> None:
+    result, _ = go(profile(f'faults = {{ camera = "{fault}", camera_from_read = 2 }}'))
+    assert (result.reason, result.is_fault, result.moves) == (reason, True, 2), result.detail
+
+
+def test_without_depth_the_arm_goes_back_once_and_no_farther() -> None:
+    """A leaf may cover the lens; a camera that gives no depth where it gave some before is broken."""
+    faults = 'faults = { camera = "zero_depth", camera_from_read = 2%s }'
+    kept = KeptSteps()
+    broken, workcell = go(profile(faults % ""), recorder=kept)
+    assert (broken.reason, broken.is_fault, broken.moves) == ("bad_picture", True, 3), broken.detail
+    assert [step.outcome for step in kept.steps] == ["moved"] * 3 and kept.steps[2].action is None
+    arm: Any = workcell.arm
+    np.testing.assert_allclose(arm._world.arm.joint_positions, kept.steps[1].joint_positions, atol=1e-6)
+    # Three attempts at one view fail, then there is depth again: the run goes on from the view before.
+    covered, _ = go(profile(faults % ", camera_reads = 3", "threshold = 0.99"))
+    assert not covered.is_fault and covered.moves == 6
+    assert covered.visible_fractions[1] == covered.visible_fractions[3]
+
+
+@pytest.mark.parametrize("fault", ["late", "black", "zero_depth", "wrong_size", "silent"])
+def test_one_bad_picture_is_taken_again(fault: str) -> None:
+    clean, _ = go(profile(loop="threshold = 0.99"))
+    result, _ = go(
+        profile(
+            f'faults = {{ camera = "{fault}", camera_from_read = 1, camera_reads = 1 }}', "threshold = 0.99"
+        )
+    )
+    assert result.reason == clean.reason and not result.is_fault
+    assert result.visible_fractions == clean.visible_fractions
+
+
+@pytest.mark.parametrize(
+    ("fault", "reason", "words"),
+    [
+        ("silent", "timeout", "did not answer"),
+        ("slow", "timeout", "far longer"),
+        ("nan", "fault", "not finite"),
+        ("jump", "fault", "0.400 rad from where joint_2 was sent"),
+        ("drop", "not_connected", "broke during the move"),
+        ("stuck", "fault", "holds it back"),
+    ],
+)
+def test_an_arm_that_fails_ends_the_run(fault: str, reason: str, words: str) -> None:
+    result, workcell = go(profile(f'faults = {{ arm = "{fault}", arm_from_move = 1 }}'))
+    assert (result.reason, result.is_fault) == (reason, True), result.detail
+    assert words in result.detail
+    assert result.moves == 2
+
+
+def test_a_controller_that_takes_no_moves_ends_the_run_as_refused() -> None:
+    result, _ = go(profile('faults = { arm = "refuse" }', "refused_after = 3"))
+    assert (result.reason, result.moves, result.refused_moves) == ("refused", 3, 3)
+    assert "nak" in result.detail
+
+
+class Hidden(ImagePerception):
+    """A segmenter that loses the target after the first picture."""
+
+    def __init__(self) -> None:
+        super().__init__(TruthFinder())
+        self.looks = 0
+
+    def look(self, frame: Frame, T_world_camera: Any, target_position: Any) -> View:
+        view = super().look(frame, T_world_camera, target_position)
+        self.looks += 1
+        empty = np.zeros_like(view.mask)
+        return view if self.looks == 1 else replace(view, visible_fraction=0.0, mask=empty)
+
+
+class Swapped(TruthFinder):
+    """A segmenter that lists the same fruits in another order every time."""
+
+    def __init__(self) -> None:
+        self.looks = 0
+
+    def find(self, frame: Any) -> Any:
+        self.looks += 1
+        found = super().find(frame)
+        return found[self.looks % len(found) :] + found[: self.looks % len(found)] if found else found
+
+
+class Withheld(TruthFinder):
+    """A segmenter that never finds the target, only its neighbours."""
+
+    def find(self, frame: Any) -> Any:
+        return [fruit for fruit in super().find(frame) if fruit.visible_fraction is None]
+
+
+def with_perception(of: Profile, perception: Any, policy: Planner) -> RunResult:
+    workcell = replace(make_workcell(of, EPISODE), perception=perception)
+    with workcell.arm, workcell.camera, Stops() as stops:
+        return workcell.loop(policy, stops, "unattended").run()
+
+
+def test_a_target_that_stays_out_of_sight_is_lost() -> None:
+    result = with_perception(profile(loop="lost_after = 3"), Hidden(), open_policy("stay"))
+    assert (result.reason, result.moves, result.is_fault) == ("target_lost", 3, False)
+
+
+def test_fruits_that_change_places_in_the_list_change_nothing() -> None:
+    plain = with_perception(profile(), ImagePerception(TruthFinder()), open_policy("nbv"))
+    swapped = with_perception(profile(), ImagePerception(Swapped()), open_policy("nbv"))
+    assert swapped.visible_fractions == plain.visible_fractions
+    assert swapped.reason == plain.reason
+
+
+@pytest.mark.parametrize("seed", [7, 9])
+def test_a_neighbour_does_not_pass_for_a_target_that_is_not_found(seed: int) -> None:
+    """Fruits of one truss, and the segmenter never finds the one that is looked for: no success on another one."""
+    of = profile(loop="").text.replace("max_moves = 6", "max_moves = 11")
+    workcell = make_workcell(parse_profile(of, Path("longer.toml")), seed)
+    workcell = replace(workcell, perception=ImagePerception(Withheld()))
+    kept = KeptSteps()
+    with workcell.arm, workcell.camera, Stops() as stops:
+        result = workcell.loop(open_policy(default_policy()), stops, "unattended", kept).run()
+    assert not result.success and not result.is_fault
+    assert max(step.view.fruits_seen for step in kept.steps) > 1
+    assert result.best_visible_fraction < 0.3, "a sliver at most, where a fruit can hardly be located"
+
+
+def test_without_a_given_target_the_largest_fruit_in_the_picture_is_taken() -> None:
+    text = TEXT.format(twin="", loop="").replace('source = "twin"', 'source = "seen"')
+    result, workcell = go(parse_profile(text, Path("seen.toml")), open_policy("nbv"))
+    assert not result.is_fault and result.reason in ("success", "budget", "refused")
+    assert result.visible_fractions[0] > 0.0
+
+
+@pytest.mark.parametrize(
+    ("action", "words"),
+    [
+        ((float("nan"), 0.0, 0.0), "not finite"),
+        ((0.0, float("inf"), 0.0), "not finite"),
+        ((0.0, 1.2, 0.0), r"outside [-1, 1]"),
+        ((0.0, 0.0, 0.0, 0.0, 0.0, 0.0), "another task"),
+    ],
+)
+def test_a_policy_that_answers_nonsense_moves_nothing(action: tuple[float, ...], words: str) -> None:
+    result, workcell = go(profile(), Towards(action))
+    assert (result.reason, result.is_fault, result.moves) == ("policy", True, 0)
+    assert words in result.detail
+    arm: Any = workcell.arm
+    assert arm._commands == 0
+
+
+def test_policies_for_other_tasks_and_with_the_truth_are_refused(tmp_path: Path) -> None:
+    with pytest.raises(PolicyError, match="no view-quality policy"):
+        open_policy(str(asset_path("policies/TomatoViewpointGuided-v1.pt")))
+    with pytest.raises(PolicyError, match="in simulation only"):
+        open_policy("oracle")
+    with pytest.raises(PolicyError, match=r"no policy at .*one of the planners .*nbv"):
+        open_policy(str(tmp_path / "missing.pt"))
+    damaged = tmp_path / "damaged.pt"
+    damaged.write_bytes(b"PK\x03\x04 nothing")
+    with pytest.raises(PolicyError, match="not a readable checkpoint"):
+        open_policy(str(damaged))
+    assert open_policy(default_policy()) is not None
+
+
+class JumpingClock(SimulatedClock):
+    """Goes back by ten seconds once."""
+
+    def __init__(self, after: float) -> None:
+        super().__init__(1000.0)
+        self._after, self._jumped = after, False
+
+    def now(self) -> float:
+        if not self._jumped and super().now() > 1000.0 + self._after:
+            self._jumped = True
+            self.set(super().now() - 10.0)
+        return super().now()
+
+
+@pytest.mark.parametrize("after", [0.02, 0.5, 4.0])
+def test_a_clock_that_jumps_back_is_a_fault(after: float) -> None:
+    result, _ = go(profile(), clock=JumpingClock(after))
+    assert (result.reason, result.is_fault) == ("fault", True)
+    assert "clock went back" in result.detail
+
+
+class KillingClock(SimulatedClock):
+    """Sends this process a signal in the middle of the second move."""
+
+    def __init__(self, number: int) -> None:
+        super().__init__(1000.0)
+        self.number, self.sleeps = number, 0
+
+    def sleep(self, seconds: float) -> None:
+        super().sleep(seconds)
+        self.sleeps += 1
+        if self.sleeps == 60:
+            os.kill(os.getpid(), self.number)
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
+def test_a_signal_in_the_middle_of_a_move_stops_the_arm(number: int) -> None:
+    before = signal.getsignal(number)
+    result, workcell = go(profile(), clock=KillingClock(number))
+    assert (result.reason, result.detail, result.is_fault) == ("stopped", signal.Signals(number).name, False)
+    assert result.end_state == "the arm was stopped and holds its position"
+    assert signal.getsignal(number) is before
+
+
+def test_a_stop_file_ends_the_run_before_anything_moves(tmp_path: Path) -> None:
+    (tmp_path / "STOP").touch()
+    result, workcell = go(profile(), stops=Stops(stop_file=tmp_path / "STOP"))
+    assert (result.reason, result.moves) == ("stopped", 0)
+    assert "STOP" in result.detail
+
+
+class Sleepy(Towards):
+    """A policy that hangs."""
+
+    def act(self, belief: Belief) -> Tensor:
+        time.sleep(1.0)
+        return super().act(belief)
+
+
+def test_a_loop_that_stands_still_loses_its_heartbeat_and_stops_the_arm() -> None:
+    stopped: list[float] = []
+    stops = Stops(heartbeat_s=0.4, on_lost_heartbeat=lambda: stopped.append(time.monotonic()))
+    result, _ = go(profile(), Sleepy(), stops=stops)
+    assert (result.reason, result.is_fault) == ("heartbeat", True)
+    assert len(stopped) == 1
+
+
+def test_people_may_take_longer_than_the_heartbeat_to_confirm_and_can_stop_instead() -> None:
+    def slowly(proposal: Proposal) -> bool:
+        if proposal.number == 0:
+            time.sleep(5.0)
+        return proposal.number == 0
+
+    stops = Stops(heartbeat_s=4.0)
+    result, _ = go(profile(), stops=stops, mode="confirm", confirm=slowly)
+    assert (result.reason, result.moves) == ("declined", 2)
+    stops = Stops()
+
+    def stopping(proposal: Proposal) -> bool:
+        stops.request("SIGINT")
+        return True
+
+    result, workcell = go(profile(), stops=stops, mode="confirm", confirm=stopping)
+    arm: Any = workcell.arm
+    assert result.reason == "stopped" and arm._commands == 0, "a yes does not outweigh a stop"
+
+
+def test_a_dry_run_shows_the_first_move_and_sends_nothing() -> None:
+    result, workcell = go(profile(), mode="dry_run")
+    assert (result.reason, result.is_fault) == ("dry_run", False)
+    assert "would go to (" in result.detail and "safety would" in result.detail
+    arm: Any = workcell.arm
+    assert arm._commands == 0
+
+
+def test_only_confirmed_moves_are_made() -> None:
+    asked: list[Proposal] = []
+
+    def twice(proposal: Proposal) -> bool:
+        asked.append(proposal)
+        return len(asked) <= 2
+
+    result, workcell = go(profile(loop="threshold = 0.99"), mode="confirm", confirm=twice)
+    assert result.reason == "declined"
+    assert [p.number for p in asked] == [0, 1, 2]
+    arm: Any = workcell.arm
+    assert arm._commands == 2
+    assert all(0.0 < p.camera_step < 0.13 for p in asked)
+
+
+def test_every_shipped_profile_can_be_read_and_errors_name_the_key(tmp_path: Path) -> None:
+    assert {"mock", "mock_rendered", "iiwa14_d435"} <= set(profile_names())
+    for name in profile_names():
+        assert load_profile(name).description
+    assert load_profile("iiwa14_d435").safety.workspace.high == (0.8, 0.7, 1.3)
+    for wrong, words in (
+        ("[safety]\nspeed = 1", "safety.speed is unknown; test.toml: safety may have"),
+        ("[safety]\nspeed_fraction = 0.9", "speed_fraction must be at most max_speed_fraction"),
+        ("[safety]\njoint_margin = 'much'", "safety.joint_margin must be a finite number"),
+        ("[stop]\nfile = 'a/b'", "file must be a plain file name"),
+        ("[wheels]\n", "wheels is unknown"),
+        ("[calibration]\nT_flange_camera = [[1, 2], [3, 4]]", "calibration.T_flange_camera must be a 4 x 4"),
+        ("[calibration]\nfile = 'none.json'", "deploy calibrate"),
+        ("[target]\nsource = 'given'\nposition = [500.0, 0.0, 900.0]", "within 1.6 m of the base"),
+        ("[capture]\nattempts = 1.5", "capture.attempts must be a whole number"),
+    ):
+        with pytest.raises(ProfileError) as error:
+            text = TEXT.replace('[target]\nsource = "twin"\n', "") if "[target]" in wrong else TEXT
+            parse_profile(text.format(twin="", loop="") + wrong, Path("test.toml"))
+        assert words in str(error.value)
+    with pytest.raises(ProfileError, match=r"arm\.driver is missing"):
+        parse_profile("[camera]\ndriver = 'mock'", Path("x.toml"))
+    with pytest.raises(ProfileError, match="is no TOML"):
+        parse_profile("[arm", Path("x.toml"))
+    with pytest.raises(ProfileError, match="give the path of a TOML file or one of"):
+        load_profile("nothing")
+    (tmp_path / "binary.toml").write_bytes(b"\xff\xfe\x00")
+    with pytest.raises(ProfileError, match="cannot be read as text"):
+        load_profile(str(tmp_path / "binary.toml"))
+
+
+def test_safety_has_the_camera_where_the_profile_says_that_it_was_measured() -> None:
+    """A wall at the lens of a camera that sits 60 mm farther out than in the drawings."""
+    mount = np.array(T_flange_camera_color_optical)
+    mount[2, 3] += 0.06
+    start = load_episode("held_out", EPISODE).start_joints
+    lens = (forward_kinematics(torch.as_tensor(start[None]))[0].numpy() @ mount)[:3, 3]
+    wall = (
+        f"[safety]\nobstacles = [{{ low = {(lens - 0.005).tolist()}, high = {(lens + 0.005).tolist()} }}]\n"
+        "obstacle_clearance = 0.01\n"
+    )
+    stay = JointMove(joint_positions=start, speed_fraction=0.1)
+    for calibration, reason in (
+        ("", None),
+        (f"[calibration]\nT_flange_camera = {mount.tolist()}\n", "obstacle"),
+    ):
+        workcell = make_workcell(profile(more=wall + calibration), EPISODE)
+        with workcell.arm:
+            refusal = workcell.guarded_arm.safety.check(
+                stay, workcell.guarded_arm.read(), workcell.clock.now()
+            )
+        assert (refusal.reason if refusal else None) == reason
+
+
+def test_only_the_guarded_arm_commands_an_arm() -> None:
+    import maniskill_tomato.deploy as package
+
+    callers = {
+        path.name
+        for path in Path(str(package.__file__)).parent.rglob("*.py")
+        if "_arm.command(" in path.read_text()
+    }
+    # The loop's `_arm` is a `GuardedArm`, which its type says; drivers define `command` but do not call one.
+    assert callers == {"guarded_arm.py", "loop.py"}
+    assert get_type_hints(Loop.__init__)["arm"] is GuardedArm

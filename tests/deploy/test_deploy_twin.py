@@ -1,0 +1,291 @@
+"""The digital twin against the simulated task, and what it shows of itself."""
+
+from typing import Any
+
+import cv2
+import gymnasium as gym
+import numpy as np
+import pytest
+import torch
+
+from maniskill_tomato.deploy.clock import SimulatedClock
+from maniskill_tomato.deploy.drivers import DriverContext, make_arm, make_camera
+from maniskill_tomato.deploy.errors import NotConnectedError, ProfileError
+from maniskill_tomato.deploy.fruits import Fruit, TruthFinder, locate, silhouette_area
+from maniskill_tomato.deploy.interface import JointMove
+from maniskill_tomato.deploy.mock.dynamics import ArmDynamics
+from maniskill_tomato.deploy.mock.episode import load_episode
+from maniskill_tomato.deploy.observing import Observing
+from maniskill_tomato.deploy.perceive import ImagePerception, TruthPerception
+from maniskill_tomato.raycast.picture_caster import FIRST_ORGAN_LABEL, ROBOT_LABEL
+from maniskill_tomato.raycast.view_rays import DEPTH_MODE, RayLabel
+from maniskill_tomato.robot.d435 import (
+    T_flange_camera_color_optical,
+    color_intrinsics,
+    depth_noise_std,
+    min_depth,
+)
+from maniskill_tomato.robot.iiwa14 import READY_QPOS, VELOCITY_LIMITS
+from maniskill_tomato.robot.look_at_move import LookAtMover
+
+SIZE = {"width": 424, "height": 240}
+EPISODE = 4
+"""One whose start posture is clear of the table, so that the twin begins with the task's own joints."""
+
+
+def devices(seed: int = EPISODE, **options: Any) -> tuple[Any, Any]:
+    context = DriverContext(clock=SimulatedClock(100.0), seed=seed)
+    twin = {**SIZE, **options}
+    arm, camera = make_arm("mock", twin, context), make_camera("mock", twin, context)
+    arm.connect()
+    camera.connect()
+    return arm, camera
+
+
+@pytest.fixture(scope="module")
+def env() -> Any:
+    made = gym.make(
+        "TomatoViewpoint-v1",
+        num_envs=1,
+        obs_mode="state",
+        episodes="held_out",
+        render_backend="none",
+        sensor_configs=dict(d435=dict(SIZE)),
+    )
+    yield made
+    made.close()
+
+
+def test_the_loops_observations_are_those_of_the_environment(env: Any) -> None:
+    """Same episode, same actions: the observation vectors differ by less than 1e-6 in every entry."""
+    arm, camera = devices(depth_noise=0.0)
+    observing = Observing(T_flange_camera_color_optical, 20)
+    mover, perception = LookAtMover(), TruthPerception()
+    expected, info = env.reset(seed=EPISODE)
+    joints = arm.read().joint_positions
+    np.testing.assert_allclose(joints, env.unwrapped.agent.robot.get_qpos()[0].numpy(), atol=1e-7)
+    target = load_episode("held_out", EPISODE).target_position.double().numpy()
+    observing.begin(target)
+    actions = [(0.4, 0.3, 0.2), (0.5, -0.2, 0.6), (-0.3, 0.6, 0.3), (0.9, 0.1, -0.2), (0.1, 0.2, 0.7)]
+    for k in range(len(actions) + 1):
+        frame = camera.read()
+        joints = arm.read().joint_positions
+        view = perception.look(frame, observing.camera_pose(joints), target)
+        belief = observing.observe(joints, view, 20 - k)
+        assert float((belief.observation - expected).abs().max()) <= 1e-6, k
+        assert view.visible_fraction == pytest.approx(float(info["visible_fraction"][0]), abs=1e-6)
+        if k == len(actions):
+            break
+        expected, _, _, _, info = env.step(torch.tensor([actions[k]]))
+        position = torch.as_tensor(observing.camera_position(joints)[None])
+        solved = mover.move(
+            torch.tensor(joints[None], dtype=torch.float32),
+            position,
+            torch.as_tensor(target[None]),
+            torch.tensor([actions[k]]),
+        )
+        goal = solved.qpos[0].float().double().numpy()
+        arm.command(JointMove(joint_positions=goal, speed_fraction=0.3))
+        while not arm.wait(0.5):
+            pass
+        np.testing.assert_allclose(arm.read().joint_positions, goal, atol=1e-8)
+
+
+def test_masks_and_depth_tell_nearly_what_exact_rays_tell() -> None:
+    """The route of hardware against the route of the task, on the same views: labels and distances agree."""
+    agreeing, distances, fractions = [], [], []
+    for seed, noise in ((4, 0.0), (9, 0.0), (4, 1.0), (9, 1.0)):
+        arm, camera = devices(seed, depth_noise=noise)
+        observing = Observing(T_flange_camera_color_optical, 20)
+        frame = camera.read()
+        pose = observing.camera_pose(arm.read().joint_positions)
+        target = frame.truth.target_position
+        exact = TruthPerception().look(frame, pose, target)
+        seen = ImagePerception(TruthFinder()).look(frame, pose, target)
+        same = exact.rays.label == seen.rays.label
+        if (
+            noise
+        ):  # Then many rays have no depth: shadows of the stereo baseline and holes, which count as unknown.
+            same |= seen.rays.label == int(RayLabel.OUTSIDE)
+        agreeing.append(float(same.float().mean()))
+        solid = same & (seen.rays.label > int(RayLabel.FREE)) & (exact.rays.label > int(RayLabel.FREE))
+        distances.append((exact.rays.distance - seen.rays.distance)[solid].abs().numpy())
+        fractions.append(abs(exact.visible_fraction - seen.visible_fraction))
+    assert min(agreeing) > 0.95
+    assert float(np.median(np.concatenate(distances))) < 0.005
+    assert max(fractions) < 1e-6, "ground truth tells V_f too"
+
+
+def test_a_picture_agrees_with_the_truth_that_comes_with_it() -> None:
+    """V counted in the picture over the area of the fruit's sphere is near V_f by ray casting."""
+    _, camera = devices(6)
+    frame = camera.read()
+    truth = frame.truth
+    episode = load_episode("held_out", 6)
+    fruit = episode.plant.fruits[episode.target]
+    visible = int((truth.labels == truth.target_label).sum())
+    pose = camera._world.camera_pose()
+    area = silhouette_area(truth.target_position, float(fruit.radius) * 0.95, frame.intrinsics, pose)
+    assert visible / area == pytest.approx(truth.visible_fraction, abs=0.08)
+    assert set(np.unique(truth.labels)) <= {0, ROBOT_LABEL, *range(2, 2 + len(episode.plant.organs))}
+
+
+def test_a_sliver_is_not_a_whole_fruit_whatever_a_segmenter_says() -> None:
+    """It says 0.9 of a fruit for a row of pixels; for the whole fruit its word counts."""
+    arm, camera = devices(6)
+    frame = camera.read()
+    pose = Observing(T_flange_camera_color_optical, 20).camera_pose(arm.read().joint_positions)
+    label = max(frame.truth.ripe_labels, key=lambda label: int((frame.truth.labels == label).sum()))
+    whole = frame.truth.labels == label
+    episode = load_episode("held_out", 6)
+    fruit = next(fruit for fruit in episode.plant.fruits if FIRST_ORGAN_LABEL + fruit.organ_index == label)
+    target = (episode.T_world_plant.double().numpy() @ [*fruit.centre, 1.0])[:3]
+    rows = np.flatnonzero(whole.any(axis=1))
+    sliver = whole.copy()
+    sliver[rows[0] + 1 :] = False
+    assert 0 < sliver.sum() < 0.06 * whole.sum()
+
+    class Boasting(TruthFinder):
+        mask = whole
+
+        def find(self, frame: Any) -> list[Fruit]:
+            return [Fruit(mask=self.mask, visible_fraction=0.9)]
+
+    finder = Boasting()
+    assert ImagePerception(finder).look(frame, pose, target).visible_fraction == 0.9
+    finder.mask = sliver
+    view = ImagePerception(finder).look(frame, pose, target)
+    assert view.mask.any() and view.visible_fraction < 0.25
+
+
+def test_an_unsure_fruit_is_found_again_but_not_chosen_as_the_target() -> None:
+    arm, camera = devices(6, depth_noise=0.0)
+    frame = camera.read()
+    pose = Observing(T_flange_camera_color_optical, 20).camera_pose(arm.read().joint_positions)
+    sizes = {label: int((frame.truth.labels == label).sum()) for label in frame.truth.ripe_labels}
+    large, small = sorted(sizes, key=lambda label: -sizes[label])[:2]
+
+    class Wavering(TruthFinder):
+        def find(self, frame: Any) -> list[Fruit]:
+            masks = [(frame.truth.labels == large, 0.35), (frame.truth.labels == small, 0.8)]
+            return [Fruit(mask=mask, score=score) for mask, score in masks]
+
+    chosen = ImagePerception(Wavering()).find_target(frame, pose)
+    expected = locate(frame.truth.labels == small, frame.depth, frame.intrinsics, pose)
+    assert chosen is not None and expected is not None
+    np.testing.assert_allclose(chosen, expected[0])
+    known = locate(frame.truth.labels == large, frame.depth, frame.intrinsics, pose)
+    assert known is not None
+    assert ImagePerception(Wavering()).look(frame, pose, known[0]).visible_fraction > 0.0
+
+
+def test_fruits_are_located_to_a_centimetre_where_enough_is_seen() -> None:
+    errors = []
+    for seed in (4, 9):
+        _, camera = devices(seed)
+        frame = camera.read()
+        episode, pose = load_episode("held_out", seed), camera._world.camera_pose()
+        T = episode.T_world_plant.double().numpy()
+        for fruit in episode.plant.fruits:
+            label = 2 + fruit.organ_index
+            centre = T[:3, :3] @ np.asarray(fruit.centre, dtype=np.float64) + T[:3, 3]
+            mask = frame.truth.labels == label
+            depth = float((np.linalg.inv(pose) @ [*centre, 1.0])[2])
+            area = silhouette_area(centre, fruit.radius, frame.intrinsics, pose)
+            if depth > 0.9 or mask.sum() < 0.6 * area:
+                continue
+            found = locate(mask, frame.depth, frame.intrinsics, pose)
+            assert found is not None
+            errors.append(float(np.linalg.norm(found[0] - centre)))
+    assert len(errors) >= 5
+    assert float(np.median(errors)) < 0.010 and max(errors) < 0.03
+
+
+def test_the_silhouette_of_a_sphere_is_what_counting_pixels_gives() -> None:
+    intrinsics = color_intrinsics(640, 480)
+    centre, radius = np.array([0.06, -0.04, 0.3]), 0.035
+    rays = intrinsics.ray_directions(intrinsics.pixel_centres())
+    rays /= np.linalg.norm(rays, axis=-1, keepdims=True)
+    along = rays @ centre
+    counted = int(((centre @ centre - along**2) < radius**2).sum())
+    assert silhouette_area(centre, radius, intrinsics, np.eye(4)) == pytest.approx(counted, rel=2e-3)
+    assert silhouette_area(np.array([0, 0, 0.01]), 0.03, intrinsics, np.eye(4)) == float("inf")
+
+
+def test_the_same_seed_gives_the_same_run_and_another_one_another() -> None:
+    def pictures(seed: int) -> list[Any]:
+        arm, camera = devices(seed)
+        frames = [camera.read()]
+        arm.command(JointMove(joint_positions=arm.read().joint_positions + 0.05, speed_fraction=0.2))
+        arm.wait(10.0)
+        return [*frames, camera.read()]
+
+    first, again, other = pictures(6), pictures(6), pictures(7)
+    for a, b in zip(first, again, strict=True):
+        np.testing.assert_array_equal(a.color, b.color)
+        np.testing.assert_array_equal(a.depth, b.depth)
+        assert a.stamp == b.stamp
+    assert not np.array_equal(first[0].color, first[1].color)
+    assert not np.array_equal(first[0].color, other[0].color)
+
+
+def test_a_move_keeps_the_speed_it_is_given_and_arrives() -> None:
+    arm = ArmDynamics(READY_QPOS)
+    goal = READY_QPOS + np.array([0.3, -0.2, 0.4, 0.3, -0.5, 0.2, 0.6])
+    duration = arm.start(goal, 0.2)
+    fastest = np.zeros(7)
+    while arm.moving:
+        arm.advance(arm.time + 0.02)
+        fastest = np.maximum(fastest, np.abs(arm.joint_velocities))
+    assert (fastest < 0.2 * VELOCITY_LIMITS * 1.01).all()
+    assert (fastest / VELOCITY_LIMITS).max() > 0.19
+    assert duration == pytest.approx(1.875 * np.abs((goal - READY_QPOS) / (0.2 * VELOCITY_LIMITS)).max())
+    np.testing.assert_allclose(arm.joint_positions, goal, atol=1e-8)
+
+
+def test_depth_is_what_the_d435_model_of_the_package_makes_of_it() -> None:
+    _, clean = devices(9, depth_noise=0.0)
+    _, noisy = devices(9)
+    _, worse = devices(9, depth_noise=3.0)
+    exact, measured, wild = (camera.read().depth for camera in (clean, noisy, worse))
+    assert exact[exact > 0.0].min() >= min_depth(DEPTH_MODE)
+    np.testing.assert_array_equal(
+        measured, (np.round(measured.astype(np.float64) * 1e3) / 1e3).astype(np.float32)
+    )
+    both = (exact > 0.0) & (measured > 0.0) & (wild > 0.0)
+    assert 0.5 < both.mean() < 0.95, "shadows of the baseline and holes"
+    # Noise in the middle of surfaces, as the formula has it: half of all normal errors are within 0.674 deviations.
+    smooth = both & (cv2.dilate(exact, np.ones((7, 7))) - cv2.erode(exact, np.ones((7, 7))) < 0.01)
+    for depth, factor in ((measured, 1.0), (wild, 3.0)):
+        ratio = np.abs(depth - exact)[smooth] / (factor * depth_noise_std(exact[smooth], DEPTH_MODE))
+        assert float(np.median(ratio)) == pytest.approx(0.674, rel=0.2)
+
+
+def test_devices_want_to_be_connected_and_options_to_be_known() -> None:
+    context = DriverContext(clock=SimulatedClock(), seed=0)
+    arm, camera = make_arm("mock", SIZE, context), make_camera("mock", SIZE, context)
+    for use in (arm.read, camera.read, lambda: camera.intrinsics, lambda: arm.wait(0.1)):
+        with pytest.raises(NotConnectedError, match="connect"):
+            use()
+    with pytest.raises(ProfileError, match=r"twin\.widht is unknown"):
+        make_arm("mock", {"widht": 3}, context)
+    with pytest.raises(ProfileError, match=r"twin\.depth_noise must be a finite number"):
+        make_arm("mock", {"depth_noise": "much"}, context)
+    with pytest.raises(ProfileError, match=r"arm\.driver must be one of mock, sunrise"):
+        make_arm("mok", {}, context)
+
+
+@pytest.mark.render
+def test_sapiens_pictures_lie_on_the_ray_casters() -> None:
+    """The textured picture shows the plant where labels say: ripe fruits are red, nothing is the clear colour."""
+    _, camera = devices(3, renderer="sapien")
+    frame = camera.read()
+    flat = camera._world.color(camera._world.picture())
+    ripe = np.isin(frame.truth.labels, frame.truth.ripe_labels)
+    inner = ripe & np.roll(ripe, 2, 0) & np.roll(ripe, -2, 0) & np.roll(ripe, 2, 1) & np.roll(ripe, -2, 1)
+    red = frame.color[..., 0].astype(int) - frame.color[..., 1]
+    assert inner.sum() > 200
+    assert (red[inner] > 40).mean() > 0.9
+    assert not np.array_equal(frame.color, flat)
+    empty = frame.truth.labels == 0
+    assert frame.color[empty].std(axis=0).max() < 25.0

@@ -1,0 +1,143 @@
+"""The ablation of the learner: what is run, what is kept, and the table."""
+
+import json
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from maniskill_tomato.errors import InvalidInputError, SeedsFailedError
+from maniskill_tomato.experiments.ablation import (
+    VARIANTS,
+    choose_variants,
+    execute,
+    execute_all,
+    plan,
+    steps_to_solved,
+)
+from maniskill_tomato.experiments.ablation_report import ablation_rows, write_ablation
+from maniskill_tomato.experiments.comparison import find_runs, load_run
+from maniskill_tomato.learning.rl.history import TrainingCurves
+from maniskill_tomato.learning.rl.presets import get_preset
+from maniskill_tomato.tasks import THESIS_IDS
+
+GUIDED, SPARSE = THESIS_IDS
+
+
+def test_every_variant_changes_what_it_says_and_nothing_else() -> None:
+    base = get_preset("td3").to_dict()
+    assert VARIANTS[0].changes == {}
+    for variant in VARIANTS:
+        config = replace(get_preset("td3"), **variant.changes).to_dict()
+        changed = {name for name in base if config[name] != base[name]}
+        assert changed == set(variant.changes), variant.name
+    assert len({variant.name for variant in VARIANTS}) == len(VARIANTS)
+
+
+def test_the_plan_leaves_out_what_makes_no_sense_and_names_what_it_does_not_know(tmp_path: Path) -> None:
+    runs = plan("td3", VARIANTS, THESIS_IDS, (0, 1), tmp_path)
+    assert len(runs) == 2 * (2 * len(VARIANTS) - 1)
+    assert len({run.folder for run in runs}) == len(runs)
+    assert all(run.env_id == SPARSE for run in runs if run.variant.name == "hindsight-targets")
+    assert [run.seed for run in runs] == sorted(run.seed for run in runs)
+    with pytest.raises(InvalidInputError, match="a variant must be one of 'base'.*; got 'her'"):
+        choose_variants(["her"])
+    with pytest.raises(InvalidInputError, match="seeds must be one or more different numbers"):
+        plan("td3", VARIANTS, THESIS_IDS, (1, 1), tmp_path)
+    with pytest.raises(InvalidInputError, match="a task must be one of"):
+        plan("td3", VARIANTS, ["Reach-v0"], (1,), tmp_path)
+
+
+def test_a_run_is_done_once_and_kept(tmp_path: Path) -> None:
+    variants = choose_variants(["base"])
+    (run,) = plan("td3", variants, [GUIDED], [3], tmp_path, episodes=2, total_timesteps=60)
+    result = execute(run)
+    assert result is not None and result["training_steps"] == 60 and result["updates"] == 0
+    assert 0.0 < result["training_cpu_seconds"] < 60.0 and 0.0 <= result["success_rate"] <= 1.0
+    written = (run.folder / "policy.pt").stat().st_mtime_ns
+    assert list(execute_all([run], jobs=1)) == [(run, json.loads((run.folder / "result.json").read_text()))]
+    assert execute(run) == result and (run.folder / "policy.pt").stat().st_mtime_ns == written
+    (found,) = [load_run(path) for path in find_runs([tmp_path / GUIDED / "base"])]
+    assert found.metrics is not None and found.metrics["success_rate"] == result["success_rate"]
+    for other in (replace(run, episodes=3), replace(run, config=replace(run.config, gamma=0.5))):
+        with pytest.raises(InvalidInputError, match="holds a run of other settings"):
+            execute(other)
+
+
+@pytest.mark.slow
+def test_a_run_that_fails_does_not_stop_the_others(tmp_path: Path) -> None:
+    good, bad = plan("td3", choose_variants(["base", "no-delay"]), [GUIDED], [0], tmp_path, 1, 40)
+    bad = replace(bad, config=replace(bad.config, action_scale=(0.1, 0.1)))
+    done = []
+    with pytest.raises(SeedsFailedError, match="1 of 2 runs failed: .*no-delay"):
+        for run, _ in execute_all([bad, good], jobs=2):
+            done.append(run)
+    assert done == [good] and good.finished() is not None
+
+
+def curves(success: list[float], lengths: list[int]) -> TrainingCurves:
+    episodes = {"success": np.array(success), "end_step": np.cumsum(lengths).astype(np.float64)}
+    return TrainingCurves(episodes, np.zeros(0, np.float32), np.zeros(0, np.float32))
+
+
+def test_steps_to_solved_against_a_plain_loop() -> None:
+    random = np.random.default_rng(0)
+    for rise in (60.0, 150.0, 1000.0):
+        success = [float(random.random() < k / rise) for k in range(400)]
+        lengths = [int(n) for n in random.integers(1, 30, 400)]
+        history = curves(success, lengths)
+        for learning_starts in (0, 3000):
+            wanted = None
+            kept = [i for i in range(400) if sum(lengths[: i + 1]) > learning_starts]
+            for last in range(49, len(kept)):
+                window = [success[i] for i in kept[last - 49 : last + 1]]
+                if sum(window) / 50 >= 0.95:
+                    wanted = sum(lengths[: kept[last] + 1])
+                    break
+            assert steps_to_solved(history, learning_starts) == wanted
+    assert steps_to_solved(curves([1.0] * 49, [1] * 49), 0) is None
+
+
+def result(env_id: str, variant: str, seed: int, success: float, **changes: Any) -> dict[str, Any]:
+    return {
+        "env_id": env_id,
+        "variant": variant,
+        "seed": seed,
+        "episodes": 100,
+        "success_rate": success,
+        "mean_steps": 10.0 - success,
+        "training_seconds": 40.0 + seed,
+        "training_cpu_seconds": 30.0 + seed,
+        "steps_to_solved": None if success < 0.9 else 1000 * (seed + 1),
+        "config": {},
+        **changes,
+    }
+
+
+def test_the_table_has_interquartile_means_over_seeds_and_over_tasks(tmp_path: Path) -> None:
+    variants = choose_variants(["base", "hindsight-targets"])
+    base = {GUIDED: [0.0, 0.9, 0.92, 1.0], SPARSE: [0.5, 0.6, 0.7, 0.8]}
+    results = [result(env, "base", seed, s) for env, all_ in base.items() for seed, s in enumerate(all_)]
+    results += [result(SPARSE, "hindsight-targets", 0, 0.75)]
+    rows = ablation_rows(variants, results)
+    assert [(row.task, row.variant) for row in rows] == [
+        (GUIDED, "base"),
+        (SPARSE, "base"),
+        (SPARSE, "hindsight-targets"),
+        ("2 tasks", "base"),
+    ]
+    guided, sparse, hindsight, both = rows
+    assert guided.success_rate.estimate == pytest.approx((0.9 + 0.92) / 2)
+    assert sparse.success_rate.estimate == pytest.approx(0.65)
+    assert both.success_rate.estimate == pytest.approx((0.6 + 0.7 + 0.8 + 0.9) / 4)
+    assert hindsight.success_rate.low is None  # A single run has no interval.
+    assert guided.success_rate.low is not None and guided.success_rate.low < 0.9
+    assert (guided.steps_to_solved, guided.solved_runs, guided.runs) == (3000.0, 3, 4)
+    assert (sparse.steps_to_solved, both.training_cpu_seconds) == (None, 31.5)
+    table = write_ablation("td3", variants, results, tmp_path)
+    assert "| never (0 of 4) |" in table and "3,000 (3 of 4)" in table
+    content = json.loads((tmp_path / "ablation.json").read_text())
+    assert len(content["rows"]) == 4 and len(content["runs"]) == 9
+    assert (tmp_path / "ablation.md").read_text().startswith(table)

@@ -1,0 +1,363 @@
+"""The thesis's experiments over seeds: definitions, resuming, tables, figure data, the script from end to end."""
+
+import dataclasses
+import json
+import math
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import imageio.v2 as imageio
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+
+from maniskill_tomato.errors import InvalidInputError
+from maniskill_tomato.experiments.camera_frustum import frustum_faces, frustum_points
+from maniskill_tomato.experiments.reproduction import (
+    SATURATED,
+    ReachCounter,
+    Reproduction,
+    bootstrap_interval,
+    load_episodes,
+    saturated_share,
+    save_episodes,
+    untrained_first_steps,
+)
+from maniskill_tomato.experiments.rollout import Episode
+from maniskill_tomato.experiments.thesis_experiments import (
+    EXPERIMENTS,
+    IDEAS,
+    PARTS_OF_TD3,
+    SINGLE_CHANGES,
+    Experiment,
+    find_variant,
+    variants_of,
+)
+from maniskill_tomato.experiments.thesis_figures import (
+    averaged_curve,
+    camera_opacities,
+    marked_views,
+    most_successful,
+    plot_camera_ways,
+    plot_evaluation,
+    plot_plant_positions,
+)
+from maniskill_tomato.experiments.thesis_views import episode_to_show
+from maniskill_tomato.learning.rl.agent import make_actor, make_normalizer
+from maniskill_tomato.learning.rl.policy import Policy
+from maniskill_tomato.learning.rl.presets import PRESETS
+
+ROOT = Path(__file__).resolve().parents[2]
+GUIDED = EXPERIMENTS["guided"]
+
+
+def make_episode(seed: int, steps: int, success: bool) -> Episode:
+    """An episode whose V_f climbs evenly to 0.9 if it is a success, to 0.4 otherwise."""
+    rng = np.random.default_rng(seed)
+    viewpoints = rng.uniform(-0.2, 0.2, (steps + 1, 6)) + np.array([0.1, 0.0, 0.9, 0.0, math.pi / 2, 0.0])
+    return Episode(
+        seed=seed,
+        success=success,
+        viewpoints=viewpoints,
+        target=np.array([0.8, 0.1, 0.8]),
+        visible_fraction=np.linspace(0.0, 0.9 if success else 0.4, steps + 1),
+        rewards=rng.uniform(size=steps),
+        reachability=np.array([2] + [0] * (steps - 1)),
+        in_forbidden_zone=np.array([False] * (steps - 1) + [True]),
+    )
+
+
+def differing_fields(a: Any, b: Any) -> set[str]:
+    return {f.name for f in dataclasses.fields(a) if getattr(a, f.name) != getattr(b, f.name)}
+
+
+@pytest.mark.parametrize("experiment", EXPERIMENTS.values(), ids=lambda e: e.name)
+def test_the_exact_variant_is_the_preset_and_every_single_change_changes_one_field(
+    experiment: Experiment,
+) -> None:
+    preset = PRESETS[experiment.preset]
+    assert find_variant(experiment, "exact").config(experiment) == preset
+    for variant in SINGLE_CHANGES:
+        if experiment.name in variant.experiments:
+            assert differing_fields(variant.config(experiment), preset) == set(variant.changes)
+            assert len(variant.changes) == 1, variant.name
+
+
+@pytest.mark.parametrize("experiment", EXPERIMENTS.values(), ids=lambda e: e.name)
+def test_variant_names_are_unique(experiment: Experiment) -> None:
+    changes = [v for v in (*SINGLE_CHANGES, *IDEAS) if experiment.name in v.experiments]
+    assert len(variants_of(experiment)) == len(changes) + 2  # The exact settings and td3.
+
+
+@pytest.mark.parametrize("experiment", EXPERIMENTS.values(), ids=lambda e: e.name)
+def test_the_parts_lead_from_the_exact_settings_to_td3_and_back(experiment: Experiment) -> None:
+    exact, td3 = PRESETS[experiment.preset], PRESETS["td3"]
+    there = find_variant(experiment, "+".join(PARTS_OF_TD3)).config(experiment)
+    assert differing_fields(there, td3) == {"step_cost", "pre_tanh_penalty"}
+    back = find_variant(experiment, "td3-without-" + "+".join(PARTS_OF_TD3)).config(experiment)
+    assert differing_fields(back, exact) == {"step_cost"}
+    assert find_variant(experiment, "td3").config(experiment) == td3
+
+
+def test_changes_can_be_made_together_and_parts_of_td3_left_out() -> None:
+    both = find_variant(GUIDED, "small-actions+gamma-0.9").config(GUIDED)
+    assert differing_fields(both, PRESETS["thesis-guided"]) == {"action_scale", "gamma"}
+    assert (both.gamma, both.action_scale[0]) == (0.9, 0.35)
+    less = find_variant(GUIDED, "td3-without-gamma-0.9+15000-steps").config(GUIDED)
+    assert differing_fields(less, PRESETS["td3"]) == {"gamma", "total_episodes", "total_timesteps"}
+    assert (less.gamma, less.total_episodes, less.total_timesteps) == (0.99, 240, None)
+
+
+@pytest.mark.parametrize(
+    ("name", "problem"),
+    [
+        ("tau-0.005+tau-0.01", "tau-0.01 changes nothing, or what another part changes already"),
+        ("gamma-0.9+exact", "exact changes nothing"),
+        ("gamma-0.9+td3", "td3 changes nothing"),
+        ("gamma-0.9+nonsense", "variant of guided must be one of 'exact'"),
+        ("td3-without-double-episodes", "part of td3 must be one of 'look-at-goals'"),
+    ],
+)
+def test_variants_that_contradict_themselves_are_refused(name: str, problem: str) -> None:
+    with pytest.raises(InvalidInputError, match=problem):
+        find_variant(GUIDED, name)
+
+
+def test_the_experiments_have_the_numbers_of_the_thesis() -> None:
+    guided, sparse = EXPERIMENTS["guided"], EXPERIMENTS["sparse"]
+    for experiment, episodes, buffer, exploration in ((guided, 240, 1000, 1200), (sparse, 500, 1500, 1800)):
+        config = find_variant(experiment, "exact").config(experiment)
+        assert (config.total_episodes, config.buffer_size) == (episodes, buffer)
+        assert config.exploration_steps == exploration
+        assert (config.gamma, config.batch_size, config.tau) == (0.99, 32, 0.001)
+        assert (config.actor_learning_rate, config.critic_learning_rate) == (1e-4, 1e-3)
+    assert guided.windows == (12, 75)
+    assert sparse.windows == (30, 180)
+    # The thesis's last epsilon, 0.6195, follows from its 1278 steps (Eq. 5-5).
+    assert guided.thesis.total_steps is not None
+    assert 0.3 + 0.3 * guided.thesis.total_steps / 1200 == pytest.approx(0.6195)
+
+
+def test_an_unknown_variant_is_refused_with_the_known_ones() -> None:
+    with pytest.raises(InvalidInputError, match="small-actions"):
+        find_variant(GUIDED, "big-actions")
+    with pytest.raises(InvalidInputError, match="wide-noise"):
+        find_variant(EXPERIMENTS["sparse"], "slow-exploration")
+
+
+def test_episodes_survive_saving(tmp_path: Path) -> None:
+    episodes = [make_episode(3, 2, True), make_episode(4, 5, False), make_episode(5, 1, True)]
+    save_episodes(tmp_path / "folder" / "episodes.npz", episodes)
+    loaded = load_episodes(tmp_path / "folder" / "episodes.npz")
+    assert len(loaded) == 3
+    for before, after in zip(episodes, loaded, strict=True):
+        for field in dataclasses.fields(Episode):
+            np.testing.assert_array_equal(getattr(before, field.name), getattr(after, field.name))
+    assert [p.name for p in (tmp_path / "folder").iterdir()] == ["episodes.npz"]
+
+
+@pytest.mark.parametrize("window", [1, 4, 12, 50])
+def test_averaged_curves_agree_with_a_plain_loop(window: int) -> None:
+    values = np.random.default_rng(0).normal(size=20)
+    ends, average = averaged_curve(values, window)
+    width = min(window, len(values))
+    expected = [(end, sum(values[end - width : end]) / width) for end in range(width, len(values) + 1)]
+    assert ends.tolist() == [end for end, _ in expected]
+    np.testing.assert_allclose(average, [mean for _, mean in expected], rtol=0, atol=1e-12)
+
+
+def test_bootstrap_interval_of_three_seeds_can_be_counted_by_hand() -> None:
+    # All seeds equal: no spread. One of two seeds: the means 0, 0.5, 1 have probabilities 1/4, 1/2, 1/4.
+    assert bootstrap_interval([0.7, 0.7, 0.7]) == pytest.approx((0.7, 0.7))
+    assert bootstrap_interval([0.0, 1.0]) == (0.0, 1.0)
+    # One success of five: the mean is at most 0.4 with probability 0.942 and at most 0.6 with 0.993.
+    assert bootstrap_interval([0.0, 0.0, 0.0, 0.0, 1.0]) == pytest.approx((0.0, 0.6))
+    with pytest.raises(InvalidInputError):
+        bootstrap_interval([])
+
+
+def test_saturated_share_counts_outputs_near_one() -> None:
+    config = PRESETS["thesis-guided"]
+    actor = make_actor(config, 9, 6)
+    with torch.no_grad():
+        actor.output.weight.zero_()
+        # tanh(3) = 0.995 is saturated, tanh(1.5) = 0.905 is not.
+        actor.output.bias.copy_(torch.tensor([3.0, -3.0, 1.5, -1.5, 0.0, 0.0]))
+    policy = Policy(
+        actor=actor,
+        normalizer=make_normalizer(config, 9),
+        action_scale=torch.ones(6),
+        action_low=-torch.ones(6),
+        action_high=torch.ones(6),
+        config=config,
+        env_id=GUIDED.env_id,
+        package_version="0",
+        counters={},
+    )
+    assert math.tanh(1.5) < SATURATED < math.tanh(3.0)
+    assert saturated_share(policy, [make_episode(0, 3, True), make_episode(1, 4, False)]) == pytest.approx(
+        1 / 3
+    )
+
+
+class ScriptedEnv:
+    """A learner's environment whose steps have given outcomes; the last step of an episode resets."""
+
+    num_envs = 1
+    single_observation_space = None
+    single_action_space = None
+
+    def __init__(self, reachability: list[int], ends: list[bool]) -> None:
+        self._script = iter(zip(reachability, ends, strict=True))
+
+    def reset(self, *, seed: int | list[int] | None = None) -> tuple[Tensor, dict[str, Any]]:
+        return torch.zeros(1, 9), {}
+
+    def step(self, actions: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor, dict[str, Any]]:
+        reached, end = next(self._script)
+        info: dict[str, Any] = {"reachability": torch.tensor([reached])}
+        if end:
+            info = {"reachability": torch.tensor([0]), "final_info": info}
+        return torch.zeros(1, 9), torch.zeros(1), torch.tensor([end]), torch.tensor([False]), info
+
+    def close(self) -> None:
+        pass
+
+
+def test_reach_is_counted_in_the_step_that_ends_an_episode_too() -> None:
+    env = ReachCounter(ScriptedEnv([0, 1, 2, 2, 0], [False, False, True, True, False]))  # type: ignore[arg-type] # pyright: ignore[reportArgumentType]
+    env.reset(seed=0)
+    for _ in range(5):
+        env.step(torch.zeros(1, 6))
+    assert env.counts.tolist() == [2, 1, 2]
+
+
+def test_the_frustum_is_a_pyramid_around_the_viewing_direction() -> None:
+    # Looking along +x from (0, 0, 1): pitch pi/2 turns the tool's z axis there.
+    points = frustum_points(np.array([0.0, 0.0, 1.0, 0.0, math.pi / 2, 0.0]), depth=0.2)
+    assert points.shape == (5, 3)
+    np.testing.assert_allclose(points[1:, 0] - points[0, 0], 0.2, atol=1e-9)
+    centre = points[1:].mean(axis=0) - points[0]
+    np.testing.assert_allclose(centre, [0.2, 0.0, 0.0], atol=1e-9)
+    # 42.5 degrees one way and 4:3 times its tangent the other way.
+    half = 0.2 * math.tan(math.radians(42.5) / 2)
+    spans = sorted(np.ptp(points[1:], axis=0)[1:])
+    np.testing.assert_allclose(spans, [2 * half, 2 * half * 4 / 3], rtol=1e-6)
+    assert [face.shape for face in frustum_faces(points)] == [(3, 3)] * 4 + [(4, 3)]
+
+
+def test_cameras_stand_at_the_first_middle_and_last_view() -> None:
+    assert marked_views(make_episode(0, 8, True)) == [0, 4, 8]
+    assert marked_views(make_episode(0, 2, True)) == [0, 1, 2]
+    assert marked_views(make_episode(0, 1, True)) == [0, 1]
+    first, middle, last = camera_opacities(3)
+    assert first > last > middle
+    assert camera_opacities(2) == [first, last]
+
+
+def test_the_best_seed_and_the_first_solved_episode_are_shown() -> None:
+    failing, mixed = [make_episode(7, 2, False)] * 2, [make_episode(8, 2, False), make_episode(9, 2, True)]
+    assert most_successful({0: failing, 4: mixed, 5: mixed}) == 4
+    assert episode_to_show(mixed) == 9
+    assert episode_to_show(failing) == 7
+
+
+def test_figures_are_drawn_for_one_seed_and_for_several(tmp_path: Path) -> None:
+    episodes = [make_episode(i, 1 + i % 4, i % 2 == 0) for i in range(8)]
+    plot_evaluation({0: episodes}, 0.85, "one", tmp_path / "one.png")
+    plot_evaluation({s: episodes for s in range(9)}, 0.85, "nine", tmp_path / "nine.png")
+    plot_camera_ways(episodes, "ways", tmp_path / "ways.png")
+    plot_plant_positions(GUIDED, tmp_path / "plants.png")
+    for path in tmp_path.iterdir():
+        assert np.asarray(imageio.imread(path)).std() > 5.0, path.name
+    with pytest.raises(InvalidInputError):
+        plot_camera_ways([], "none", tmp_path / "none.png")
+
+
+def test_untrained_actors_of_small_scale_move_less() -> None:
+    exact = PRESETS["thesis-sparse"]
+    still = dataclasses.replace(exact, actor_output_init="small")
+    wild = untrained_first_steps(EXPERIMENTS["sparse"].env_id, exact, 8)
+    calm = untrained_first_steps(EXPERIMENTS["sparse"].env_id, still, 8)
+    assert wild["mean_move_m"] > 0.3 > 0.05 > calm["mean_move_m"] > 0.0
+    assert calm["unreachable_share"] < wild["unreachable_share"] <= 1.0
+    assert calm["saturated_output_share"] == 0.0
+
+
+def test_a_finished_seed_is_kept_and_other_settings_are_refused(tmp_path: Path) -> None:
+    reproduction = Reproduction(
+        experiment=GUIDED,
+        variant=find_variant(GUIDED, "small-actions"),
+        folder=tmp_path,
+        evaluation_episodes=2,
+        training_episodes=2,
+        show_progress=False,
+    )
+    first = reproduction.run_seed(3, GUIDED.evaluations[:1])
+    assert first["training"]["episodes"] == 2
+    assert set(first["evaluations"]) == {"training-pose"}
+    policy = reproduction.seed_folder(3) / "training" / "policy.pt"
+    written = policy.stat().st_mtime_ns
+    again = reproduction.run_seed(3, GUIDED.evaluations[:2])
+    assert policy.stat().st_mtime_ns == written
+    assert again["training"] == first["training"]
+    assert again["evaluations"]["training-pose"] == first["evaluations"]["training-pose"]
+    assert set(again["evaluations"]) == {"training-pose", "one-tomato"}
+    other = dataclasses.replace(reproduction, training_episodes=3)
+    with pytest.raises(InvalidInputError, match="other settings"):
+        other.run_seed(3, GUIDED.evaluations[:1])
+
+
+def test_a_training_that_was_cut_off_starts_anew(tmp_path: Path) -> None:
+    reproduction = Reproduction(
+        experiment=GUIDED,
+        variant=find_variant(GUIDED, "exact"),
+        folder=tmp_path,
+        evaluation_episodes=1,
+        training_episodes=1,
+        show_progress=False,
+    )
+    first = reproduction.run_seed(0, GUIDED.evaluations[:1])
+    (reproduction.seed_folder(0) / "training.json").unlink()
+    again = reproduction.run_seed(0, GUIDED.evaluations[:1])
+    first["training"].pop("seconds")
+    again["training"].pop("seconds")
+    assert again == first
+
+
+def run_script(*arguments: str) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(
+        [sys.executable, str(ROOT / "scripts" / "reproduce.py"), *arguments],
+        capture_output=True,
+        text=True,
+        timeout=300,
+        check=False,
+    )
+
+
+def test_the_script_runs_from_end_to_end(tmp_path: Path) -> None:
+    tiny = ("--training-episodes", "2", "--episodes", "2", "--untrained", "2", "--no-views")
+    result = run_script("sparse", "--seeds", "0", "1", "--out", str(tmp_path), *tiny)
+    assert result.returncode == 0, result.stderr
+    folder = tmp_path / "sparse" / "exact"
+    figures = {path.name for path in (folder / "figures").iterdir()}
+    assert figures == {
+        "training.png",
+        "plants.png",
+        "evaluation_training-pose.png",
+        "evaluation_three-tomatoes.png",
+        "trajectories_training-pose.png",
+        "trajectories_three-tomatoes.png",
+    }
+    summaries = json.loads((folder / "summary.json").read_text())
+    assert [s["seed"] for s in summaries] == [0, 1]
+    assert set(summaries[0]["evaluations"]) == {"training-pose", "three-tomatoes"}
+
+
+def test_the_script_names_unknown_variants(tmp_path: Path) -> None:
+    result = run_script("guided", "--variant", "nonsense", "--out", str(tmp_path))
+    assert result.returncode == 2
+    assert result.stderr.splitlines()[-1].startswith("error: variant of guided must be one of 'exact'")

@@ -1,0 +1,426 @@
+"""The view-quality policy: features, network, search, data, training, files, and its evaluation."""
+
+import json
+import math
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from torch import Tensor
+
+from maniskill_tomato.cli import main
+from maniskill_tomato.errors import CheckpointError, InvalidInputError
+from maniskill_tomato.experiments.metrics import summarise
+from maniskill_tomato.experiments.rollout import run_episodes
+from maniskill_tomato.experiments.view_rollout import run_view_episode
+from maniskill_tomato.experiments.viewpoint_policy import acting_policy, open_viewpoint_policy
+from maniskill_tomato.learning.rl.envs import make_env
+from maniskill_tomato.learning.script import parse_env_options, run_training
+from maniskill_tomato.learning.view_quality.collect import QualityData, collect_episodes
+from maniskill_tomato.learning.view_quality.fit import FitConfig, fit, judge, mirrored
+from maniskill_tomato.learning.view_quality.training import QualityTrainConfig, train_view_quality
+from maniskill_tomato.policies.moves import move_towards
+from maniskill_tomato.policies.next_best_view import NextBestView
+from maniskill_tomato.policies.quality_features import FEATURES, MAP_CHANNELS, SCALARS, quality_features
+from maniskill_tomato.policies.quality_network import ViewQualityNetwork
+from maniskill_tomato.policies.view_quality import (
+    ViewQuality,
+    ViewQualityConfig,
+    load_view_quality,
+    new_network,
+    save_view_quality,
+)
+from maniskill_tomato.robot.look_at import look_at_pose
+from maniskill_tomato.sensing.belief import Belief
+from maniskill_tomato.sensing.view_lattice import AZIMUTHS, DISTANCES, ELEVATIONS
+
+ONE = torch.zeros(1, dtype=torch.int64)
+PLANT = {"seed": 7, "row": False, "leaf_density": 1.2}
+
+
+@pytest.fixture(scope="module")
+def env() -> Iterator[Any]:
+    env = make_env("TomatoViewpoint-v1", plant=PLANT)
+    yield env
+    env.close()
+
+
+@pytest.fixture
+def belief(env: Any) -> Belief:
+    env.reset(seed=3)
+    env.step(torch.tensor([[0.6, 0.3, 0.0]]))
+    return env.unwrapped.belief  # type: ignore[no-any-return]
+
+
+class Oracle(ViewQualityNetwork):
+    """Says what it is told."""
+
+    def __init__(self, probability: Tensor) -> None:
+        super().__init__(MAP_CHANNELS, SCALARS, DISTANCES, width=4, blocks=1)
+        self._logits = torch.logit(probability, eps=1e-6).view(1, AZIMUTHS, ELEVATIONS, DISTANCES)
+
+    def forward(self, maps: Tensor, scalars: Tensor) -> tuple[Tensor, Tensor]:
+        return self._logits, self._logits.sigmoid()
+
+
+def told(belief: Belief, probability: dict[int, float], **settings: float) -> ViewQuality:
+    """A policy that believes these candidates to be good, and no other."""
+    values = torch.zeros(belief.lattice.size)
+    for k, p in probability.items():
+        values[k] = p
+    policy = ViewQuality(Oracle(values), ViewQualityConfig(**settings))
+    policy.begin(belief, ONE)
+    return policy
+
+
+def by_distance(belief: Belief) -> list[int]:
+    """The reachable candidates that a move does not reach, nearest first."""
+    away = (belief.lattice.positions(belief.target_position) - belief.camera_position[:, None])[0]
+    way = away.norm(dim=-1)
+    return [k for k in way.argsort().tolist() if bool(belief.reachable[0, k]) and float(way[k]) > 0.13]
+
+
+# ---------------------------------------------------------------- features
+
+
+def test_features_are_those_of_each_candidate(belief: Belief) -> None:
+    maps, scalars = quality_features(belief)
+    assert maps.shape == (1, MAP_CHANNELS, AZIMUTHS, ELEVATIONS) and scalars.shape == (1, SCALARS)
+    table = maps.view(len(FEATURES), DISTANCES, AZIMUTHS, ELEVATIONS)
+    target, camera = belief.target_position[0], belief.camera_position[0]
+    for a, e, d in ((0, 0, 0), (6, 4, 1), (12, 8, 3), (3, 5, 2)):
+        k = int(belief.lattice.index(a, e, d))
+        position = target + belief.lattice.offsets[k]
+        expected, unknown = belief.memory.predict(position[None, None])[0, 0]
+        gaps = [float((position - v).norm()) for v in belief.memory.visited[0, :2]]
+        wanted = [
+            float(expected),
+            float(unknown),
+            math.exp(-((min(gaps) / 0.06) ** 2)),
+            float(belief.reachable[0, k]),
+            float((position - camera).norm()) / 1.2,
+        ]
+        torch.testing.assert_close(table[:, d, a, e], torch.tensor(wanted), rtol=1e-4, atol=1e-5)
+
+
+def test_scalars_tell_where_the_camera_and_the_target_are(belief: Belief) -> None:
+    _, scalars = quality_features(belief)
+    offset = belief.camera_position[0] - belief.target_position[0]
+    distance = float(offset.norm())
+    middle, half = torch.tensor([0.7, 0.0, 0.8]), torch.tensor([0.5, 0.5, 0.6])
+    wanted = torch.cat(
+        [
+            belief.visible_fraction,
+            torch.tensor([distance]),
+            offset / distance,
+            (belief.target_position[0] - middle) / half,
+            torch.tensor([19 / 20]),
+        ]
+    )
+    torch.testing.assert_close(scalars[0], wanted)
+
+
+def test_a_mirror_image_exchanges_left_and_right_and_nothing_else() -> None:
+    maps, scalars = torch.randn(3, MAP_CHANNELS, AZIMUTHS, ELEVATIONS), torch.randn(3, SCALARS)
+    flip = torch.tensor([True, False, True])
+    there, numbers = mirrored(maps, scalars, flip)
+    torch.testing.assert_close(there[0, :, 0], maps[0, :, -1])
+    torch.testing.assert_close(there[1], maps[1])
+    assert numbers[0, 3] == -scalars[0, 3] and numbers[0, 6] == -scalars[0, 6]
+    assert numbers[0, 0] == scalars[0, 0] and numbers[1, 3] == scalars[1, 3]
+    back, same = mirrored(there, numbers, flip)
+    torch.testing.assert_close(back, maps)
+    torch.testing.assert_close(same, scalars)
+
+
+# ------------------------------------------------------------------ search
+
+
+def test_the_policy_moves_towards_the_one_good_view(belief: Belief) -> None:
+    k = by_distance(belief)[20]
+    action = told(belief, {k: 0.9}).act(belief)
+    goal = belief.lattice.positions(belief.target_position)[:, k]
+    wanted = move_towards(belief.camera_position, belief.target_position, goal)
+    torch.testing.assert_close(action, wanted)
+
+
+def test_patience_decides_between_a_near_guess_and_a_far_certainty(belief: Belief) -> None:
+    order = by_distance(belief)
+    near, far = order[0], order[-1]
+    goals = belief.lattice.positions(belief.target_position)[0]
+    for patience, chosen in ((2.0, near), (200.0, far)):
+        action = told(belief, {near: 0.5, far: 1.0}, patience=patience).act(belief)
+        wanted = move_towards(belief.camera_position, belief.target_position, goals[None, chosen])
+        torch.testing.assert_close(action, wanted)
+
+
+def test_views_out_of_reach_are_not_chosen(belief: Belief) -> None:
+    outside = int((~belief.reachable[0]).nonzero()[0, 0])
+    k = by_distance(belief)[5]
+    action = told(belief, {outside: 1.0, k: 0.6}).act(belief)
+    goal = belief.lattice.positions(belief.target_position)[:, k]
+    wanted = move_towards(belief.camera_position, belief.target_position, goal)
+    torch.testing.assert_close(action, wanted)
+
+
+def test_a_view_towards_which_the_arm_did_not_move_is_given_up(belief: Belief) -> None:
+    order = by_distance(belief)
+    policy = told(belief, {order[4]: 0.9, order[9]: 0.8}, patience=1000.0)
+    goals = belief.lattice.positions(belief.target_position)
+    for chosen in (order[4], order[9]):  # The camera stays where it is.
+        wanted = move_towards(belief.camera_position, belief.target_position, goals[:, chosen])
+        torch.testing.assert_close(policy.act(belief), wanted)
+
+
+def test_settings_out_of_range_are_refused() -> None:
+    for value in (0.0, -1.0, math.inf, math.nan):
+        with pytest.raises(InvalidInputError, match="patience"):
+            ViewQualityConfig(patience=value)
+    with pytest.raises(InvalidInputError, match="blocks"):
+        ViewQualityNetwork(4, 4, 4, blocks=0)
+    with pytest.raises(InvalidInputError, match="learning_rate"):
+        FitConfig(learning_rate=0.0)
+    with pytest.raises(InvalidInputError, match="rounds"):
+        QualityTrainConfig(rounds=())
+
+
+# ------------------------------------------------------------ data, training
+
+
+def test_what_is_collected_is_the_truth(env: Any) -> None:
+    data = collect_episodes(env, range(5, 7))
+    assert len(data.visible_fraction) == 2 and set(data.episode.tolist()) == {0, 1}
+    assert len(data.maps) == len(data.scalars) == len(data.episode)
+    env.reset(seed=6)
+    belief: Belief = env.unwrapped.belief
+    torch.testing.assert_close(data.reachable[1], belief.reachable[0])
+    target = belief.target_position[0]
+    for k in (100, 250, 400):
+        pose = look_at_pose(target + belief.lattice.offsets[k], target)[None]
+        truth = float(env.unwrapped.ground_truth.visible_fraction(pose)[0])
+        assert float(data.visible_fraction[1, k]) == pytest.approx(truth, abs=1e-3)
+    first = data.scalars[data.episode == 1][0]
+    torch.testing.assert_close(first, quality_features(belief)[1][0])
+    again = collect_episodes(env, range(5, 7))
+    torch.testing.assert_close(again.maps, data.maps, rtol=0.0, atol=0.0)
+    joined = QualityData.join([data, again])
+    assert joined.episode.max() == 3 and len(joined.maps) == 2 * len(data.maps)
+
+
+def test_a_camera_that_corrects_the_target_moves_the_candidates_that_are_judged() -> None:
+    env: Any = make_env("TomatoViewpoint-v1", plant=PLANT, perception="occlusion_model")
+    world = env.unwrapped
+    data = collect_episodes(env, range(3))
+    # An episode whose target was located on the way has a table for each belief.
+    assert 3 < len(data.visible_fraction) == int(data.episode.max()) + 1 <= 6
+    assert bool((data.episode.diff() >= 0).all()) and bool((data.episode.diff() <= 1).all())
+    env.reset(seed=0)
+    belief = world.belief
+    target = belief.target_position[0]
+    assert not torch.equal(target, world.target_position_w[0])
+    pose = look_at_pose(target + belief.lattice.offsets[250], target)[None]
+    truth = float(world.ground_truth.visible_fraction(pose)[0])
+    assert float(data.visible_fraction[0, 250]) == pytest.approx(truth, abs=1e-3)
+    env.close()
+
+
+def test_the_network_learns_what_the_maps_tell() -> None:
+    """V_f of a candidate is the first feature at it; full views are those above the threshold."""
+    generator = torch.Generator().manual_seed(0)
+    truth = torch.rand(400, AZIMUTHS, ELEVATIONS, DISTANCES, generator=generator)
+    maps = torch.randn(400, MAP_CHANNELS, AZIMUTHS, ELEVATIONS, generator=generator)
+    maps[:, :DISTANCES] = truth.permute(0, 3, 1, 2)
+    data = QualityData(
+        maps=maps.half(),
+        scalars=torch.randn(400, SCALARS, generator=generator),
+        episode=torch.arange(400),
+        visible_fraction=truth.reshape(400, -1).half(),
+        reachable=torch.ones(400, AZIMUTHS * ELEVATIONS * DISTANCES, dtype=torch.bool),
+    )
+    config = FitConfig(steps=300, batch_size=32, learning_rate=1e-2, width=16, blocks=1)
+    told: list[int] = []
+    network = fit(data, config, data, lambda step, values: told.append(step))
+    errors = judge(network, data, 0.8)
+    assert told == [200, 300]
+    assert errors["squared_error"] < 0.25 / 12  # A quarter of the variance of a uniform number.
+    assert errors["cross_entropy"] < 0.5 * 0.5004  # Half the entropy of a fifth: -0.2 ln 0.2 - 0.8 ln 0.8.
+
+
+def test_a_training_goes_on_where_it_was(tmp_path: Path) -> None:
+    config = QualityTrainConfig(
+        rounds=(2, 2),
+        block=1,
+        pool=2,
+        validation_episodes=1,
+        fit=FitConfig(steps=3, batch_size=4, width=4, blocks=1),
+    )
+    options = {"plant": {"row": False, "pool": 2}}
+    lines: list[str] = []
+    path = train_view_quality(tmp_path / "run", config, env_options=options, report=lines.append)
+    assert sum("blocks)" in line for line in lines) == 5
+    content = path.read_bytes()
+    (tmp_path / "run" / "round-1.pt").unlink()
+    lines.clear()
+    assert train_view_quality(tmp_path / "run", config, env_options=options, report=lines.append) == path
+    assert not any("blocks)" in line for line in lines)  # No episode was run again.
+    assert load_view_quality(path).facts["looks"] > 0 and len(path.read_bytes()) == len(content)
+    with pytest.raises(InvalidInputError, match="other settings"):
+        train_view_quality(tmp_path / "run", QualityTrainConfig(), env_options=options)
+
+
+def test_a_training_begins_with_the_network_that_it_is_given(tmp_path: Path) -> None:
+    torch.manual_seed(3)
+    given = ViewQuality(new_network(4, 1))
+    for parameter in given.network.parameters():
+        parameter.data += 0.1
+    save_view_quality(tmp_path / "given.pt", given)
+    config = QualityTrainConfig(
+        rounds=(1,),
+        block=1,
+        pool=2,
+        validation_episodes=1,
+        fit=FitConfig(steps=1, batch_size=2, learning_rate=1e-9, weight_decay=0.0, width=8, blocks=2),
+    )
+    arguments: dict[str, Any] = {"env_options": {"plant": {"row": False, "pool": 2}}}
+    path = train_view_quality(tmp_path / "run", config, start_from=tmp_path / "given.pt", **arguments)
+    for a, b in zip(given.network.parameters(), load_view_quality(path).network.parameters(), strict=True):
+        torch.testing.assert_close(a, b, atol=1e-6, rtol=0.0)
+    with pytest.raises(InvalidInputError, match="other settings"):
+        train_view_quality(tmp_path / "run", config, **arguments)
+    with pytest.raises(CheckpointError):
+        train_view_quality(tmp_path / "other", config, start_from=tmp_path / "missing.pt", **arguments)
+
+
+def test_options_of_the_task_are_read_from_words() -> None:
+    texts = {"perception": "occlusion_model", "contact_penalty": "0.5", "plant": '{"pool": 3}'}
+    options = parse_env_options(texts)
+    assert options == {"perception": "occlusion_model", "contact_penalty": 0.5, "plant": {"pool": 3}}
+
+
+def test_a_training_script_says_errors_in_one_line(
+    capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    @dataclass
+    class Args:
+        out: Path = tmp_path
+
+    def fails(args: Args, report: Callable[[str], None]) -> Path:
+        report("begun")
+        raise InvalidInputError("the folder is full; empty it")
+
+    with pytest.raises(SystemExit) as stop:
+        run_training(Args, fails, [], "A script.")
+    assert stop.value.code == 2
+    told = capsys.readouterr()
+    assert told.out == "begun\n" and told.err.strip() == "error: the folder is full; empty it"
+    run_training(Args, lambda args, report: args.out / "policy.pt", ["--out", "there"], "A script.")
+    assert capsys.readouterr().out.startswith("policy there/policy.pt after ")
+
+
+def test_the_script_offers_every_setting() -> None:
+    script = Path(__file__).resolve().parents[2] / "scripts" / "train_view_quality.py"
+    done = subprocess.run([sys.executable, str(script), "--help"], capture_output=True, text=True, check=True)
+    for flag in (
+        "--jobs",
+        "--config.rounds",
+        "--config.fit.learning-rate",
+        "--config.fit.seed",
+        "--start-from",
+        "--env-options",
+    ):
+        assert flag in done.stdout
+
+
+# ------------------------------------------------------------ files, evaluation
+
+
+def test_a_saved_policy_says_the_same(belief: Belief, tmp_path: Path) -> None:
+    torch.manual_seed(0)
+    policy = ViewQuality(new_network(8, 1), ViewQualityConfig(patience=5.0), {"env_id": "TomatoViewpoint-v1"})
+    save_view_quality(tmp_path / "p.pt", policy)
+    loaded = load_view_quality(tmp_path / "p.pt")
+    assert loaded.config == policy.config and loaded.facts == policy.facts
+    torch.testing.assert_close(loaded.success_probability(belief), policy.success_probability(belief))
+    assert isinstance(open_viewpoint_policy(tmp_path / "p.pt", "TomatoViewpointRow-v1"), ViewQuality)
+    with pytest.raises(CheckpointError, match="Sparse"):
+        open_viewpoint_policy(tmp_path / "p.pt", "TomatoViewpointSparse-v1")
+
+
+def test_files_that_hold_no_such_policy_are_refused(tmp_path: Path) -> None:
+    with pytest.raises(CheckpointError, match="no checkpoint at"):
+        load_view_quality(tmp_path / "none.pt")
+    torch.save({"format": "something"}, tmp_path / "other.pt")
+    with pytest.raises(CheckpointError, match="no view-quality policy"):
+        load_view_quality(tmp_path / "other.pt")
+    (tmp_path / "cut.pt").write_bytes((tmp_path / "other.pt").read_bytes()[:100])
+    with pytest.raises(CheckpointError, match="not a readable"):
+        load_view_quality(tmp_path / "cut.pt")
+    network = new_network(4, 1)
+    with torch.no_grad():
+        next(network.parameters()).fill_(math.nan)
+    save_view_quality(tmp_path / "nan.pt", ViewQuality(network))
+    with pytest.raises(CheckpointError, match="not finite"):
+        load_view_quality(tmp_path / "nan.pt")
+
+
+def test_eval_runs_the_same_episodes_as_the_benchmark(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    options = ["--policy", "nbv", "--episodes", "2", "--seed", "4", "--no-video", "--no-baseline"]
+    main(["eval", "TomatoViewpoint-v1", *options, "--out", str(tmp_path), "--episode-list", "validation"])
+    assert "success" in capsys.readouterr().out
+    metrics = json.loads((tmp_path / "metrics.json").read_text())
+    env = make_env("TomatoViewpoint-v1", episodes="validation")
+    try:
+        episodes = [run_view_episode(env, NextBestView(), i) for i in (4, 5)]
+    finally:
+        env.close()
+    assert metrics["per_episode"]["steps"] == [e.moves for e in episodes]
+    assert metrics["per_episode"]["success"] == [e.success for e in episodes]
+    contacts = sum(int(e.contact.sum()) for e in episodes) / sum(e.moves for e in episodes)
+    assert metrics["plant_contact_step_share"] == pytest.approx(contacts)
+
+
+def test_the_shipped_policy_finds_tomatoes_on_plants_never_seen_before(tmp_path: Path) -> None:
+    options = ["--episodes", "20", "--no-video", "--no-baseline", "--episode-list", "held_out"]
+    main(["eval", "TomatoViewpoint-v1", *options, "--out", str(tmp_path)])
+    metrics = json.loads((tmp_path / "metrics.json").read_text())
+    assert metrics["success_rate"] >= 0.9 and metrics["mean_steps"] <= 6.0
+
+
+def test_without_a_policy_eval_says_how_to_get_one(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    monkeypatch.setattr("maniskill_tomato.assets.ASSETS_DIR", tmp_path)
+    with pytest.raises(SystemExit) as stopped:
+        main(["eval", "TomatoViewpoint-v1"])
+    told = capsys.readouterr().err
+    assert stopped.value.code == 2 and "nbv" in told and "train_view_quality.py" in told
+
+
+def test_the_evaluation_of_a_row_counts_the_tomatoes_that_were_seen() -> None:
+    env: Any = make_env("TomatoViewpointRow-v1", plant={"seed": 7})
+    try:
+        policy = acting_policy("nbv", env)
+        (episode,) = run_episodes(env, policy, 1, seed=3, show_progress=False)
+        env.reset(seed=3)
+        info: dict[str, Any] = {}
+        steps, done = 0, False
+        while not done:
+            _, _, terminated, truncated, info = env.step(policy.act(torch.zeros(1, 1)))
+            steps, done = steps + 1, bool(terminated) or bool(truncated)
+    finally:
+        env.close()
+    assert episode.targets_seen is not None
+    assert episode.targets_seen == (int(info["seen_count"]), int(info["target_count"]))
+    figures = summarise([episode, episode])
+    seen, wanted = episode.targets_seen
+    assert 0 < seen <= wanted and figures["target_seen_share"] == pytest.approx(seen / wanted)
+    moves = int(info["moves"])
+    assert episode.moves == moves >= steps == episode.steps
+    assert figures["moves_per_seen_target"] == pytest.approx(moves / seen)

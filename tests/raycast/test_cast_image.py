@@ -1,0 +1,65 @@
+"""Cast depth images against the pattern of rays and the visibility caster, which know nothing of pixels."""
+
+import numpy as np
+import pytest
+import torch
+
+from maniskill_tomato.errors import InvalidInputError
+from maniskill_tomato.plants.generator import generate_plant
+from maniskill_tomato.raycast.cast_image import BACKGROUND_DEPTH, ImageCaster, PixelLabel
+from maniskill_tomato.raycast.caster import VisibilityCaster
+from maniskill_tomato.raycast.view_rays import RayLabel, ViewRayCaster, sample_view
+from maniskill_tomato.robot.d435 import CameraIntrinsics
+
+INTRINSICS = CameraIntrinsics.from_fov(width=160, height=120, fov_y=np.deg2rad(42.5))
+
+
+def camera_towards(point: np.ndarray, distance: float) -> torch.Tensor:
+    pose = np.eye(4)
+    pose[:3, :3] = np.array([[0, 0, 1], [-1, 0, 0], [0, -1, 0]])
+    pose[:3, 3] = point - [distance, 0, 0]
+    return torch.from_numpy(pose.astype(np.float32))[None]
+
+
+def test_a_cast_image_shows_what_the_rays_say() -> None:
+    plant = generate_plant("full", 3)
+    caster = VisibilityCaster(plants=[plant], intrinsics=INTRINSICS, rays_per_side=24)
+    images = ImageCaster(caster, INTRINSICS)
+    rays = ViewRayCaster(caster)
+    stand, agreeing, seen_some = torch.eye(4)[None], [], 0
+    for k in range(6):
+        centre = torch.from_numpy(plant.fruits[k].centre)[None]
+        camera, target = camera_towards(plant.fruits[k].centre, 0.35), torch.tensor([k])
+        image = images.cast(camera, target, stand)
+        visible = caster.cast(camera, target, stand)
+        pixels = int((image.label == int(PixelLabel.TARGET)).sum())
+        seen_some += pixels > 0
+        assert pixels == pytest.approx(float(visible.visible[0]), abs=0.06 * float(visible.total[0]) + 3)
+        mask = image.label[0] == int(PixelLabel.TARGET)
+        read = sample_view(image.depth[0], mask, INTRINSICS, camera[0], centre[0])
+        cast = rays.cast(camera, target, centre, stand)
+        both = (read.label != RayLabel.OUTSIDE) & (cast.label != RayLabel.OUTSIDE)
+        agreeing.append((read.label == cast.label)[both].float().mean())
+        near = both & (read.label == cast.label) & (read.label != RayLabel.FREE)
+        assert float((read.distance - cast.distance)[near].abs().median()) < 0.003
+    assert seen_some >= 4
+    # A pixel's centre and the ray through that pixel can fall on two sides of an edge.
+    assert float(torch.stack(agreeing).mean()) > 0.93
+
+
+def test_where_nothing_stands_the_background_is_seen() -> None:
+    plant = generate_plant("one_tomato", 0)
+    caster = VisibilityCaster(plants=[plant], intrinsics=INTRINSICS)
+    away = camera_towards(np.array([-2.0, 0.0, 0.5]), 0.5)
+    away[0, :3, :3] = away[0, :3, :3] @ torch.diag(torch.tensor([-1.0, 1.0, -1.0]))
+    image = ImageCaster(caster, INTRINSICS).cast(away, torch.tensor([0]), torch.eye(4)[None])
+    assert bool((image.label == int(PixelLabel.NOTHING)).all())
+    assert float(image.depth.min()) == BACKGROUND_DEPTH
+
+
+def test_wrong_shapes_are_refused() -> None:
+    caster = VisibilityCaster(plants=[generate_plant("one_tomato", 0)], intrinsics=INTRINSICS)
+    with pytest.raises(InvalidInputError, match="target_fruit"):
+        ImageCaster(caster, INTRINSICS).cast(
+            torch.eye(4)[None], torch.zeros(2, dtype=torch.int64), torch.eye(4)[None]
+        )

@@ -1,0 +1,390 @@
+"""The pattern of rays against geometry worked out by hand, a plain ray tracer, and images made without a renderer."""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+import trimesh
+from numpy.typing import NDArray
+from torch import Tensor
+from torch.testing import assert_close
+
+from maniskill_tomato.errors import InvalidInputError
+from maniskill_tomato.plants.generator import generate_plant
+from maniskill_tomato.plants.organs import Fruit, MeshPart, Organ, Plant, SemanticClass
+from maniskill_tomato.raycast.cast_views import CastViews
+from maniskill_tomato.raycast.caster import VisibilityCaster
+from maniskill_tomato.raycast.view_rays import (
+    DEPTH_MODE,
+    NEAREST_DEPTH,
+    PATTERN_HALF_WIDTH,
+    RANGE,
+    RAYS_PER_SIDE,
+    RayLabel,
+    ViewRayCaster,
+    ViewRays,
+    disturb,
+    ray_pattern,
+    sample_view,
+)
+from maniskill_tomato.robot.d435 import CameraIntrinsics, color_intrinsics, depth_noise_std
+from maniskill_tomato.robot.description import link_meshes
+from maniskill_tomato.robot.iiwa14 import LINK_NAMES
+from maniskill_tomato.robot.look_at import look_at_pose, look_frame
+
+RAYS = RAYS_PER_SIDE**2
+RADIUS = 0.035
+WIDE = CameraIntrinsics(width=640, height=480, fx=250.0, fy=250.0, cx=320.0, cy=240.0)
+"""Wide enough for the whole pattern from 0.5 m."""
+
+
+@pytest.fixture(params=["cpu", pytest.param("cuda", marks=pytest.mark.gpu)])
+def device(request: pytest.FixtureRequest) -> str:
+    name: str = request.param
+    return name
+
+
+def part(vertices: NDArray[np.float64], faces: NDArray[np.int64]) -> MeshPart:
+    return MeshPart(
+        vertices=vertices.astype(np.float32),
+        normals=np.tile(np.array([0, 0, 1], np.float32), (len(vertices), 1)),
+        uvs=np.zeros((len(vertices), 2), np.float32),
+        faces=faces.astype(np.int32),
+        material="leaf",
+    )
+
+
+def ball_plant(centres: list[tuple[float, float, float]], leaf_x: float | None = None) -> Plant:
+    """Ripe balls, and a leaf that fills x = leaf_x for y > 0."""
+    sphere = trimesh.creation.icosphere(subdivisions=4, radius=RADIUS)
+    organs, fruits = [], []
+    if leaf_x is not None:
+        corners = np.array([(leaf_x, 0, -2), (leaf_x, 3, -2), (leaf_x, 3, 3), (leaf_x, 0, 3)], float)
+        leaf = part(corners, np.array([(0, 1, 2), (0, 2, 3)]))
+        organs.append(Organ("leaf_00", SemanticClass.LEAF, (leaf,)))
+    for i, centre in enumerate(centres):
+        ball = part(np.asarray(sphere.vertices) + centre, np.asarray(sphere.faces))
+        fruits.append(Fruit(len(organs), np.array(centre, np.float32), RADIUS * 1.0001, "ripe"))
+        organs.append(Organ(f"fruit_{i:02d}", SemanticClass.FRUIT_RIPE, (ball,)))
+    return Plant("by hand", 0, "training", tuple(organs), tuple(fruits))
+
+
+def look(
+    plant: Plant,
+    position: tuple[float, float, float],
+    intrinsics: CameraIntrinsics = WIDE,
+    device: str = "cpu",
+    roll: float = 0.0,
+    target: int = 0,
+) -> ViewRays:
+    """One view of a plant that stands at the origin, straight at a fruit."""
+    centre = torch.from_numpy(plant.fruits[target].centre).to(device)
+    pose = look_at_pose(torch.tensor(position, device=device), centre, roll)
+    caster = ViewRayCaster(VisibilityCaster(plants=[plant], intrinsics=intrinsics, device=device))
+    return caster.cast(
+        pose[None], torch.tensor([target], device=device), centre[None], torch.eye(4, device=device)[None]
+    )
+
+
+def test_the_pattern_is_symmetric_dense_in_the_middle_and_ends_at_the_square() -> None:
+    pattern = ray_pattern().reshape(RAYS_PER_SIDE, RAYS_PER_SIDE, 2)
+    assert np.all(np.diff(pattern[0, :, 0]) > 0) and np.all(np.diff(pattern[:, 0, 1]) < 0)
+    np.testing.assert_allclose(pattern, -pattern[::-1, ::-1], atol=1e-7)
+    steps = np.diff(pattern[0, :, 0])
+    assert np.all(np.diff(steps[RAYS_PER_SIDE // 2 - 1 :]) > 0)
+    assert 0.8 * PATTERN_HALF_WIDTH < pattern.max() < PATTERN_HALF_WIDTH
+
+
+@pytest.mark.parametrize("roll", [0.0, 1.0, -2.5])
+def test_rays_cross_the_targets_plane_at_the_pattern_whatever_the_roll(device: str, roll: float) -> None:
+    plant = ball_plant([(0.8, 0.1, 0.9)])
+    position, target = torch.tensor([0.3, -0.2, 1.2]), torch.tensor([0.8, 0.1, 0.9])
+    rays = look(plant, (0.3, -0.2, 1.2), device=device, roll=roll)
+    R = look_at_pose(position, target, roll)[:3, :3]
+    direction_w = rays.direction_c[0].cpu() @ R.T
+    frame = look_frame(position, target)
+    away = (target - position).norm()
+    crossing = position + direction_w * (away / (direction_w @ frame[:, 2]))[:, None] - target
+    assert_close((crossing @ frame)[:, :2], torch.from_numpy(ray_pattern()), atol=1e-5, rtol=0)
+    assert_close(rays.direction_c.norm(dim=-1), torch.ones(1, RAYS, device=device))
+
+
+def test_labels_and_distances_of_a_ball_behind_half_a_leaf_are_those_worked_out_by_hand(device: str) -> None:
+    # The camera faces +x, so that the leaf at y > 0 covers the left half.
+    rays = look(ball_plant([(0.5, 0.0, 0.0)], leaf_x=0.3), (0.0, 0.0, 0.0), device=device)
+    pattern = torch.from_numpy(ray_pattern())
+    direction = torch.cat([torch.full((RAYS, 1), 0.5), -pattern[:, :1], pattern[:, 1:]], dim=-1)
+    direction = direction / direction.norm(dim=-1, keepdim=True)
+    along = direction[:, 0] * 0.5
+    inside = RADIUS**2 - (0.25 - along**2)
+    expected = torch.full((RAYS,), int(RayLabel.FREE), dtype=torch.int8)
+    expected[inside > 0] = int(RayLabel.TARGET)
+    expected[direction[:, 1] > 0] = int(RayLabel.OTHER)
+    assert_close(rays.label[0].cpu(), expected)
+    distance = torch.full((RAYS,), RANGE)
+    distance = torch.where(inside > 0, along - inside.clamp_min(0).sqrt(), distance)
+    distance = torch.where(direction[:, 1] > 0, 0.3 / direction[:, 0], distance)
+    # The ball is made of flat triangles.
+    assert_close(rays.distance[0].cpu(), distance, atol=1e-3, rtol=0)
+    for label in (RayLabel.FREE, RayLabel.TARGET, RayLabel.OTHER):
+        assert int((rays.label == label).sum()) >= 6
+
+
+def test_a_second_fruit_in_front_is_something_else() -> None:
+    plant = ball_plant([(0.5, 0.0, 0.0), (0.35, 0.0, 0.0)])
+    rays = look(plant, (0.0, 0.0, 0.0))
+    assert int((rays.label == RayLabel.TARGET).sum()) == 0
+    assert int((rays.label == RayLabel.OTHER).sum()) >= 6
+    nearer = look(plant, (0.0, 0.0, 0.0), target=1)
+    assert int((nearer.label == RayLabel.TARGET).sum()) >= 6
+
+
+def test_rays_outside_the_image_have_no_answer() -> None:
+    narrow = color_intrinsics()
+    rays = look(ball_plant([(0.4, 0.0, 0.0)]), (0.0, 0.0, 0.0), intrinsics=narrow)
+    x = rays.direction_c[0, :, 0] / rays.direction_c[0, :, 2]
+    y = rays.direction_c[0, :, 1] / rays.direction_c[0, :, 2]
+    u, v = narrow.fx * x + narrow.cx, narrow.fy * y + narrow.cy
+    outside = (u < 0) | (u > narrow.width) | (v < 0) | (v > narrow.height)
+    assert 20 < int(outside.sum()) < RAYS - 20
+    assert_close(rays.label[0] == RayLabel.OUTSIDE, outside)
+    assert bool((rays.distance[0][outside] == 0).all())
+
+
+def test_what_is_nearer_than_the_camera_measures_has_no_answer() -> None:
+    for leaf_x, label in ((NEAREST_DEPTH - 0.005, RayLabel.OUTSIDE), (NEAREST_DEPTH + 0.005, RayLabel.OTHER)):
+        rays = look(ball_plant([(0.5, 0.0, 0.0)], leaf_x=leaf_x), (0.0, 0.0, 0.0))
+        left = rays.label[0].view(RAYS_PER_SIDE, RAYS_PER_SIDE)[:, : RAYS_PER_SIDE // 2]
+        assert bool((left == label).all())
+
+
+def test_the_robots_links_leave_rays_without_an_answer(device: str) -> None:
+    plant = ball_plant([(0.5, 0.0, 0.0)])
+    cube = trimesh.creation.box(extents=(0.1, 0.1, 0.1))
+    meshes = {"link_3": (np.asarray(cube.vertices), np.asarray(cube.faces))}
+    caster = ViewRayCaster(
+        VisibilityCaster(plants=[plant], intrinsics=WIDE, robot_meshes=meshes, device=device)
+    )
+    pose = look_at_pose(torch.zeros(1, 3, device=device), torch.tensor([[0.5, 0.0, 0.0]], device=device))
+    links = torch.eye(4, device=device).repeat(1, len(LINK_NAMES), 1, 1)
+    links[0, LINK_NAMES.index("link_3"), :3, 3] = torch.tensor([0.3, 0.05, 0.0], device=device)
+    given = (
+        pose,
+        torch.zeros(1, device=device),
+        torch.tensor([[0.5, 0, 0]], device=device),
+        torch.eye(4, device=device)[None],
+    )
+    with_link = caster.cast(*given, link_transforms=links).label[0].cpu()
+    without = caster.cast(*given).label[0].cpu()
+    # The cube covers y from 0 to 0.1 and z from -0.05 to 0.05 at x = 0.25, and less behind.
+    y, z = -ray_pattern()[:, 0] / 0.5, ray_pattern()[:, 1] / 0.5
+    covered = torch.from_numpy((y > 0) & (y < 0.1 / 0.25) & (np.abs(z) < 0.05 / 0.25))
+    assert int(covered.sum()) > 20
+    assert_close(with_link == RayLabel.OUTSIDE, covered)
+    assert_close(with_link[~covered], without[~covered])
+    assert int((without == RayLabel.OUTSIDE).sum()) == 0
+    links[0, LINK_NAMES.index("link_3"), 0, 3] = -0.3
+    assert_close(caster.cast(*given, link_transforms=links).label[0].cpu(), without)
+
+
+def test_a_grown_plant_agrees_with_a_plain_loop_over_its_triangles() -> None:
+    plant = generate_plant("full", 3, "training")
+    target = next(i for i, fruit in enumerate(plant.fruits) if fruit.ripeness == "ripe")
+    centre = plant.fruits[target].centre.astype(np.float64)
+    for offset in ((-0.45, -0.2, 0.1), (-0.3, 0.25, -0.15)):
+        position = centre + offset
+        rays = look(plant, tuple(position.tolist()), intrinsics=WIDE, target=target)
+        R = look_at_pose(torch.from_numpy(position), torch.from_numpy(centre))[:3, :3].numpy()
+        chosen = np.arange(0, RAYS, 2)
+        direction = rays.direction_c[0].numpy().astype(np.float64)[chosen] @ R.T
+        hits, ray_of_hit, face = _first_hits(plant, position, direction)
+        label = np.full(len(chosen), int(RayLabel.FREE))
+        label[ray_of_hit] = np.where(
+            plant.organ_of_face[face] == plant.fruits[target].organ_index,
+            int(RayLabel.TARGET),
+            int(RayLabel.OTHER),
+        )
+        distance = np.full(len(chosen), RANGE)
+        distance[ray_of_hit] = hits
+        np.testing.assert_array_equal(rays.label[0].numpy()[chosen], label)
+        np.testing.assert_allclose(rays.distance[0].numpy()[chosen], distance, atol=1e-4)
+        assert len(set(label.tolist())) >= 2
+
+
+def _first_hits(
+    plant: Plant, position: NDArray[np.float64], direction: NDArray[np.float64]
+) -> tuple[NDArray[np.float64], NDArray[np.int64], NDArray[np.int64]]:
+    """Distance, ray and face of the first hit of each ray that has one within range (Moeller & Trumbore 1997)."""
+    a, b, c = (plant.vertices[plant.faces[:, i]].astype(np.float64) for i in range(3))
+    edge1, edge2, back = b - a, c - a, position - a
+    q = np.cross(back, edge1)
+    distances, rays, faces = [], [], []
+    for i, d in enumerate(direction):
+        p = np.cross(d, edge2)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            scale = 1.0 / np.einsum("ij,ij->i", edge1, p)
+            u = np.einsum("ij,ij->i", back, p) * scale
+            v = (q @ d) * scale
+            t = np.einsum("ij,ij->i", edge2, q) * scale
+        t = np.where((u >= 0) & (v >= 0) & (u + v <= 1) & (t > 0.01), t, np.inf)
+        if t.min() < RANGE:
+            distances.append(t.min())
+            rays.append(i)
+            faces.append(int(t.argmin()))
+    return np.array(distances), np.array(rays), np.array(faces)
+
+
+def test_a_new_plant_is_seen_also_when_it_has_more_fruits(device: str) -> None:
+    one, two = ball_plant([(0.5, 0.0, 0.0)]), ball_plant([(0.5, 0.3, 0.0), (0.5, 0.0, 0.0)])
+    casters = VisibilityCaster(plants=[one], intrinsics=WIDE, device=device)
+    rays, views = ViewRayCaster(casters), CastViews(casters)
+    pose = look_at_pose(torch.zeros(1, 3, device=device), torch.tensor([[0.5, 0.0, 0.0]], device=device))
+    there, plant_pose = torch.tensor([[0.5, 0.0, 0.0]], device=device), torch.eye(4, device=device)
+
+    def targets_seen(index: int) -> int:
+        view = rays.cast(pose, torch.tensor([index], device=device), there, plant_pose[None])
+        return int((view.label == RayLabel.TARGET).sum())
+
+    seen = targets_seen(0)
+    assert seen >= 6 and float(views.visible_fraction(pose, 0, plant_pose)) == 1.0
+    casters.replace_plant(0, two)
+    assert targets_seen(1) == seen and float(views.visible_fraction(pose, 1, plant_pose)) == 1.0
+    # This fruit lies 31 degrees to the left, in the image still, and the pattern ends before.
+    assert targets_seen(0) == 0 and float(views.visible_fraction(pose, 0, plant_pose)) == 1.0
+
+
+def random_cameras(centre: Tensor, count: int) -> Tensor:
+    generator = torch.Generator().manual_seed(5)
+    offset = 0.25 * torch.randn(count, 3, generator=generator) - torch.tensor([0.5, 0.0, 0.0])
+    aside = 0.1 * torch.randn(count, 3, generator=generator)
+    return look_at_pose(centre + offset, centre + aside)
+
+
+def test_many_views_at_once_have_the_visible_fractions_of_single_views(device: str) -> None:
+    plants = [generate_plant("three_tomatoes", seed, "training") for seed in (1, 2)]
+    caster = VisibilityCaster(
+        plants=plants, intrinsics=color_intrinsics(), robot_meshes=link_meshes(), device=device
+    )
+    views = CastViews(caster, at_once=32)
+    T_world_plant = torch.eye(4)
+    T_world_plant[:3, 3] = torch.tensor([0.8, 0.1, 0.0])
+    T_world_plant = T_world_plant.to(device)
+    links = torch.eye(4).repeat(100, len(LINK_NAMES), 1, 1)
+    links[..., :3, 3] = torch.randn(100, len(LINK_NAMES), 3, generator=torch.Generator().manual_seed(1)) * 0.5
+    links = links.to(device)
+    for env_index, target in ((0, 2), (1, 0)):
+        centre = torch.from_numpy(plants[env_index].fruits[target].centre) + T_world_plant[:3, 3].cpu()
+        cameras = random_cameras(centre, 100).to(device)
+        for given in (None, links):
+            at_once = views.visible_fraction(cameras, target, T_world_plant, given, env_index=env_index)
+            for k in (0, 31, 32, 99):
+                single = caster.cast(
+                    cameras[k : k + 1].expand(2, 4, 4),
+                    torch.full((2,), target, device=device),
+                    T_world_plant.expand(2, 4, 4),
+                    None if given is None else given[k : k + 1].expand(2, -1, -1, -1),
+                )
+                assert float(at_once[k]) == float(single.visible_fraction[env_index])
+            assert 0.05 < float(at_once.mean()) < 0.95
+    assert views.visible_fraction(cameras[:0], 0, T_world_plant).shape == (0,)
+
+
+def test_views_that_do_not_exist_are_refused() -> None:
+    views = CastViews(VisibilityCaster(plants=[ball_plant([(0.5, 0, 0)])], intrinsics=WIDE))
+    pose = torch.eye(4)
+    with pytest.raises(InvalidInputError, match=r"target_fruit must be from 0 to 0, got 1"):
+        views.visible_fraction(pose[None], 1, pose)
+    with pytest.raises(InvalidInputError, match=r"env_index must be from 0 to 0, got 2"):
+        views.visible_fraction(pose[None], 0, pose, env_index=2)
+    with pytest.raises(InvalidInputError, match=r"T_world_plant must have shape \(4, 4\)"):
+        views.visible_fraction(pose[None], 0, pose[None])
+
+
+def painted_view(roll: float) -> tuple[NDArray[np.float64], NDArray[np.bool_], NDArray[np.bool_], Tensor]:
+    """Depth and masks of a ball at (0.5, 0, 0) behind a leaf at x = 0.3, y > 0, painted pixel by pixel."""
+    T_world_camera = look_at_pose(
+        torch.zeros(3, dtype=torch.float64), torch.tensor([0.5, 0, 0], dtype=torch.float64), roll
+    )
+    direction = WIDE.ray_directions(WIDE.pixel_centres()) @ T_world_camera[:3, :3].numpy().T
+    length = np.linalg.norm(direction, axis=-1)
+    unit = direction / length[..., None]
+    along = unit[..., 0] * 0.5
+    inside = RADIUS**2 - (0.25 - along**2)
+    target = inside > 0
+    depth = np.where(target, (along - np.sqrt(np.maximum(inside, 0))) / length, 2.0)
+    leaf = unit[..., 1] > 0
+    depth = np.where(leaf, 0.3 / direction[..., 0], depth)
+    return depth, target & ~leaf, leaf, T_world_camera
+
+
+@pytest.mark.parametrize("roll", [0.0, 0.6])
+def test_an_image_tells_what_the_rays_tell(roll: float) -> None:
+    depth, target_mask, _, T_world_camera = painted_view(roll)
+    sampled = sample_view(depth, target_mask, WIDE, T_world_camera, torch.tensor([0.5, 0.0, 0.0]))
+    cast = look(ball_plant([(0.5, 0.0, 0.0)], leaf_x=0.3), (0.0, 0.0, 0.0), roll=roll)
+    assert_close(sampled.direction_c, cast.direction_c, atol=1e-5, rtol=0)
+    equal = sampled.label == cast.label
+    # A pixel is 2 mm wide here; the row of rays nearest to the ball's edge passes it by less.
+    assert float(equal.float().mean()) > 0.98
+    assert_close(sampled.distance[equal], cast.distance[equal], atol=4e-3, rtol=0)
+
+
+def test_pixels_without_depth_and_the_robots_pixels_have_no_answer() -> None:
+    depth, target_mask, leaf, T_world_camera = painted_view(0.0)
+    target = torch.tensor([0.5, 0.0, 0.0])
+    whole = sample_view(depth, target_mask, WIDE, T_world_camera, target)
+    assert int((whole.label == RayLabel.OUTSIDE).sum()) == 0
+    for nothing in (0.0, math.nan, math.inf, NEAREST_DEPTH - 0.01):
+        holes = np.where(leaf, nothing, depth)
+        rays = sample_view(holes, target_mask, WIDE, T_world_camera, target)
+        lost = rays.label == RayLabel.OUTSIDE
+        assert_close(lost, whole.label == RayLabel.OTHER)
+        assert bool((rays.distance[lost] == 0).all())
+    robot = sample_view(depth, target_mask, WIDE, T_world_camera, target, robot_mask=leaf)
+    assert_close(robot.label == RayLabel.OUTSIDE, whole.label == RayLabel.OTHER)
+
+
+def test_images_of_another_size_are_refused() -> None:
+    depth, target_mask, _, T_world_camera = painted_view(0.0)
+    with pytest.raises(InvalidInputError, match=r"target_mask must have the camera's shape \(480, 640\)"):
+        sample_view(depth, target_mask[:-1], WIDE, T_world_camera, torch.zeros(3))
+    with pytest.raises(InvalidInputError, match=r"target_position must have shape \(3,\)"):
+        sample_view(depth, target_mask, WIDE, T_world_camera, torch.zeros(1, 3))
+
+
+def test_disturbed_rays_err_as_often_and_as_far_as_asked() -> None:
+    count = 200_000
+    label = torch.arange(count).remainder(4).to(torch.int8)[None]
+    distance = torch.where(label == RayLabel.FREE, RANGE, 0.8) * (label != RayLabel.OUTSIDE)
+    direction = torch.tensor([0.6, 0.0, 0.8]).expand(1, count, 3)
+    rays = ViewRays(direction, distance, label)
+    generator = torch.Generator().manual_seed(0)
+
+    same = disturb(rays, generator, depth_noise=0.0)
+    assert_close(same.label, rays.label)
+    assert_close(same.distance, rays.distance)
+
+    noisy = disturb(rays, generator, depth_noise=2.0)
+    assert_close(noisy.label, rays.label)
+    hit = label >= RayLabel.TARGET
+    assert_close(noisy.distance[~hit], rays.distance[~hit])
+    # The noise of the depth 0.8 * 0.8 m, along the ray.
+    wanted = 2.0 * float(depth_noise_std(0.64, DEPTH_MODE)) / 0.8
+    error = noisy.distance[hit] - 0.8
+    assert float(error.std()) == pytest.approx(wanted, rel=0.02)
+    assert float(error.mean()) == pytest.approx(0.0, abs=wanted / 50)
+
+    wrong = disturb(rays, generator, depth_noise=0.0, dropout=0.1, false_target=0.2, missed_target=0.3)
+    lost = wrong.label == RayLabel.OUTSIDE
+    for before, after, share in (
+        (RayLabel.FREE, RayLabel.OUTSIDE, 0.1),
+        (RayLabel.TARGET, RayLabel.OUTSIDE, 0.1),
+        (RayLabel.OTHER, RayLabel.TARGET, 0.9 * 0.2),
+        (RayLabel.TARGET, RayLabel.OTHER, 0.9 * 0.3),
+    ):
+        found = (wrong.label[label == before] == after).float().mean()
+        assert float(found) == pytest.approx(share, abs=0.01)
+    assert bool((wrong.distance[lost] == 0).all())
+    with pytest.raises(InvalidInputError, match=r"dropout must lie in \[0, 1\], got 1.5"):
+        disturb(rays, generator, dropout=1.5)

@@ -1,0 +1,165 @@
+"""The thesis's settings, number by number, and that the networks are built with them."""
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+from maniskill_tomato.errors import InvalidInputError
+from maniskill_tomato.segmentation.training.classic_augmentation import (
+    brighter,
+    classic_augmentation,
+    contrasted,
+)
+from maniskill_tomato.segmentation.training.detector_presets import (
+    MASK_RCNN_PRESETS,
+    THESIS_AVERAGE_PRECISION,
+    THESIS_DATA,
+    YOLO_PRESET,
+    ClassicAugmentation,
+    MaskRcnnConfig,
+)
+from maniskill_tomato.segmentation.training.fruit_targets import TrainingPicture
+
+torchvision = pytest.importorskip("torchvision")
+
+
+@pytest.mark.parametrize("name", ["strategy-1", "strategy-2", "strategy-3"])
+def test_common_settings_are_those_of_table_4_2(name: str) -> None:
+    config = MASK_RCNN_PRESETS[name]
+    assert config.backbone == "resnet101"
+    assert config.batch_size == 1
+    assert config.momentum == 0.9
+    assert config.weight_decay == 0.0001
+    assert config.longest_side == 1024
+    assert config.shortest_side == 800
+    assert config.least_confidence == 0.5
+    assert config.categories == ("tomato", "robot")
+
+
+def test_strategy_1_is_table_4_3() -> None:
+    config = MASK_RCNN_PRESETS["strategy-1"]
+    assert THESIS_DATA["strategy-1"] == {"training": 153, "validation": 98, "test": 40}
+    assert (config.epochs, config.steps_per_epoch, config.validation_steps) == (80, 600, 100)
+    assert config.anchor_sides == (32, 64, 128, 256, 512)
+    assert config.proposal_nms == 0.7
+    assert config.dropout == 0
+    assert {config.learning_rate(epoch) for epoch in range(1, 81)} == {0.001}
+    assert config.augmentation == ClassicAugmentation(
+        probability=0.75, flip=True, blur_sigma=2.5, brightness=(0.8, 1.5), contrast=None
+    )
+
+
+def test_strategy_2_is_table_4_4() -> None:
+    config = MASK_RCNN_PRESETS["strategy-2"]
+    assert THESIS_DATA["strategy-2"] == {"training": 220, "validation": 125, "test": 40}
+    assert (config.epochs, config.steps_per_epoch, config.validation_steps) == (65, 1000, 120)
+    assert config.anchor_sides == (16, 64, 128, 256, 512)
+    assert config.proposal_nms == 0.7
+    assert config.rois_per_image == 200
+    assert config.dropout == 0.3
+    rates = [config.learning_rate(epoch) for epoch in range(1, 66)]
+    assert rates == [0.001] * 20 + [0.0001] * 45
+    assert config.augmentation == ClassicAugmentation(
+        probability=0.8, flip=True, blur_sigma=2.5, brightness=(0.7, 1.3), contrast=(0.6, 1.4)
+    )
+
+
+def test_strategy_3_is_the_proposal_of_section_6_2() -> None:
+    config = MASK_RCNN_PRESETS["strategy-3"]
+    assert (config.epochs, config.steps_per_epoch, config.validation_steps) == (80, 1000, 200)
+    assert config.anchor_sides == MASK_RCNN_PRESETS["strategy-2"].anchor_sides
+    assert config.augmentation == MASK_RCNN_PRESETS["strategy-2"].augmentation
+    assert config.proposal_nms == 0.5
+    assert config.rois_per_image == 300
+    assert config.dropout == 0.5
+    rates = [config.learning_rate(epoch) for epoch in range(1, 81)]
+    assert rates == [0.001] * 10 + [0.0001] * 30 + [0.00001] * 40
+
+
+def test_yolo_is_table_4_1() -> None:
+    assert YOLO_PRESET.epochs == 100
+    assert YOLO_PRESET.batch_size == 1
+    assert YOLO_PRESET.learning_rate == 0.0001
+    assert (YOLO_PRESET.smallest_input, YOLO_PRESET.largest_input) == (288, 448)
+    assert (YOLO_PRESET.object_threshold, YOLO_PRESET.nms_threshold, YOLO_PRESET.match_threshold) == (
+        0.5,
+        0.45,
+        0.5,
+    )
+    assert (YOLO_PRESET.plateau_epochs, YOLO_PRESET.plateau_factor, YOLO_PRESET.patience) == (2, 10, 3)
+    assert not YOLO_PRESET.pretrained
+    assert THESIS_DATA["yolo"] == {"training": 120, "validation": 30, "test": 50}
+    assert THESIS_AVERAGE_PRECISION == {"yolo": 0.9394, "strategy-1": 0.6725, "strategy-2": 0.7403}
+
+
+def test_settings_that_cannot_be_are_refused() -> None:
+    with pytest.raises(InvalidInputError, match="dropout"):
+        MaskRcnnConfig(dropout=1.0)
+    with pytest.raises(InvalidInputError, match="epoch 1"):
+        MaskRcnnConfig(learning_rates=((2, 1e-3),))
+    with pytest.raises(InvalidInputError, match="anchor_sides"):
+        MaskRcnnConfig(anchor_sides=(32, 64))
+    with pytest.raises(InvalidInputError, match="probability"):
+        ClassicAugmentation(probability=1.5)
+
+
+def test_the_network_is_built_with_the_settings() -> None:
+    from maniskill_tomato.segmentation.mask_rcnn import build_mask_rcnn
+
+    config = replace(MASK_RCNN_PRESETS["strategy-3"], backbone="mobilenet")
+    network: Any = build_mask_rcnn(config)
+    assert [sizes[0] for sizes in network.rpn.anchor_generator.sizes] == [16, 64, 128, 256, 512]
+    assert network.rpn.nms_thresh == 0.5
+    assert network.roi_heads.fg_bg_sampler.batch_size_per_image == 300
+    assert network.roi_heads.score_thresh == 0.5
+    dropped = [m.p for m in network.roi_heads.box_head.modules() if isinstance(m, torch.nn.Dropout)]
+    assert dropped == [0.5, 0.5]
+    assert network.roi_heads.box_predictor.cls_score.out_features == 3
+    images, _ = network.transform([torch.zeros(3, 480, 640)])
+    assert images.tensors.shape[2:] == (1024, 1024)
+    assert images.image_sizes == [(768, 1024)]
+
+
+def half_and_half() -> TrainingPicture:
+    """Dark on the left, bright on the right, with a fruit on the left."""
+    image = np.full((40, 60, 3), 50, np.uint8)
+    image[:, 30:] = 200
+    labels = np.zeros((40, 60), np.int16)
+    labels[10:20, 5:15] = 1
+    return TrainingPicture(
+        image=image,
+        boxes=np.array([[5, 10, 15, 20]], np.float32),
+        ignored=np.zeros(1, bool),
+        labels=labels,
+        whole_boxes=np.array([[2, 8, 18, 22]], np.float32),
+    )
+
+
+def test_brightness_and_contrast_follow_their_formulas() -> None:
+    image = half_and_half().image
+    assert brighter(image, 1.2)[0, 0, 0] == 60
+    assert brighter(image, 1.5)[0, -1, 0] == 255
+    assert contrasted(image, 0.6)[0, 0, 0] == int(127 + 0.6 * (50 - 127))
+    assert contrasted(image, 1.4)[0, -1, 0] == int(127 + 1.4 * (200 - 127))
+
+
+def test_each_change_comes_as_often_as_the_thesis_says_and_the_annotation_follows() -> None:
+    config = MASK_RCNN_PRESETS["strategy-2"].augmentation
+    picture, rng = half_and_half(), np.random.default_rng(0)
+    unchanged = flipped = 0
+    for _ in range(2000):
+        changed = classic_augmentation(picture, config, rng)
+        assert changed.labels is not None and changed.whole_boxes is not None
+        left, top, right, bottom = changed.boxes[0].astype(int)
+        assert (changed.labels[top:bottom, left:right] == 1).all() and (changed.labels == 1).sum() == 100
+        if changed is picture:
+            unchanged += 1
+        elif left == 45:
+            flipped += 1
+            np.testing.assert_allclose(changed.whole_boxes[0], [42, 8, 58, 22])
+    # Binomial: standard deviations of 0.9 %.
+    assert unchanged / 2000 == pytest.approx(0.2, abs=0.03)
+    assert flipped / 2000 == pytest.approx(0.2, abs=0.03)

@@ -1,0 +1,229 @@
+"""Mask R-CNN, YOLO's files and the two scripts, on drawn pictures."""
+
+import json
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from types import ModuleType
+
+import cv2
+import numpy as np
+import pytest
+import torch
+
+from maniskill_tomato.errors import CheckpointError
+from maniskill_tomato.segmentation.datasets.annotations import AnnotatedImage, AnnotatedImages, Instance
+from maniskill_tomato.segmentation.datasets.coco import write_coco
+from maniskill_tomato.segmentation.efficientnet_lite import EfficientNetLite0
+from maniskill_tomato.segmentation.instances import box_ellipse, mask_box
+from maniskill_tomato.segmentation.mask_rcnn import Lite0Pyramid
+from maniskill_tomato.segmentation.masks import EncodedMask
+from maniskill_tomato.segmentation.segmenter import make_segmenter
+from maniskill_tomato.segmentation.training.detector_presets import MASK_RCNN_PRESETS
+from maniskill_tomato.segmentation.training.mask_rcnn_training import MaskRcnnTraining, mask_rcnn_target
+from maniskill_tomato.segmentation.training.training_pictures import training_picture
+from maniskill_tomato.segmentation.yolo import (
+    read_history,
+    stock_settings,
+    thesis_settings,
+    write_yolo_data,
+    yolo_labels,
+)
+
+TINY = replace(
+    MASK_RCNN_PRESETS["light"],
+    epochs=2,
+    steps_per_epoch=1,
+    batch_size=1,
+    longest_side=96,
+    shortest_side=96,
+    least_confidence=0.0,
+    dropout=0.3,
+)
+
+
+def drawn_set(folder: Path, masks: bool = True) -> tuple[AnnotatedImage, ...]:
+    """Three images of two red ellipses each, on files below `folder`."""
+    rng = np.random.default_rng(0)
+    images = []
+    (folder / "images").mkdir(parents=True)
+    for number in range(3):
+        picture = np.full((96, 128, 3), (60, 140, 50), np.uint8)
+        fruits = []
+        for x in (32, 96):
+            radius, y = rng.uniform(14, 24), rng.uniform(30, 66)
+            mask = box_ellipse(
+                np.array([x - radius, y - radius, x + radius, y + radius], np.float32), 96, 128
+            )
+            picture[mask] = (205, 40, 30)
+            left, top, right, bottom = mask_box(mask)
+            fruits.append(
+                Instance(
+                    category="tomato_ripe",
+                    box_xywh=(left, top, right - left, bottom - top),
+                    visible_mask=EncodedMask.encode(mask) if masks else None,
+                )
+            )
+        name = f"images/{number}.png"
+        cv2.imwrite(str(folder / name), picture[..., ::-1])
+        images.append(
+            AnnotatedImage(path=folder / name, file_name=name, width=128, height=96, instances=tuple(fruits))
+        )
+    write_coco(AnnotatedImages(images=tuple(images)), folder)
+    return tuple(images)
+
+
+def test_mask_rcnn_trains_goes_on_and_opens_as_a_segmenter(tmp_path: Path) -> None:
+    images = drawn_set(tmp_path / "set")
+    training = MaskRcnnTraining(TINY, [images], [1.0], images[:1])
+    before = {n: p.detach().clone() for n, p in training.network.named_parameters()}
+    assert training.run(tmp_path / "run", lambda line: None, lambda: training.step == 1) is None
+    again = MaskRcnnTraining(TINY, [images], [1.0], images[:1])
+    again.resume(tmp_path / "run")
+    weights = again.run(tmp_path / "run", lambda line: None)
+    assert weights is not None
+    line = json.loads((tmp_path / "run" / "history.json").read_text())[-1]
+    terms = {"loss_classifier", "loss_box_reg", "loss_mask", "loss_objectness", "loss_rpn_box_reg"}
+    assert terms | {f"val_{term}" for term in terms} <= set(line)
+    assert line["loss"] == pytest.approx(sum(line[term] for term in terms), rel=1e-5)
+    moved = [n for n, p in again.network.named_parameters() if not torch.equal(p, before[n])]
+    assert any("mask" in name for name in moved) and any("rpn" in name for name in moved)
+    found = make_segmenter(weights, score_threshold=0.0)(images[0].load())
+    assert found.masks.shape[1:] == (96, 128)
+    assert set(found.categories) <= {"tomato"}
+
+
+def test_mask_rcnn_on_imagenet_weights_leaves_its_first_layers_alone(tmp_path: Path) -> None:
+    images = drawn_set(tmp_path / "set")
+    config = replace(
+        MASK_RCNN_PRESETS["light-lite0"],
+        longest_side=96,
+        shortest_side=96,
+        steps_per_epoch=1,
+        epochs=1,
+        batch_size=1,
+    )
+    training = MaskRcnnTraining(config, [images], [1.0], pretrained=True)
+    start = EfficientNetLite0()
+    start.load_imagenet()
+    weights = training.run(tmp_path / "run", lambda line: None)
+    pyramid = training.network.backbone
+    assert isinstance(pyramid, Lite0Pyramid)
+    body = pyramid.body.state_dict()
+    for name, before in start.state_dict().items():
+        fixed = name.startswith(("stem", *(f"blocks.{i}." for i in range(6)))) or "running" in name
+        fixed |= "tracked" in name
+        assert torch.equal(body[name], before) == fixed, name
+    assert weights is not None and make_segmenter(weights)(images[0].load()).masks.shape[1:] == (96, 128)
+
+
+def test_a_picture_without_masks_does_not_train_the_mask_head(tmp_path: Path) -> None:
+    images = drawn_set(tmp_path / "set", masks=False)
+    training = MaskRcnnTraining(TINY, [images], [1.0])
+    before = {n: p.detach().clone() for n, p in training.network.named_parameters() if "mask" in n}
+    terms = training.train_step()
+    assert terms["loss_mask"] == 0 and terms["loss_objectness"] > 0
+    for name, parameter in training.network.named_parameters():
+        if name in before and "bias" not in name:
+            # Weight decay alone.
+            decay = 1 - TINY.learning_rate(1) * TINY.weight_decay
+            torch.testing.assert_close(parameter.detach(), before[name] * decay)
+
+
+def test_the_target_of_mask_rcnn_leaves_out_fruits_set_aside(tmp_path: Path) -> None:
+    (image, *_) = drawn_set(tmp_path / "set")
+    picture = replace(training_picture(image), ignored=np.array([True, False]))
+    target = mask_rcnn_target(picture)
+    assert target["boxes"].shape == (1, 4) and target["labels"].tolist() == [1]
+    rows, columns = np.nonzero(target["masks"][0].numpy())
+    expected = target["boxes"][0].tolist()
+    assert [columns.min(), rows.min(), columns.max() + 1, rows.max() + 1] == expected
+
+
+def test_yolo_labels_are_shares_of_the_image(tmp_path: Path) -> None:
+    fruit = Instance(category="tomato", box_xywh=(10.0, 20.0, 30.0, 40.0))
+    leaf = Instance(category="leaf", box_xywh=(0.0, 0.0, 50.0, 50.0))
+    image = AnnotatedImage(
+        path=tmp_path / "a.png", file_name="a.png", width=100, height=200, instances=(fruit, leaf)
+    )
+    assert yolo_labels(image) == "0 0.250000 0.200000 0.300000 0.200000\n"
+    # 3 px are narrower than what is asked for.
+    tiny = Instance(category="tomato", box_xywh=(10.0, 20.0, 3.0, 40.0))
+    assert yolo_labels(replace(image, instances=(tiny, leaf))) == ""
+    images = drawn_set(tmp_path / "set")
+    data = write_yolo_data(images[:2], images[2:], tmp_path / "yolo")
+    assert "val: images/val" in data.read_text()
+    assert len(list((tmp_path / "yolo" / "labels" / "train").iterdir())) == 2
+    assert (tmp_path / "yolo" / "images" / "val" / "000000.png").is_file()
+
+
+def test_yolo_losses_are_read_as_those_of_the_others(tmp_path: Path) -> None:
+    path = tmp_path / "results.csv"
+    path.write_text(
+        "epoch,time,train/box_loss,train/cls_loss,metrics/mAP50(B),val/box_loss,val/cls_loss\n"
+        "1,240.4,3.8,3.6,0,4.1,3.9\n2,460.4,3.1,2.8,0.01,3.5,3.3\n"
+    )
+    assert read_history(path) == [
+        {"step": 1, "box_loss": 3.8, "cls_loss": 3.6, "val_box_loss": 4.1, "val_cls_loss": 3.9},
+        {"step": 2, "box_loss": 3.1, "cls_loss": 2.8, "val_box_loss": 3.5, "val_cls_loss": 3.3},
+    ]
+    path.write_text("epoch,train/box_loss\n1,none\n")
+    with pytest.raises(CheckpointError, match="no list of losses"):
+        read_history(path)
+
+
+def test_yolo_is_trained_with_table_4_1_or_with_the_library_s_own_settings() -> None:
+    thesis, stock = thesis_settings(), stock_settings(7)
+    assert (thesis["epochs"], thesis["batch"], thesis["lr0"], thesis["patience"]) == (100, 1, 1e-4, 3)
+    # 288 to 448 px: 368 px on average, and 80 px to either side.
+    assert thesis["imgsz"] == 368 and thesis["multi_scale"] * 368 == pytest.approx(80)
+    assert stock["epochs"] == 7 and "lr0" not in stock and not stock["pretrained"]
+
+
+def test_the_training_script_writes_weights_and_curves(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], load_script: Callable[[str], ModuleType]
+) -> None:
+    drawn_set(tmp_path / "set")
+    network = (
+        "--config.network.backbone",
+        "plain",
+        "--config.network.widths",
+        "8",
+        "8",
+        "8",
+        "8",
+        "--config.network.blocks",
+        "0",
+        "0",
+        "0",
+        "0",
+    )
+    options = ("--config.steps", "2", "--config.log-every", "1", "--config.batch-size", "2", *network)
+    arguments = ["light", "--data", str(tmp_path / "set"), "--validation", str(tmp_path / "set"), *options]
+    load_script("train_segmenter").main([*arguments, "--out", str(tmp_path / "run")])
+    assert "weights" in capsys.readouterr().out
+    assert {p.name for p in (tmp_path / "run").iterdir()} == {
+        "checkpoint.pt",
+        "history.json",
+        "losses.png",
+        "weights.pt",
+    }
+    with pytest.raises(SystemExit) as exit_info:
+        load_script("train_segmenter").main(["light", "--data", str(tmp_path / "nowhere")])
+    assert exit_info.value.code == 2 and "no data set" in capsys.readouterr().err
+
+
+def test_the_evaluation_script_finds_a_perfect_segmenter_perfect(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], load_script: Callable[[str], ModuleType]
+) -> None:
+    drawn_set(tmp_path / "set")
+    load_script("evaluate_segmenter").main(
+        ["--data", str(tmp_path / "set"), "--segmenter", "colour", "--out", str(tmp_path / "out")]
+    )
+    metrics = json.loads((tmp_path / "out" / "metrics.json").read_text())
+    assert metrics["fruits"] == 6 and metrics["box_AP50"] == 1 and metrics["mask_AP50"] == 1
+    assert metrics["coco_mask_AP50"] == pytest.approx(1)
+    picture = cv2.imread(str(tmp_path / "out" / "precision_recall.png"))
+    assert picture is not None and picture.std() > 5
+    assert (tmp_path / "out" / "pictures.jpg").is_file()
+    assert "box_AP50" in capsys.readouterr().out

@@ -1,0 +1,185 @@
+"""The general task with everything from the camera image."""
+
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import pytest
+import torch
+
+import maniskill_tomato  # noqa: F401
+from maniskill_tomato.errors import InvalidInputError
+from maniskill_tomato.raycast.cast_image import ImageCaster, PixelLabel
+from maniskill_tomato.robot.d435 import color_intrinsics
+from maniskill_tomato.robot.kinematics import link_transforms
+from maniskill_tomato.segmentation.instances import Instances
+from maniskill_tomato.sensing.camera_perception import COARSE_POSITION, IMAGE_SIZE, CameraPerception
+
+
+def make(**options: Any) -> Any:
+    return gym.make(
+        "TomatoViewpoint-v1", episodes="validation", obs_mode="state", render_backend="none", **options
+    ).unwrapped
+
+
+def test_what_the_camera_measures_is_near_the_truth() -> None:
+    env = make(perception="occlusion_model")
+    measured, true, offsets = [], [], []
+    for seed in range(3):
+        env.reset(seed=seed)
+        rng = np.random.default_rng(seed)
+        for _ in range(5):
+            action = torch.as_tensor(rng.uniform(-1, 1, 3), dtype=torch.float32)
+            *_, info = env.step(action)
+            measured.append(float(info["visible_fraction"][0]))
+            true.append(float(info["true_visible_fraction"][0]))
+            if bool(env._eyes.located[0]):
+                offset = env.belief.target_position - env._target_position_w
+                offsets.append(float(offset.norm()))
+    errors = np.abs(np.array(measured) - np.array(true))
+    assert max(true) > 0.3, "the views must not all be blind"
+    assert errors.mean() < 0.1
+    assert np.median(offsets) < 0.015
+    env.close()
+
+
+def test_the_same_seed_measures_the_same() -> None:
+    runs = []
+    for _ in range(2):
+        env = make(perception="occlusion_model")
+        observation, _ = env.reset(seed=4)
+        after, reward, *_ = env.step(torch.tensor([0.5, 0.3, 0.1]))
+        runs.append((observation, after, reward))
+        env.close()
+    for a, b in zip(*runs, strict=True):
+        assert torch.equal(a, b)
+
+
+def test_an_unseen_target_is_known_from_afar_only() -> None:
+    env = make(perception="occlusion_model", start_visibility=(0.0, 0.001))
+    env.reset(seed=1)
+    if not bool(env._eyes.located[0]):
+        offset = env.belief.target_position - env._target_position_w
+        assert 0.0 < float(offset.norm()) < 5 * COARSE_POSITION
+        assert float(env._eyes.visible_fraction[0]) == 0.0
+    env.close()
+
+
+def test_reward_goes_by_what_is_measured() -> None:
+    env = make(perception="occlusion_model")
+    env.reset(seed=2)
+    _, reward, _, _, info = env.step(torch.tensor([1.0, 0.0, 0.0]))
+    expected = float(info["visible_fraction_gain"][0]) - env.task.step_cost
+    expected += env.task.success_reward * float(info["success"][0])
+    if not bool(info["plant_contact"][0]):
+        assert float(reward[0]) == pytest.approx(expected, abs=1e-5)
+    env.close()
+
+
+@pytest.mark.parametrize(
+    "options",
+    [{"perception": "eyes"}, {"perception": "occlusion_model", "sensor_noise": {"depth_noise": 1.0}}],
+)
+def test_options_that_make_no_sense_are_refused(options: dict[str, Any]) -> None:
+    with pytest.raises(InvalidInputError, match="perception"):
+        make(**options)
+
+
+@pytest.mark.render
+@pytest.mark.parametrize("perception", ["thesis_model", "improved_model", "segmenter"])
+def test_rendered_perceptions_run_and_their_pictures_lie_on_the_cast_labels(perception: str) -> None:
+    env = gym.make(
+        "TomatoViewpoint-v1",
+        episodes="validation",
+        obs_mode="state",
+        perception=perception,
+        sensor_configs={"width": 320, "height": 240},
+    ).unwrapped
+    task: Any = env
+    task.reset(seed=1)
+    *_, info = task.step(torch.tensor([0.0, 0.6, 0.3]))
+    assert 0.0 <= float(info["visible_fraction"][0]) <= 1.0
+    assert set(info) >= {"true_visible_fraction", "true_success"}
+    picture = task._wrist_picture(0).astype(int)
+    assert picture.shape == (240, 320, 3)
+    T_w_links = link_transforms(task.agent.robot.get_qpos())
+    images = ImageCaster(task._caster, task.camera_intrinsics).cast(
+        T_w_links[:, -1] @ task._T_ee_camera, task._target, task.planting.T_world_plant, T_w_links
+    )
+    target = (images.label[0] == int(PixelLabel.TARGET)).numpy()
+    if np.count_nonzero(target) > 20:
+        red, green, _ = picture[target].T
+        assert np.median(red - green) > 30
+    # Leaves and stems are green where the caster meets the plant.
+    plant = (images.label[0] == int(PixelLabel.PLANT)).numpy()
+    nothing = (images.label[0] == int(PixelLabel.NOTHING)).numpy()
+    colourful = picture.max(-1) - picture.min(-1)
+    assert np.median(colourful[plant]) > 2 * np.median(colourful[nothing])
+    env.close()
+
+
+def test_of_several_fruits_found_the_one_near_the_known_place_is_the_target() -> None:
+    env = make(perception="occlusion_model")
+    env.reset(seed=2)
+    looks = []
+    for order in (1, -1):
+        eyes = CameraPerception(env._caster, segmenter=LabelSegmenter(env, order))
+        eyes.begin(0, np.random.RandomState(0))
+        T_w_links = link_transforms(env.agent.robot.get_qpos())
+        T_w_camera = T_w_links[:, -1] @ env._T_ee_camera
+        place = env._target_position_w
+        eyes.look(T_w_camera, env._target, place, env.planting.T_world_plant, T_w_links)
+        near = eyes.visible_fraction.clone()
+        eyes.look(T_w_camera, env._target, place + 1.0, env.planting.T_world_plant, T_w_links)
+        assert float(eyes.visible_fraction[0]) == 0.0, "a fruit a metre away is another one"
+        looks.append(float(near[0]))
+    assert looks[0] == looks[1] > 0.0
+    env.close()
+
+
+def test_what_the_first_view_of_a_hidden_target_shows_well_is_not_taken_for_it() -> None:
+    env: Any = gym.make(
+        "TomatoViewpoint-v1", obs_mode="state", render_backend="none", start_visibility=(0.7, 1.0)
+    ).unwrapped
+    env.reset(seed=0)
+    seen = []
+    for hidden_below in (None, 0.3):
+        eyes = CameraPerception(env._caster, segmenter=LabelSegmenter(env, 1))
+        eyes.begin(0, np.random.RandomState(0), hidden_below)
+        eyes.forget(torch.tensor([0]))
+        T_w_links = link_transforms(env.agent.robot.get_qpos())
+        T_w_camera = T_w_links[:, -1] @ env._T_ee_camera
+        for _ in range(2):
+            eyes.look(T_w_camera, env._target, env._target_position_w, env.planting.T_world_plant, T_w_links)
+            seen.append(float(eyes.visible_fraction[0]))
+    assert min(seen[:2]) > 0.45
+    assert seen[2:] == [0.0, 0.0]
+    env.close()
+
+
+class LabelSegmenter:
+    """The target's mask and one of another fruit, in either order."""
+
+    def __init__(self, env: Any, order: int) -> None:
+        T_w_links = link_transforms(env.agent.robot.get_qpos())
+        caster = ImageCaster(env._caster, color_intrinsics(*IMAGE_SIZE))
+        images = caster.cast(
+            T_w_links[:, -1] @ env._T_ee_camera, env._target, env.planting.T_world_plant, T_w_links
+        )
+        target = (images.label[0] == int(PixelLabel.TARGET)).numpy()
+        other = np.zeros_like(target)
+        other[:30, :30] = True
+        self._masks = np.stack([target, other][::order])
+
+    def __call__(self, image: Any, depth_m: Any = None) -> Instances:
+        return Instances(
+            boxes=np.array([[0, 0, 5, 5], [0, 0, 5, 5]], np.float32),
+            scores=np.array([0.9, 0.8], np.float32),
+            categories=("tomato", "tomato"),
+            masks=self._masks,
+        )
+
+
+def test_rendered_perception_without_a_renderer_is_refused() -> None:
+    with pytest.raises(InvalidInputError, match="render_backend"):
+        make(perception="segmenter")
