@@ -3,23 +3,29 @@
 import torch
 from torch import Tensor
 
+from maniskill_tomato.policies.moves import move_towards
 from maniskill_tomato.raycast.scene import RayScene
+from maniskill_tomato.robot.inverse_kinematics import Reach
 from maniskill_tomato.robot.kinematics import link_transforms
+from maniskill_tomato.robot.look_at_move import LookAtMover
 from maniskill_tomato.tasks.planting import Planting
 from maniskill_tomato.tasks.world_state import WorldState
 
 
 class GroundTruth:
-    """Asks the plants themselves. For planners that say `needs_truth`, for certification and for critics."""
+    """Asks the plants themselves: the `policies.protocol.GroundTruth` of a world."""
 
-    def __init__(self, scene: RayScene, planting: Planting, state: WorldState) -> None:
-        """Follows a world's plants and targets.
+    def __init__(self, scene: RayScene, planting: Planting, state: WorldState, threshold: float) -> None:
+        """Follows a world's plants, targets and arms.
 
         Args:
             scene: Casts the rays and measures distances.
             planting: The plants.
             state: Of the world.
+            threshold: V_f above which the task counts the target as fully visible.
         """
+        self.threshold = threshold
+        self._mover: LookAtMover | None = None
         self._scene = scene
         self._planting = planting
         self._state = state
@@ -63,3 +69,35 @@ class GroundTruth:
         T_w_plant = self._planting.T_world_plant[env_index].expand(count, 4, 4)
         env_idx = torch.full((count,), env_index, device=start_qpos.device)
         return self._scene.clearance_along(start_qpos.float(), end_qpos.float(), T_w_plant, env_idx)
+
+    def can_follow(
+        self, start: Tensor, way: Tensor, target: Tensor, env_index: int = 0, *, contact_free: bool = False
+    ) -> bool:
+        """Whether the arm, from where it stands, can make every move of a way and sees the target at its end.
+
+        Args:
+            start: Where the camera stands, in the world frame, in [m]. Shape (3,).
+            way: Stops of the camera. Shape (n, 3).
+            target: What it looks at. Shape (3,).
+            env_index: Which environment.
+            contact_free: Whether no move may touch the plants.
+        """
+        if not len(way):
+            return False
+        if self._mover is None:
+            self._mover = LookAtMover(start.device)
+        position, target = start[None].double(), target[None].double()
+        joints = [self._state.qpos[env_index][None].double()]
+        for stop in way.double():
+            move = self._mover.move(joints[-1], position, target, move_towards(position, target, stop[None]))
+            if int(move.reach[0]) != int(Reach.REACHABLE):
+                return False
+            position = move.T_world_camera[:, :3, 3]
+            joints.append(move.qpos)
+        seen = self.visible_fraction(move.T_world_camera, env_index, joints[-1])
+        if float(seen) <= self.threshold:
+            return False
+        if not contact_free:
+            return True
+        clearance = self.clearance(torch.cat(joints[:-1]), torch.cat(joints[1:]), env_index)
+        return bool((clearance > 0.0).all())

@@ -14,7 +14,13 @@ from maniskill_tomato.robot.viewpoint_move import OutsideWorkspace
 from maniskill_tomato.sensing.observation import ObservationLayout
 from maniskill_tomato.sensing.sensor_noise import SensorNoise
 from maniskill_tomato.sensing.simulated_camera import RENDERED, Perception
-from maniskill_tomato.tasks import MAX_EPISODE_STEPS, MAX_GENERAL_STEPS, MAX_ROW_STEPS, TASK_IDS, option_checks
+from maniskill_tomato.tasks import (
+    MAX_EPISODE_STEPS,
+    MAX_GENERAL_STEPS,
+    MAX_ROW_STEPS,
+    TASK_IDS,
+    option_checks,
+)
 from maniskill_tomato.tasks.arm_moves import ArmMoves, Control
 from maniskill_tomato.tasks.row.config import GeneralTaskConfig
 from maniskill_tomato.tasks.row.episode_selection import EpisodeChoice

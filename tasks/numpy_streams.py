@@ -13,7 +13,7 @@ def spread_seed(seed: int | Sequence[int], count: int) -> list[int]:
     """A seed for each of `count` environments.
 
     Args:
-        seed: One for each; or a single number, which the first takes, and which the others' follow from as in ManiSkill.
+        seed: One for each; or one number, which the first takes and those of the others follow from as in ManiSkill.
         count: How many, at least 1.
 
     Raises:
@@ -23,7 +23,9 @@ def spread_seed(seed: int | Sequence[int], count: int) -> list[int]:
     if len(seeds) == 1 and count > 1:
         seeds += [int(s) for s in np.random.RandomState(seeds[0]).randint(2**31, size=count - 1)]
     if len(seeds) != count:
-        raise InvalidInputError(f"seed must be one number or {count}, one for each environment; got {len(seeds)}")
+        raise InvalidInputError(
+            f"seed must be one number or {count}, one for each environment; got {len(seeds)}"
+        )
     return seeds
 
 

@@ -110,7 +110,9 @@ class Planting:
     def fruit_positions_w(self, env_index: int, fruits: list[int]) -> Tensor:
         """Centres of several fruits of one environment in the world frame, in [m]. Shape (len(fruits), 3)."""
         T = self.T_world_plant[env_index]
-        centres = self._fruit_centre_p[env_index, torch.tensor(fruits, dtype=torch.int64, device=self._device)]
+        centres = self._fruit_centre_p[
+            env_index, torch.tensor(fruits, dtype=torch.int64, device=self._device)
+        ]
         return centres @ T[:3, :3].T + T[:3, 3]
 
     def fruit_organ(self, fruit: Tensor) -> Tensor:

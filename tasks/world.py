@@ -23,12 +23,12 @@ from maniskill_tomato.robot.viewpoint_move import viewpoint_of
 from maniskill_tomato.sensing.belief import Belief
 from maniskill_tomato.tasks.arm_moves import ACTION_SIZES, ArmMoves, Plan
 from maniskill_tomato.tasks.ground_truth import GroundTruth
-from maniskill_tomato.tasks.planting import GROWN_PLANTS, Planting
 from maniskill_tomato.tasks.numpy_streams import (
     random_state,
     set_random_state,
     spread_seed,
 )
+from maniskill_tomato.tasks.planting import GROWN_PLANTS, Planting
 from maniskill_tomato.tasks.world_state import WorldState
 
 FIRST_ORGAN_ID = 17
@@ -165,8 +165,6 @@ class World:
             cached_plants=GROWN_PLANTS,
             device=str(self.device),
         )
-        self.ground_truth = GroundTruth(self.scene, self.planting, self.state)
-        """What only a simulator knows; for planners that need the truth."""
         self._plant_pose, self._plant_pose_noise = plant_pose, np.array(plant_pose_noise, dtype=np.float64)
         self._T_ee_camera = torch.tensor(
             T_flange_camera_color_optical, dtype=torch.float32, device=self.device
@@ -183,6 +181,10 @@ class World:
         """Poses of the cameras' optical frames. Shape (N, 4, 4)."""
         self.place_arms()
         self.game = make_game(self)
+        self.ground_truth = GroundTruth(
+            self.scene, self.planting, self.state, float(self.task.full_visibility)
+        )
+        """What only a simulator knows; for policies that need the truth."""
 
     # ---------------------------------------------------------------- episode
 

@@ -95,8 +95,12 @@ class WorldState:
 
     def rows(self, names: Iterable[str]) -> dict[str, Tensor]:
         """Copies of some columns as float32, each of shape (N, D)."""
-        return {name: getattr(self, name).float().flatten(1) if getattr(self, name).ndim > 1
-                else getattr(self, name).float()[:, None] for name in names}
+        return {
+            name: getattr(self, name).float().flatten(1)
+            if getattr(self, name).ndim > 1
+            else getattr(self, name).float()[:, None]
+            for name in names
+        }
 
     def put(self, env_idx: Tensor, rows: Mapping[str, Tensor]) -> None:
         """Takes back what `rows` gave, for some environments.
@@ -125,5 +129,7 @@ class WorldState:
             own: Tensor = getattr(self, f.name)
             if f.name not in saved or saved[f.name].shape != own.shape:
                 found = tuple(saved[f.name].shape) if f.name in saved else "nothing"
-                raise InvalidInputError(f"the state's {f.name} must have shape {tuple(own.shape)}, got {found}")
+                raise InvalidInputError(
+                    f"the state's {f.name} must have shape {tuple(own.shape)}, got {found}"
+                )
             setattr(self, f.name, saved[f.name].to(own).clone())

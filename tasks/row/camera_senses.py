@@ -2,6 +2,7 @@
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from maniskill_tomato.errors import InvalidInputError
@@ -11,10 +12,9 @@ from maniskill_tomato.sensing.simulated_camera import (
     COARSE_POSITION,
     RENDERED,
     Perception,
-    identity_is_known,
     make_camera,
 )
-from maniskill_tomato.tasks.row.senses import VIEWS_A_SEED, ExactSenses, Senses, Sight, Vantage
+from maniskill_tomato.tasks.row.senses import ExactSenses, Senses, Sight, Vantage
 from maniskill_tomato.tasks.world import World
 from maniskill_tomato.tasks.world_state import NOISE_SEEDS
 
@@ -33,7 +33,6 @@ class CameraSenses:
         assert made is not None
         self._world = world
         self._camera, self._perception = made
-        self._identity_known = identity_is_known(perception)
         self._qpos = world.state.qpos
 
     def begin(self, env_index: int, rng: np.random.RandomState, hidden_below: float) -> None:
@@ -65,7 +64,6 @@ class CameraSenses:
             env_index,
             position.double().cpu().numpy(),
             hidden_below=hidden_below or None,
-            identity_known=self._identity_known,
         )
 
     def known_target(self) -> Tensor:
@@ -76,12 +74,10 @@ class CameraSenses:
         """Takes and measures frames."""
         world = self._world
         target, T_w_plant = world.state.target, world.planting.T_world_plant
-        for i in vantage.rows():
-            self._camera.seed(i, int(world.state.noise_seed[i]) * VIEWS_A_SEED + int(vantage.look[i]))
+        for i, seed in vantage.seeds(world.state.noise_seed).items():
+            self._camera.seed(i, seed)
         self._qpos = vantage.qpos
-        frames = self._camera.take(
-            vantage.T_w_camera, target, T_w_plant, vantage.T_w_links, vantage.mask
-        )
+        frames = self._camera.take(vantage.T_w_camera, target, T_w_plant, vantage.T_w_links, vantage.mask)
         located = self._perception.look(frames)
         seen = world.scene.visibility(vantage.T_w_camera, target, T_w_plant, vantage.T_w_links)
         fraction = self._perception.visible_fraction
@@ -98,7 +94,7 @@ class CameraSenses:
         """Reads the kept measurements again."""
         self._perception.recall(observer, env_idx)
 
-    def _picture(self, env_index: int) -> np.ndarray[tuple[int, ...], np.dtype[np.uint8]]:
+    def _picture(self, env_index: int) -> NDArray[np.uint8]:
         picture = self._world.picture
         if picture is None:
             raise InvalidInputError("this perception needs colours, and the world has no renderer")

@@ -44,7 +44,17 @@ class SearchGame:
     """The general task, and the row where `transits` says how arms get from target to target."""
 
     saved_columns = (
-        *("viewpoint", "reach", "target", "plant_pose", "plant_seed", "views", "view_count", "looks", "moves"),
+        *(
+            "viewpoint",
+            "reach",
+            "target",
+            "plant_pose",
+            "plant_seed",
+            "views",
+            "view_count",
+            "looks",
+            "moves",
+        ),
         *("clearance", "path_length", "joint_path_length", "fraction_before", "fraction_after"),
         *("noise_seed", "position_error", "hidden_below", "open_targets", "targets_begun", "seen_count"),
         *("target_count", "target_moves", "target_done", "transits"),
@@ -83,9 +93,7 @@ class SearchGame:
         self._senses = make_senses(perception, world, noise)
         self._is_camera = perception != "ground_truth"
         self._starts = HardStarts(task, world.scene, world.device)
-        self.sequence = (
-            None if transits is None else TargetSequence(world, self._observer.lattice, transits)
-        )
+        self.sequence = None if transits is None else TargetSequence(world, self._observer.lattice, transits)
         self._true_views = TrueViews(world.num_envs, self._observer.lattice) if privileged else None
         self._sight: Sight | None = None
         self._seen_from = torch.zeros(0)
@@ -165,7 +173,9 @@ class SearchGame:
             column[env_idx] = 0
         for length in (state.path_length, state.joint_path_length):
             length[env_idx] = 0.0
-        clearance = world.scene.clearance_at(state.qpos[env_idx], world.planting.T_world_plant[env_idx], env_idx)
+        clearance = world.scene.clearance_at(
+            state.qpos[env_idx], world.planting.T_world_plant[env_idx], env_idx
+        )
         state.clearance[env_idx] = clearance
         if self.sequence is not None:
             self.sequence.begin(env_idx)
@@ -340,7 +350,7 @@ class SearchGame:
         )
 
     def recall(self, env_idx: Tensor) -> None:
-        """Looks again from where some environments looked, so that all that is known of their targets is known again."""
+        """Looks again from where some environments looked, so that all is known of their targets that was known."""
         state = self._world.state
         self._ask_truth(env_idx)
         self._senses.recall_targets(env_idx)

@@ -11,9 +11,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from maniskill_tomato.raycast.view_rays import ViewRays, disturb
+from maniskill_tomato.raycast.view_rays import ViewRays
 from maniskill_tomato.sensing.observation import ViewpointObserver
-from maniskill_tomato.sensing.sensor_noise import SensorNoise
+from maniskill_tomato.sensing.sensor_noise import SensorErrors, SensorNoise
 from maniskill_tomato.tasks.world import World
 from maniskill_tomato.tasks.world_state import NOISE_SEEDS
 
@@ -68,11 +68,15 @@ class Vantage:
     mask: Tensor | None = None
     """Which environments look; all if None. Shape (N,), bool."""
 
-    def rows(self) -> list[int]:
-        """Indices of those that look."""
-        if self.mask is None:
-            return list(range(len(self.qpos)))
-        return [int(i) for i in self.mask.nonzero()[:, 0]]
+    def seeds(self, noise_seed: Tensor) -> dict[int, int]:
+        """What the errors of this view follow from, for each environment that looks, by its index.
+
+        Args:
+            noise_seed: Of the episodes. Shape (N,).
+        """
+        seeds = (noise_seed * VIEWS_A_SEED + self.look % VIEWS_A_SEED).tolist()
+        looks = [True] * len(seeds) if self.mask is None else self.mask.tolist()
+        return {i: int(seed) for i, (seed, looked) in enumerate(zip(seeds, looks, strict=True)) if looked}
 
 
 class Senses(Protocol):
@@ -116,8 +120,7 @@ class ExactSenses:
         """
         self._world = world
         self._noise = noise
-        self._errs_in_rays = any((noise.depth_noise, noise.dropout, noise.false_target, noise.missed_target))
-        self._generator = torch.Generator(device=world.device)
+        self._errors = SensorErrors(noise, world.device)
 
     def begin(self, env_index: int, rng: np.random.RandomState, hidden_below: float) -> None:
         """Draws the target's believed position and the seed of the rays' errors, where there are any."""
@@ -125,7 +128,7 @@ class ExactSenses:
         if self._noise.target_position:
             error = rng.normal(0.0, self._noise.target_position, 3)
             state.position_error[env_index] = torch.as_tensor(error).to(state.position_error)
-        if self._errs_in_rays:
+        if self._errors.are_in_rays:
             state.noise_seed[env_index] = int(rng.randint(2**31 - 1)) % NOISE_SEEDS
 
     def begin_targets(self, env_idx: Tensor) -> None:
@@ -147,34 +150,16 @@ class ExactSenses:
         rays = world.scene.view_rays(
             vantage.T_w_camera, target, self.known_target(), T_w_plant, vantage.T_w_links
         )
-        if self._errs_in_rays:
-            rays = self._disturbed(rays, vantage)
+        if self._errors.are_in_rays:
+            rays = self._errors.rays(rays, vantage.seeds(world.state.noise_seed))
         fraction = seen.visible_fraction
         return Sight(
             rays=rays,
             visible_fraction=fraction,
-            told_fraction=fraction * (1.0 - self._noise.missed_target),
+            told_fraction=self._errors.visible_fraction(fraction),
             true_fraction=fraction,
             tomato_seen=seen.any_visible,
         ), None
 
     def revise(self, observer: ViewpointObserver, env_idx: Tensor) -> None:
         """Nothing: where a target is believed to be does not change."""
-
-    def _disturbed(self, rays: ViewRays, vantage: Vantage) -> ViewRays:
-        """The rays as they are measured: each environment's errors follow from its own seed and view."""
-        noise, state = self._noise, self._world.state
-        direction, distance, label = rays.direction_c, rays.distance.clone(), rays.label.clone()
-        for i in vantage.rows():
-            seed = int(state.noise_seed[i]) * VIEWS_A_SEED + int(vantage.look[i]) % VIEWS_A_SEED
-            self._generator.manual_seed(seed)
-            own = disturb(
-                ViewRays(direction[i : i + 1], distance[i : i + 1], label[i : i + 1]),
-                self._generator,
-                depth_noise=noise.depth_noise,
-                dropout=noise.dropout,
-                false_target=noise.false_target,
-                missed_target=noise.missed_target,
-            )
-            distance[i], label[i] = own.distance[0], own.label[0]
-        return ViewRays(direction, distance, label)

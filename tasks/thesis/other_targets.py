@@ -6,7 +6,9 @@ import torch
 from torch import Tensor
 
 
-def other_ripe_fruits(ripe_fruits: Sequence[Sequence[int]], target: Tensor, count: int) -> tuple[Tensor, Tensor]:
+def other_ripe_fruits(
+    ripe_fruits: Sequence[Sequence[int]], target: Tensor, count: int
+) -> tuple[Tensor, Tensor]:
     """The ripe fruits that follow the target in the order of the plant's, the first again after the last.
 
     The order makes the choice repeatable without a random draw, and as even as that of the target.
