@@ -95,11 +95,10 @@ class WorldState:
 
     def rows(self, names: Iterable[str]) -> dict[str, Tensor]:
         """Copies of some columns as float32, each of shape (N, D)."""
+        columns: dict[str, Tensor] = {name: getattr(self, name) for name in names}
         return {
-            name: getattr(self, name).float().flatten(1)
-            if getattr(self, name).ndim > 1
-            else getattr(self, name).float()[:, None]
-            for name in names
+            name: column.reshape(len(column), -1).to(torch.float32, copy=True)
+            for name, column in columns.items()
         }
 
     def put(self, env_idx: Tensor, rows: Mapping[str, Tensor]) -> None:

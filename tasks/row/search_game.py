@@ -43,7 +43,7 @@ START_RPY = (0.0, torch.pi / 2, 0.0)
 class SearchGame:
     """The general task, and the row where `transits` says how arms get from target to target."""
 
-    saved_columns = (
+    saved_columns: tuple[str, ...] = (
         *(
             "viewpoint",
             "reach",

@@ -19,7 +19,7 @@ from maniskill_tomato.tasks.world import World
 class ThesisGame:
     """One class for both tasks; a `ViewpointTaskConfig` tells them apart."""
 
-    saved_columns = ("viewpoint", "reach", "target", "plant_pose", "plant_seed")
+    saved_columns: tuple[str, ...] = ("viewpoint", "reach", "target", "plant_pose", "plant_seed")
 
     def __init__(self, world: World, task: ViewpointTaskConfig, other_targets: int = 0) -> None:
         """Plays in a world.
