@@ -12,15 +12,16 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from maniskill_tomato.raycast.cast_image import ImageCaster, PixelLabel
-from maniskill_tomato.raycast.caster import VisibilityCaster
-from maniskill_tomato.raycast.view_rays import DEPTH_MODE, ViewRays, sample_view
+from maniskill_tomato.raycast.images import PixelLabel
+from maniskill_tomato.raycast.scene import RayScene
+from maniskill_tomato.raycast.view_rays import DEPTH_MODE, ViewRays
 from maniskill_tomato.robot.d435 import CameraIntrinsics, color_intrinsics
 from maniskill_tomato.robot.depth_noise import DepthNoise, measure_depth
 from maniskill_tomato.segmentation.instances import TOMATO
 from maniskill_tomato.segmentation.masks import BinaryMask
 from maniskill_tomato.segmentation.segmenter import Segmenter, make_segmenter
 from maniskill_tomato.sensing.target_tracker import TargetTracker
+from maniskill_tomato.sensing.view_pattern import sample_view
 from maniskill_tomato.sensing.visible_fraction.estimate import (
     Estimate,
     Float64,
@@ -64,7 +65,7 @@ class CameraPerception:
 
     def __init__(
         self,
-        caster: VisibilityCaster,
+        scene: RayScene,
         *,
         intrinsics: CameraIntrinsics | None = None,
         noise: DepthNoise | None = None,
@@ -75,7 +76,7 @@ class CameraPerception:
         """Begins with all targets where they are.
 
         Args:
-            caster: The environments' plants and links.
+            scene: The environments' plants and links.
             intrinsics: Of the images; `IMAGE_SIZE` of the colour camera if None.
             noise: Faults of the depth, the defaults if None.
             model: Estimates V_f; if None a sphere model that knows the size of the tasks' tomatoes.
@@ -83,11 +84,12 @@ class CameraPerception:
             picture: Renders the colours of an environment by its index, shape (height, width, 3); if None they are
                 black.
         """
-        self._images = ImageCaster(caster, intrinsics or color_intrinsics(*IMAGE_SIZE))
+        self._scene = scene
+        self._intrinsics = intrinsics or color_intrinsics(*IMAGE_SIZE)
         self._noise = noise or DepthNoise()
         self._model = model or SphereModel(SphereConfig(radius_m=USUAL_RADIUS, radius_spread=0.14))
         self._segmenter, self._picture = segmenter, picture
-        b, device = caster.num_envs, caster.device
+        b, device = scene.num_envs, scene.device
         self._rng = [np.random.default_rng(0) for _ in range(b)]
         self._hidden_below: list[float | None] = [None] * b
         self._choices = [TargetTracker() for _ in range(b)]
@@ -136,8 +138,8 @@ class CameraPerception:
             T_world_plant: Poses of the plants. Shape (B, 4, 4).
             links: World poses of the links. Shape (B, 9, 4, 4).
         """
-        images = self._images.cast(T_world_camera, target, T_world_plant, links)
-        i = self._images.intrinsics
+        i = self._intrinsics
+        images = self._scene.image(i, T_world_camera, target, T_world_plant, links)
         self._depth, self._mask, self._robot = [], [], []
         for k in range(len(self._rng)):
             true = images.depth[k].cpu().numpy().astype(np.float64)
@@ -201,7 +203,7 @@ class CameraPerception:
             sample_view(
                 self._depth[k],
                 self._mask[k],
-                self._images.intrinsics,
+                self._intrinsics,
                 T_world_camera[k],
                 target_position[k],
                 self._robot[k],
@@ -217,7 +219,7 @@ class CameraPerception:
 
 def make_perception(
     perception: Perception,
-    caster: VisibilityCaster,
+    scene: RayScene,
     intrinsics: CameraIntrinsics,
     picture: Callable[[int], UInt8],
 ) -> CameraPerception | None:
@@ -225,20 +227,20 @@ def make_perception(
 
     Args:
         perception: Which.
-        caster: The environments' plants and links.
+        scene: The environments' plants and links.
         intrinsics: Of rendered pictures.
         picture: Renders them, by the index of an environment.
     """
     if perception == "ground_truth":
         return None
     if perception == "occlusion_model":
-        return CameraPerception(caster)
+        return CameraPerception(scene)
     if perception == "segmenter":
         return CameraPerception(
-            caster, intrinsics=intrinsics, segmenter=make_segmenter("light"), picture=picture
+            scene, intrinsics=intrinsics, segmenter=make_segmenter("light"), picture=picture
         )
     model = ThesisModel() if perception == "thesis_model" else ImprovedModel()
-    return CameraPerception(caster, intrinsics=intrinsics, model=model, picture=picture)
+    return CameraPerception(scene, intrinsics=intrinsics, model=model, picture=picture)
 
 
 def _in_world(

@@ -15,10 +15,7 @@ from maniskill_tomato.errors import InvalidInputError
 from maniskill_tomato.plants.episode_list import Episode
 from maniskill_tomato.plants.row import Row, leaf_density_of
 from maniskill_tomato.plants.spec import PlantSpec
-from maniskill_tomato.raycast.cast_views import CastViews
-from maniskill_tomato.raycast.caster import Visibility
-from maniskill_tomato.raycast.clearance import PlantClearance
-from maniskill_tomato.raycast.view_rays import ViewRayCaster
+from maniskill_tomato.raycast.visibility import Visibility
 from maniskill_tomato.robot.kinematics import link_transforms
 from maniskill_tomato.robot.look_at import camera_to_viewpoint
 from maniskill_tomato.sensing.belief import Belief
@@ -143,18 +140,13 @@ class TomatoViewpointGeneralEnv(TomatoEnv):
 
     def _make_tools(self) -> None:
         n, device = self.num_envs, self.device
-        self._ray_caster = ViewRayCaster(self._caster)
-        self._cast_views = CastViews(self._caster)
-        self._plant_clearance = PlantClearance(self._caster)
         self._observer = ViewpointObserver(n, device, self.layout, self.task.max_moves)
-        self._hard_starts = HardStarts(self.task, self._cast_views, self._plant_clearance, device)
-        self.ground_truth = GroundTruth(
-            self._cast_views, self._plant_clearance, lambda: self.planting, lambda: self._target
-        )
+        self._hard_starts = HardStarts(self.task, self._ray_scene, device)
+        self.ground_truth = GroundTruth(self._ray_scene, lambda: self.planting, lambda: self._target)
         """What only the simulator knows; for planners that need the truth."""
         self._errors = SensorErrors(self._sensor_noise, n, device)
         self._eyes = make_perception(
-            self.perception, self._caster, self.camera_intrinsics, self._wrist_picture
+            self.perception, self._ray_scene, self.camera_intrinsics, self._wrist_picture
         )
         self.soft_starts = 0
         """Episodes so far that no drawn start made as hard as asked for."""
@@ -271,7 +263,7 @@ class TomatoViewpointGeneralEnv(TomatoEnv):
         self._path_length[env_idx] = 0.0
         self._gain[env_idx] = 0.0
         qpos = self.agent.robot.get_qpos()
-        clearance = self._plant_clearance.at(qpos, self.planting.T_world_plant)
+        clearance = self._ray_scene.clearance_at(qpos, self.planting.T_world_plant)
         self._clearance[env_idx] = clearance[env_idx]
         self._look_anew(env_idx)
         self._visible_fraction = self._measured_fraction().clone()
@@ -320,12 +312,12 @@ class TomatoViewpointGeneralEnv(TomatoEnv):
         T_w_links = link_transforms(qpos)
         T_w_camera = T_w_links[:, -1] @ self._T_ee_camera
         T_w_plant = self.planting.T_world_plant
-        self._seen: Visibility = self._caster.cast(T_w_camera, self._target, T_w_plant, T_w_links)
+        self._seen: Visibility = self._ray_scene.visibility(T_w_camera, self._target, T_w_plant, T_w_links)
         known = self._known_target_position()
         self._camera_position = T_w_camera[:, :3, 3]
         if self._eyes is None:
             rays = self._errors.rays(
-                self._ray_caster.cast(T_w_camera, self._target, known, T_w_plant, T_w_links)
+                self._ray_scene.view_rays(T_w_camera, self._target, known, T_w_plant, T_w_links)
             )
             measured = self._errors.visible_fraction(self._seen.visible_fraction)
         else:
@@ -381,7 +373,7 @@ class TomatoViewpointGeneralEnv(TomatoEnv):
             The way's length, in [m]. Shape (num_envs,).
         """
         qpos = self.agent.robot.get_qpos()
-        self._clearance = self._plant_clearance.along(before, qpos, self.planting.T_world_plant)
+        self._clearance = self._ray_scene.clearance_along(before, qpos, self.planting.T_world_plant)
         T_w_camera = link_transforms(qpos)[:, -1] @ self._T_ee_camera
         length: Tensor = (T_w_camera[:, :3, 3] - position).norm(dim=-1)
         return length

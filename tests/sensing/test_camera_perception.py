@@ -9,7 +9,7 @@ import torch
 
 import maniskill_tomato  # noqa: F401
 from maniskill_tomato.errors import InvalidInputError
-from maniskill_tomato.raycast.cast_image import ImageCaster, PixelLabel
+from maniskill_tomato.raycast.images import PixelLabel
 from maniskill_tomato.robot.d435 import color_intrinsics
 from maniskill_tomato.robot.kinematics import link_transforms
 from maniskill_tomato.segmentation.instances import Instances
@@ -103,14 +103,18 @@ def test_rendered_perceptions_run_and_their_pictures_lie_on_the_cast_labels(perc
     picture = task._wrist_picture(0).astype(int)
     assert picture.shape == (240, 320, 3)
     T_w_links = link_transforms(task.agent.robot.get_qpos())
-    images = ImageCaster(task._caster, task.camera_intrinsics).cast(
-        T_w_links[:, -1] @ task._T_ee_camera, task._target, task.planting.T_world_plant, T_w_links
+    images = task._ray_scene.image(
+        task.camera_intrinsics,
+        T_w_links[:, -1] @ task._T_ee_camera,
+        task._target,
+        task.planting.T_world_plant,
+        T_w_links,
     )
     target = (images.label[0] == int(PixelLabel.TARGET)).numpy()
     if np.count_nonzero(target) > 20:
         red, green, _ = picture[target].T
         assert np.median(red - green) > 30
-    # Leaves and stems are green where the caster meets the plant.
+    # Leaves and stems are green where rays meet the plant.
     plant = (images.label[0] == int(PixelLabel.PLANT)).numpy()
     nothing = (images.label[0] == int(PixelLabel.NOTHING)).numpy()
     colourful = picture.max(-1) - picture.min(-1)
@@ -123,7 +127,7 @@ def test_of_several_fruits_found_the_one_near_the_known_place_is_the_target() ->
     env.reset(seed=2)
     looks = []
     for order in (1, -1):
-        eyes = CameraPerception(env._caster, segmenter=LabelSegmenter(env, order))
+        eyes = CameraPerception(env._ray_scene, segmenter=LabelSegmenter(env, order))
         eyes.begin(0, np.random.RandomState(0))
         T_w_links = link_transforms(env.agent.robot.get_qpos())
         T_w_camera = T_w_links[:, -1] @ env._T_ee_camera
@@ -144,7 +148,7 @@ def test_what_the_first_view_of_a_hidden_target_shows_well_is_not_taken_for_it()
     env.reset(seed=0)
     seen = []
     for hidden_below in (None, 0.3):
-        eyes = CameraPerception(env._caster, segmenter=LabelSegmenter(env, 1))
+        eyes = CameraPerception(env._ray_scene, segmenter=LabelSegmenter(env, 1))
         eyes.begin(0, np.random.RandomState(0), hidden_below)
         eyes.forget(torch.tensor([0]))
         T_w_links = link_transforms(env.agent.robot.get_qpos())
@@ -162,9 +166,12 @@ class LabelSegmenter:
 
     def __init__(self, env: Any, order: int) -> None:
         T_w_links = link_transforms(env.agent.robot.get_qpos())
-        caster = ImageCaster(env._caster, color_intrinsics(*IMAGE_SIZE))
-        images = caster.cast(
-            T_w_links[:, -1] @ env._T_ee_camera, env._target, env.planting.T_world_plant, T_w_links
+        images = env._ray_scene.image(
+            color_intrinsics(*IMAGE_SIZE),
+            T_w_links[:, -1] @ env._T_ee_camera,
+            env._target,
+            env.planting.T_world_plant,
+            T_w_links,
         )
         target = (images.label[0] == int(PixelLabel.TARGET)).numpy()
         other = np.zeros_like(target)
