@@ -149,9 +149,14 @@ class TomatoViewpointGeneralEnv(TomatoEnv):
         self._observer = ViewpointObserver(n, device, self.layout, self.task.max_moves)
         self._hard_starts = HardStarts(self.task, self._cast_views, self._plant_clearance, device)
         self.ground_truth = GroundTruth(
-            self._cast_views, self._plant_clearance, lambda: self.planting, lambda: self._target
+            self._cast_views,
+            self._plant_clearance,
+            planting=lambda: self.planting,
+            target=lambda: self._target,
+            qpos=lambda: self.agent.robot.get_qpos(),
+            threshold=self.task.full_visibility,
         )
-        """What only the simulator knows; for planners that need the truth."""
+        """What only the simulator knows; for policies that need the truth."""
         self._errors = SensorErrors(self._sensor_noise, n, device)
         self._eyes = make_perception(
             self.perception, self._caster, self.camera_intrinsics, self._wrist_picture
