@@ -132,13 +132,14 @@ def assert_acts_alike(model: Path, source: Path, observations: Float32) -> None:
 def summed_one_by_one(actor: DenseActor, observations: torch.Tensor) -> torch.Tensor:
     """The actor's answer as a processor without vector units calculates it: float32, product by product."""
     x = ((observations - actor.normalizer.centre) / actor.normalizer.half_range).numpy()
-    for index, layer in enumerate(actor.layers):
+    layers: Any = actor.layers
+    for index, layer in enumerate(layers):
         weight, bias = (p.detach().numpy() for p in (layer.weight, layer.bias))
         total = np.zeros((len(x), len(bias)), np.float32)
         for column in range(weight.shape[1]):
             total += x[:, column : column + 1] * weight[:, column]
         total += bias
-        x = np.tanh(total) if index == len(actor.layers) - 1 else np.maximum(total, 0.0)
+        x = np.tanh(total) if index == len(layers) - 1 else np.maximum(total, 0.0)
     return torch.from_numpy(x) * actor.action_scale
 
 

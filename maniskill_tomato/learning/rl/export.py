@@ -294,7 +294,8 @@ def rounding_tolerance(actor: DenseActor, observations: NDArray[np.float32]) -> 
         torch.from_numpy(observations).double() - actor.normalizer.centre.cpu().double()
     ) / actor.normalizer.half_range.cpu().double()
     error = 2.0 * unit * x.abs()
-    for layer, activation in zip(actor.layers, activations, strict=True):
+    layers: Sequence[Any] = actor.layers  # To mypy a module's weight may be a module.
+    for layer, activation in zip(layers, activations, strict=True):
         weight, bias = (p.detach().cpu().double() for p in (layer.weight, layer.bias))
         terms = x.abs() @ weight.abs().T + bias.abs()
         error = error @ weight.abs().T + unit * (weight.shape[1] + 1) ** 0.5 * terms
