@@ -31,7 +31,6 @@ from maniskill_tomato.plants.episode_list import (
     read_episodes,
     write_episodes,
 )
-from maniskill_tomato.policies.env_truth import EnvironmentTruth
 from maniskill_tomato.policies.oracle import OracleSearch
 from maniskill_tomato.tasks.row.episode_sampling import draw_episodes, extend_episodes
 from maniskill_tomato.worker_pool import run_jobs
@@ -66,8 +65,7 @@ def certify(episodes: list[Episode], contact_free: bool) -> list[Episode]:
     """The episodes with the fewest moves that the oracle finds within the task's limit."""
     env: Any = make_env("TomatoViewpoint-v1", episodes=episodes)
     world = env.unwrapped
-    truth = EnvironmentTruth(env, contact_free)
-    search = OracleSearch(truth, truth.threshold, world.device, accept=truth.can_follow)
+    search = OracleSearch(world.ground_truth, world.device, contact_free=contact_free)
     certified = []
     for number, episode in enumerate(episodes):
         env.reset(options={"episode": number})
