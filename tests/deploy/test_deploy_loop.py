@@ -29,7 +29,7 @@ from maniskill_tomato.deploy.steps import KeptSteps, RunResult
 from maniskill_tomato.deploy.stops import Stops
 from maniskill_tomato.deploy.workcell import Workcell, make_workcell
 from maniskill_tomato.errors import PolicyError
-from maniskill_tomato.policies.base import Planner
+from maniskill_tomato.policies.protocol import Planner
 from maniskill_tomato.robot.d435 import T_flange_camera_color_optical
 from maniskill_tomato.robot.kinematics import forward_kinematics
 from maniskill_tomato.sensing.belief import Belief

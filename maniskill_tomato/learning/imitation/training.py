@@ -14,7 +14,7 @@ import maniskill_tomato
 from maniskill_tomato.errors import InvalidInputError
 from maniskill_tomato.files import write_atomically
 from maniskill_tomato.learning.blocks import Block, run_blocks
-from maniskill_tomato.learning.imitation.collect import ImitationData, Student, collect_demonstrations
+from maniskill_tomato.learning.imitation.collect import ImitationData, collect_demonstrations
 from maniskill_tomato.learning.imitation.fit import fit_actor, fit_recurrent
 from maniskill_tomato.learning.imitation.imitation_config import ImitationConfig, StudentKind
 from maniskill_tomato.learning.rl.agent import make_agent
@@ -23,6 +23,7 @@ from maniskill_tomato.learning.rl.envs import make_env
 from maniskill_tomato.learning.rl.policy import load_policy
 from maniskill_tomato.learning.rl.presets import get_preset
 from maniskill_tomato.policies.learned import LearnedPolicy
+from maniskill_tomato.policies.protocol import Policy
 from maniskill_tomato.policies.recurrent import (
     RecurrentActor,
     RecurrentPolicy,
@@ -112,7 +113,7 @@ def _fit(config: ImitationConfig, data: ImitationData, path: Path, report: Calla
     save_checkpoint(path, checkpoint)
 
 
-def _student(kind: StudentKind, path: Path) -> Student:
+def _student(kind: StudentKind, path: Path) -> Policy:
     return load_recurrent(path) if kind == "recurrent" else LearnedPolicy(load_policy(path))
 
 
