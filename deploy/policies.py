@@ -11,9 +11,9 @@ from torch import Tensor
 from maniskill_tomato.assets import asset_path
 from maniskill_tomato.errors import PolicyError, TomatoError
 from maniskill_tomato.files import read_tensors
-from maniskill_tomato.policies.base import Planner
 from maniskill_tomato.policies.learned import LearnedPolicy
 from maniskill_tomato.policies.onnx_policy import OnnxPolicy
+from maniskill_tomato.policies.protocol import Planner
 from maniskill_tomato.policies.registry import PLANNERS, PRIVILEGED, make_planner
 from maniskill_tomato.policies.view_quality import is_view_quality, load_view_quality
 from maniskill_tomato.sensing.belief import Belief

@@ -28,7 +28,6 @@ from maniskill_tomato.policies.deep_move_to_see import (
     save_move_network,
     train_move_network,
 )
-from maniskill_tomato.policies.env_truth import EnvironmentTruth
 from maniskill_tomato.policies.move_to_see import MoveToSee
 
 logger = logging.getLogger("train_deep_move_to_see")
@@ -54,7 +53,7 @@ def collect(episodes: int, moves: int, seed: int) -> MoveToSeeData:
     """Views of training plants with the moves that 3D Move To See makes from them."""
     env: Any = make_env("TomatoViewpoint-v1")
     world = env.unwrapped
-    teacher, wanderer = MoveToSee(EnvironmentTruth(env), world.device), RandomStep(seed)
+    teacher, wanderer = MoveToSee(world.ground_truth, world.device), RandomStep(seed)
     coin = torch.Generator().manual_seed(seed)
     pictures: list[Tensor] = []
     distances: list[Tensor] = []

@@ -48,7 +48,7 @@ class Eval:
         from maniskill_tomato.experiments.viewpoint_policy import open_viewpoint_policy
         from maniskill_tomato.learning.rl.envs import check_env_id
         from maniskill_tomato.learning.rl.policy import RandomPolicy
-        from maniskill_tomato.policies.base import Planner
+        from maniskill_tomato.policies.protocol import Planner
         from maniskill_tomato.policies.registry import PLANNERS
 
         check_env_id(self.env_id)

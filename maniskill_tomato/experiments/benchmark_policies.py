@@ -9,9 +9,8 @@ import gymnasium as gym
 
 from maniskill_tomato.errors import InvalidInputError
 from maniskill_tomato.experiments.viewpoint_policy import open_viewpoint_policy
-from maniskill_tomato.policies.base import Planner
 from maniskill_tomato.policies.deep_move_to_see import DeepMoveToSee, load_move_network
-from maniskill_tomato.policies.env_truth import EnvironmentTruth
+from maniskill_tomato.policies.protocol import Planner
 from maniskill_tomato.policies.registry import PLANNERS, make_planner
 
 
@@ -73,12 +72,10 @@ class PolicySpec:
             spec: Any = env.unwrapped.spec
             return open_viewpoint_policy(self.path, None if spec is None else spec.id)
         assert self.planner is not None
-        truth = EnvironmentTruth(env, contact_free)
         return make_planner(
             self.planner,
-            ground_truth=truth,
-            threshold=truth.threshold,
-            accept_way=truth.can_follow,
+            ground_truth=getattr(env.unwrapped, "ground_truth", None),
+            contact_free=contact_free,
             device=device,
         )
 

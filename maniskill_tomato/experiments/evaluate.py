@@ -21,9 +21,9 @@ from maniskill_tomato.experiments.viewpoint_policy import acting_policy
 from maniskill_tomato.learning.rl.envs import make_env
 from maniskill_tomato.learning.rl.history import load_history
 from maniskill_tomato.learning.rl.policy import Policy, RandomPolicy
-from maniskill_tomato.policies.base import Planner
 from maniskill_tomato.policies.baselines import RandomStep
 from maniskill_tomato.policies.learned import LearnedPolicy
+from maniskill_tomato.policies.protocol import Planner
 from maniskill_tomato.policies.view_quality import ViewQuality
 from maniskill_tomato.rendering import vulkan_probe
 from maniskill_tomato.tasks import GENERAL_IDS

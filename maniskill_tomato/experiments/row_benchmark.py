@@ -9,8 +9,8 @@ import torch
 from torch import Tensor
 
 from maniskill_tomato.experiments.statistics import mean_interval, sign_flip_p
-from maniskill_tomato.policies.base import Planner
 from maniskill_tomato.policies.oracle import FARTHEST, SHOULDER, shell_points
+from maniskill_tomato.policies.protocol import Planner
 from maniskill_tomato.robot.iiwa14 import READY_QPOS
 from maniskill_tomato.robot.inverse_kinematics import Reach
 from maniskill_tomato.robot.look_at_move import MIN_DISTANCE, LookAtMover

@@ -11,8 +11,8 @@ from torch import Tensor
 
 from maniskill_tomato.errors import InvalidInputError
 from maniskill_tomato.experiments.view_episode import ViewEpisode
+from maniskill_tomato.policies.protocol import Policy
 from maniskill_tomato.robot.inverse_kinematics import Reach
-from maniskill_tomato.sensing.belief import ViewpointPolicy
 
 Reset = Callable[[gym.Env[Any, Any], int], Any]
 """Starts the episode with a number."""
@@ -25,7 +25,7 @@ def reset_to_seed(env: gym.Env[Any, Any], episode: int) -> Any:
 
 def run_view_episode(
     env: gym.Env[Any, Any],
-    policy: ViewpointPolicy,
+    policy: Policy,
     episode: int,
     reset: Reset = reset_to_seed,
     oracle_moves: int | None = None,
@@ -90,7 +90,7 @@ def run_view_episode(
 
 def run_view_episodes(
     env: gym.Env[Any, Any],
-    policy: ViewpointPolicy,
+    policy: Policy,
     episodes: Sequence[int],
     reset: Reset = reset_to_seed,
     oracle_moves: Callable[[int], int | None] = lambda episode: None,

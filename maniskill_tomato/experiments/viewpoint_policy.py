@@ -10,9 +10,8 @@ from maniskill_tomato.errors import CheckpointError
 from maniskill_tomato.experiments.exported import open_policy
 from maniskill_tomato.experiments.rollout import ActingPolicy
 from maniskill_tomato.files import read_tensors
-from maniskill_tomato.policies.base import Planner
-from maniskill_tomato.policies.env_truth import EnvironmentTruth
 from maniskill_tomato.policies.learned import LearnedPolicy
+from maniskill_tomato.policies.protocol import Planner
 from maniskill_tomato.policies.recurrent import is_recurrent, load_recurrent
 from maniskill_tomato.policies.registry import make_planner
 from maniskill_tomato.policies.view_quality import is_view_quality, load_view_quality
@@ -67,12 +66,9 @@ class BeliefPolicy:
 def acting_policy(policy: ActingPolicy | Planner | str, env: gym.Env[Any, Any]) -> ActingPolicy:
     """What `run_episodes` can ask in `env`; a string names a planner."""
     if isinstance(policy, str):
-        truth = EnvironmentTruth(env)
         policy = make_planner(
             policy,
-            ground_truth=truth,
-            threshold=truth.threshold,
-            accept_way=truth.can_follow,
+            ground_truth=getattr(env.unwrapped, "ground_truth", None),
             device=getattr(env.unwrapped, "device", "cpu"),
         )
     return BeliefPolicy(policy, env) if isinstance(policy, Planner) else policy

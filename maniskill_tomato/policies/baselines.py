@@ -9,8 +9,8 @@ import math
 import torch
 from torch import Tensor
 
-from maniskill_tomato.policies.base import Planner, RandomPlanner
 from maniskill_tomato.policies.moves import Goals
+from maniskill_tomato.policies.protocol import Planner, RandomPlanner
 from maniskill_tomato.raycast.view_rays import RayLabel, ray_pattern
 from maniskill_tomato.robot.look_at_move import MAX_MOVE
 from maniskill_tomato.sensing.belief import Belief
@@ -60,8 +60,8 @@ class RandomViewpoint(RandomPlanner):
         super().__init__(seed)
         self._goals = Goals()
 
-    def begin(self, belief: Belief, env_idx: Tensor) -> None:
-        self._goals.begin(belief, env_idx)
+    def begin(self, belief: Belief, rows: Tensor) -> None:
+        self._goals.begin(belief, rows)
 
     def act(self, belief: Belief) -> Tensor:
         """Towards the goal; a new one where the last is reached or blocked."""
@@ -88,20 +88,20 @@ class FixedSweep(Planner):
         self._route = torch.zeros(0, 9, 3)
         self._next = torch.zeros(0, dtype=torch.int64)
 
-    def begin(self, belief: Belief, env_idx: Tensor) -> None:
+    def begin(self, belief: Belief, rows: Tensor) -> None:
         position, target = belief.camera_position, belief.target_position
         if len(self._route) != len(position):
             self._route = position.new_zeros(len(position), 9, 3)
             self._next = torch.zeros(len(position), dtype=torch.int64, device=position.device)
-        self._goals.begin(belief, env_idx)
+        self._goals.begin(belief, rows)
         candidates = belief.lattice.positions(target)
-        for i in env_idx.tolist():
+        for i in rows.tolist():
             views = target[i] + sweep_offsets(target[i])
             allowed = candidates[i][belief.reachable[i]]
             if len(allowed):
                 views = allowed[torch.cdist(views, allowed).argmin(dim=1)]
             self._route[i] = _from_the_nearest_corner(views.view(3, 3, 3), position[i])
-        self._next[env_idx] = 0
+        self._next[rows] = 0
 
     def act(self, belief: Belief) -> Tensor:
         """Towards the next view of the pattern."""

@@ -24,7 +24,7 @@ from torch import Tensor, nn
 
 from maniskill_tomato.errors import CheckpointError, InvalidInputError
 from maniskill_tomato.files import write_atomically
-from maniskill_tomato.policies.base import Planner
+from maniskill_tomato.policies.protocol import Planner
 from maniskill_tomato.raycast.view_rays import RAYS_PER_SIDE, RayLabel, ViewRays
 from maniskill_tomato.sensing.belief import Belief
 

@@ -26,8 +26,8 @@ import torch
 from torch import Tensor
 from torch.nn.functional import grid_sample
 
-from maniskill_tomato.policies.base import Planner
 from maniskill_tomato.policies.moves import move_towards
+from maniskill_tomato.policies.protocol import Planner
 from maniskill_tomato.policies.reach import CameraReach
 from maniskill_tomato.robot.look_at import look_frame
 from maniskill_tomato.robot.look_at_move import MAX_MOVE, MIN_DISTANCE
@@ -91,13 +91,13 @@ class GradientView(Planner):
         self._square = torch.zeros(0, 3)
         self._count = torch.zeros(0, 1)
 
-    def begin(self, belief: Belief, env_idx: Tensor) -> None:
+    def begin(self, belief: Belief, rows: Tensor) -> None:
         position = belief.camera_position
         if len(self._mean) != len(position):
             self._mean, self._square = torch.zeros_like(position), torch.zeros_like(position)
             self._count = torch.zeros_like(position[:, :1])
         for state in (self._mean, self._square, self._count):
-            state[env_idx] = 0.0
+            state[rows] = 0.0
 
     def act(self, belief: Belief) -> Tensor:
         """Up the gradient, as far as the arm reaches."""

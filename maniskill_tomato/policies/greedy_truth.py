@@ -5,7 +5,7 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
-from maniskill_tomato.policies.base import GroundTruth, Planner
+from maniskill_tomato.policies.protocol import GroundTruth, Planner
 from maniskill_tomato.policies.reach import CameraReach
 from maniskill_tomato.robot.look_at import look_at_pose, look_frame
 from maniskill_tomato.robot.look_at_move import MAX_MOVE, MIN_DISTANCE
@@ -43,8 +43,8 @@ class GreedyTruth(Planner):
         self._directions = greedy_directions().to(device)
         self._last: dict[int, Tensor] = {}
 
-    def begin(self, belief: Belief, env_idx: Tensor) -> None:
-        for i in env_idx.tolist():
+    def begin(self, belief: Belief, rows: Tensor) -> None:
+        for i in rows.tolist():
             self._last.pop(i, None)
 
     def act(self, belief: Belief) -> Tensor:

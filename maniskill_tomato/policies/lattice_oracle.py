@@ -3,8 +3,8 @@
 import torch
 from torch import Tensor
 
-from maniskill_tomato.policies.base import GroundTruth, Planner
 from maniskill_tomato.policies.moves import Candidates, moves_needed
+from maniskill_tomato.policies.protocol import GroundTruth, Planner
 from maniskill_tomato.robot.look_at import look_at_pose
 from maniskill_tomato.robot.look_at_move import MAX_MOVE
 from maniskill_tomato.sensing.belief import Belief
@@ -20,21 +20,20 @@ class LatticeOracle(Planner):
     name = "lattice_oracle"
     needs_truth = True
 
-    def __init__(self, ground_truth: GroundTruth, threshold: float) -> None:
+    def __init__(self, ground_truth: GroundTruth) -> None:
         self._truth = ground_truth
-        self._threshold = threshold
         self.tried = Candidates()
         self.seen = torch.zeros(0, 0)
         """True V_f of every candidate. Shape (B, K)."""
 
-    def begin(self, belief: Belief, env_idx: Tensor) -> None:
+    def begin(self, belief: Belief, rows: Tensor) -> None:
         if self.seen.shape != belief.reachable.shape:
             self.seen = torch.zeros(belief.reachable.shape, device=belief.reachable.device)
         candidates = belief.lattice.positions(belief.target_position)
-        for i in env_idx.tolist():
+        for i in rows.tolist():
             poses = look_at_pose(candidates[i], belief.target_position[i])
             self.seen[i] = self._truth.visible_fraction(poses, i)
-        self.tried.begin(belief, env_idx)
+        self.tried.begin(belief, rows)
 
     def act(self, belief: Belief) -> Tensor:
         """Towards that candidate."""
@@ -43,5 +42,5 @@ class LatticeOracle(Planner):
         candidates = belief.lattice.positions(target)
         way = (candidates - position[:, None]).norm(dim=-1)
         near = -moves_needed(way) - way / (1e3 * MAX_MOVE)
-        worth = torch.where(self.seen > self._threshold, near, self.seen - 1e3)
+        worth = torch.where(self.seen > self._truth.threshold, near, self.seen - 1e3)
         return self.tried.move_to_best(belief, candidates, worth, belief.reachable)

@@ -4,7 +4,7 @@ from typing import Protocol
 
 from torch import Tensor
 
-from maniskill_tomato.policies.base import Planner
+from maniskill_tomato.policies.protocol import Planner
 from maniskill_tomato.sensing.belief import Belief
 
 

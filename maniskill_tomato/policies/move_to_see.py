@@ -28,7 +28,7 @@ from abc import abstractmethod
 import torch
 from torch import Tensor
 
-from maniskill_tomato.policies.base import GroundTruth, Planner
+from maniskill_tomato.policies.protocol import GroundTruth, Planner
 from maniskill_tomato.robot.look_at import look_at_pose, look_frame
 from maniskill_tomato.robot.look_at_move import MAX_MOVE
 from maniskill_tomato.sensing.belief import Belief

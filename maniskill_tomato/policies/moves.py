@@ -72,12 +72,12 @@ class Goals:
         self._goal = torch.zeros(0, 3)
         self._before = torch.zeros(0)
 
-    def begin(self, belief: Belief, env_idx: Tensor) -> None:
+    def begin(self, belief: Belief, rows: Tensor) -> None:
         """Drops the goals of some environments."""
         if len(self._goal) != len(belief.camera_position):
             self._goal = torch.full_like(belief.camera_position, math.nan)
             self._before = torch.full_like(belief.camera_position[:, 0], math.inf)
-        self._goal[env_idx] = math.nan
+        self._goal[rows] = math.nan
 
     def ended(self, belief: Belief) -> Tensor:
         """Which environments need a new goal. Shape (B,), bool."""
@@ -120,7 +120,7 @@ class Candidates:
         self._direction = torch.zeros(0, 3)
         self._refused_directions: list[list[Tensor]] = []
 
-    def begin(self, belief: Belief, env_idx: Tensor) -> None:
+    def begin(self, belief: Belief, rows: Tensor) -> None:
         """Forgets the episodes of some environments."""
         if self.refused.shape != belief.reachable.shape:
             self.refused = torch.zeros_like(belief.reachable)
@@ -128,9 +128,9 @@ class Candidates:
             self._before = torch.full_like(belief.camera_position, math.nan)
             self._direction = torch.zeros_like(belief.camera_position)
             self._refused_directions = [[] for _ in range(len(self.chosen))]
-        self.refused[env_idx] = False
-        self._before[env_idx] = math.nan
-        for i in env_idx.tolist():
+        self.refused[rows] = False
+        self._before[rows] = math.nan
+        for i in rows.tolist():
             self._refused_directions[i].clear()
 
     def note_refusals(self, belief: Belief) -> None:

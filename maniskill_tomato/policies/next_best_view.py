@@ -18,8 +18,8 @@ import torch
 from torch import Tensor
 
 from maniskill_tomato.errors import InvalidInputError
-from maniskill_tomato.policies.base import Planner
 from maniskill_tomato.policies.moves import Candidates
+from maniskill_tomato.policies.protocol import Planner
 from maniskill_tomato.robot.look_at_move import MAX_MOVE
 from maniskill_tomato.sensing.belief import Belief
 
@@ -55,15 +55,15 @@ class MeasuredViews:
         self._offset = torch.zeros(0, most, 3)
         self._seen = torch.zeros(0, most)
 
-    def begin(self, belief: Belief, env_idx: Tensor) -> None:
+    def begin(self, belief: Belief, rows: Tensor) -> None:
         """Forgets the views of some environments."""
         position = belief.camera_position
         if len(self._offset) != len(position):
             self._offset = position.new_full((len(position), self._most, 3), math.nan)
             self._seen = position.new_zeros(len(position), self._most)
             self._count = torch.zeros(len(position), dtype=torch.int64, device=position.device)
-        self._offset[env_idx] = math.nan
-        self._count[env_idx] = 0
+        self._offset[rows] = math.nan
+        self._count[rows] = 0
 
     def add(self, belief: Belief) -> None:
         """Takes in the present views."""
@@ -107,9 +107,9 @@ class NextBestView(Planner):
         self._measured = MeasuredViews()
         self.tried = Candidates()
 
-    def begin(self, belief: Belief, env_idx: Tensor) -> None:
-        self._measured.begin(belief, env_idx)
-        self.tried.begin(belief, env_idx)
+    def begin(self, belief: Belief, rows: Tensor) -> None:
+        self._measured.begin(belief, rows)
+        self.tried.begin(belief, rows)
 
     def act(self, belief: Belief) -> Tensor:
         """Towards the best view."""

@@ -12,14 +12,12 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from maniskill_tomato.policies.base import GroundTruth, Planner
 from maniskill_tomato.policies.moves import NEAR_ENOUGH, move_towards, moves_needed, stops
+from maniskill_tomato.policies.protocol import GroundTruth, Planner
 from maniskill_tomato.policies.reach import CameraReach
 from maniskill_tomato.robot.look_at import look_at_pose
 from maniskill_tomato.robot.look_at_move import MAX_MOVE, MIN_DISTANCE
 from maniskill_tomato.sensing.belief import Belief
-
-AcceptWay = Callable[[Tensor, Tensor, Tensor, int], bool]
 
 SPACINGS = (0.02, 0.03, 0.04, 0.05)
 """Distance of neighbouring samples after 1, 2, 3 and more moves, in [m]."""
@@ -64,24 +62,22 @@ class OracleSearch:
     def __init__(
         self,
         ground_truth: GroundTruth,
-        threshold: float,
         device: str | torch.device = "cpu",
+        *,
+        contact_free: bool = False,
         reachable: Callable[[Tensor, Tensor], Tensor] | None = None,
-        accept: AcceptWay | None = None,
     ) -> None:
         """Keeps what it asks.
 
         Args:
-            ground_truth: Gives V_f of any view.
-            threshold: V_f above which a view is good.
+            ground_truth: Gives V_f of any view, and the last word on a way.
             device: Of all tensors.
+            contact_free: Whether no move may touch the plant.
             reachable: Which positions (N, 3) can be taken when looking at a target (3,); the arm's if None.
-            accept: The last word on a way: start (3,), stops (n, 3), target (3,) and environment; any is good if None.
         """
         self._truth = ground_truth
-        self._threshold = threshold
+        self._contact_free = contact_free
         self._reachable = reachable or CameraReach(device).reachable
-        self._accept: AcceptWay = accept or (lambda start, way, target, env_index: True)
 
     def solve(
         self,
@@ -132,7 +128,7 @@ class OracleSearch:
         """A solution that needs this number of moves, with its view among `places`."""
         for block in torch.split(places, _BLOCK):
             seen = self._truth.visible_fraction(look_at_pose(block, target), env_index)
-            good = torch.nonzero(seen > self._threshold)[:, 0]
+            good = torch.nonzero(seen > self._truth.threshold)[:, 0]
             for index in good[:_WAYS].tolist():
                 way = self._way(start, block[index], target, env_index, moves, reached, excluded)
                 if way is not None:
@@ -151,7 +147,7 @@ class OracleSearch:
     ) -> Tensor | None:
         """Stops of a straight way or of one with a bend that needs no more moves."""
         straight = stops(start, goal)
-        if self._free(straight, target, excluded) and self._accept(start, straight, target, env_index):
+        if self._free(straight, target, excluded) and self._holds(start, straight, target, env_index):
             return straight
         tried = 0
         first, second = (reached - start).norm(dim=1), (reached - goal).norm(dim=1)
@@ -160,12 +156,16 @@ class OracleSearch:
         for bend in reached[fits]:
             way = torch.cat([stops(start, bend), stops(bend, goal)])
             if self._free(way, target, excluded):
-                if self._accept(start, way, target, env_index):
+                if self._holds(start, way, target, env_index):
                     return way
                 tried += 1
                 if tried == _BENT_WAYS:
                     break
         return None
+
+    def _holds(self, start: Tensor, way: Tensor, target: Tensor, env_index: int) -> bool:
+        """Whether the arm can make every move of a way and sees the target at its end."""
+        return self._truth.can_follow(start, way, target, env_index, contact_free=self._contact_free)
 
     def _free(self, way: Tensor, target: Tensor, excluded: Tensor) -> bool:
         """Whether the camera can stop at every place of a way; its end is known to be reachable."""
@@ -203,8 +203,8 @@ class Oracle(Planner):
         self._ways: dict[int, Tensor] = {}
         self._excluded: dict[int, list[Tensor]] = {}
 
-    def begin(self, belief: Belief, env_idx: Tensor) -> None:
-        for i in env_idx.tolist():
+    def begin(self, belief: Belief, rows: Tensor) -> None:
+        for i in rows.tolist():
             self._excluded[i] = []
             self._ways.pop(i, None)
 

@@ -8,8 +8,8 @@ from torch import Tensor, nn
 from torch.nn.utils.rnn import PackedSequence
 
 from maniskill_tomato.errors import InvalidInputError
-from maniskill_tomato.policies.base import Planner
 from maniskill_tomato.policies.network_file import holds, load_network, save_network
+from maniskill_tomato.policies.protocol import Planner
 from maniskill_tomato.sensing.belief import Belief
 from maniskill_tomato.sensing.observation import ObservationLayout, Part
 
@@ -68,11 +68,11 @@ class RecurrentPolicy(Planner):
         self.facts = facts or {}
         self._state = torch.zeros(1, 0, actor.sizes["width"])
 
-    def begin(self, belief: Belief, env_idx: Tensor) -> None:
+    def begin(self, belief: Belief, rows: Tensor) -> None:
         count = len(belief.camera_position)
         if self._state.shape[1] != count:
             self._state = belief.observation.new_zeros(1, count, self.actor.sizes["width"])
-        self._state[:, env_idx] = 0.0
+        self._state[:, rows] = 0.0
 
     def act(self, belief: Belief) -> Tensor:
         """The actor's moves."""

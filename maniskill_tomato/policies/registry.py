@@ -5,7 +5,6 @@ from collections.abc import Callable
 import torch
 
 from maniskill_tomato.errors import InvalidInputError
-from maniskill_tomato.policies.base import GroundTruth, Planner
 from maniskill_tomato.policies.baselines import FixedSweep, LookAtServoing, RandomStep, RandomViewpoint, Stay
 from maniskill_tomato.policies.deep_move_to_see import DeepMoveToSee
 from maniskill_tomato.policies.gradient_view import GradientView
@@ -13,7 +12,8 @@ from maniskill_tomato.policies.greedy_truth import GreedyTruth
 from maniskill_tomato.policies.lattice_oracle import LatticeOracle
 from maniskill_tomato.policies.move_to_see import MoveToSee, MoveToSeeOnMemory
 from maniskill_tomato.policies.next_best_view import NextBestDirection, NextBestView
-from maniskill_tomato.policies.oracle import AcceptWay, Oracle, OracleSearch
+from maniskill_tomato.policies.oracle import Oracle, OracleSearch
+from maniskill_tomato.policies.protocol import GroundTruth, Planner
 from maniskill_tomato.policies.view_quality import ViewQuality
 
 
@@ -23,14 +23,12 @@ class _Setting:
     def __init__(
         self,
         ground_truth: GroundTruth | None,
-        threshold: float,
-        accept_way: AcceptWay | None,
+        contact_free: bool,
         seed: int,
         device: str | torch.device,
     ) -> None:
         self._truth = ground_truth
-        self.threshold = threshold
-        self.accept_way = accept_way
+        self.contact_free = contact_free
         self.seed = seed
         self.device = device
 
@@ -57,8 +55,8 @@ _MAKERS: dict[str, Callable[[_Setting], Planner]] = {
     ViewQuality.name: lambda s: ViewQuality.shipped(s.device),
     MoveToSee.name: lambda s: MoveToSee(s.truth, s.device),
     GreedyTruth.name: lambda s: GreedyTruth(s.truth, s.device),
-    LatticeOracle.name: lambda s: LatticeOracle(s.truth, s.threshold),
-    Oracle.name: lambda s: Oracle(OracleSearch(s.truth, s.threshold, s.device, accept=s.accept_way)),
+    LatticeOracle.name: lambda s: LatticeOracle(s.truth),
+    Oracle.name: lambda s: Oracle(OracleSearch(s.truth, s.device, contact_free=s.contact_free)),
 }
 
 PLANNERS = tuple(_MAKERS)
@@ -72,8 +70,7 @@ def make_planner(
     name: str,
     *,
     ground_truth: GroundTruth | None = None,
-    threshold: float = 0.8,
-    accept_way: AcceptWay | None = None,
+    contact_free: bool = False,
     seed: int = 0,
     device: str | torch.device = "cpu",
 ) -> Planner:
@@ -82,8 +79,7 @@ def make_planner(
     Args:
         name: One of `PLANNERS`.
         ground_truth: The simulator's knowledge, for planners with `needs_truth`.
-        threshold: V_f above which the task counts the target as fully visible, for the oracle.
-        accept_way: Whether the arm can follow a way, for the oracle; any if None.
+        contact_free: Whether the oracle touches no plant.
         seed: Of its random numbers.
         device: Where the environment's tensors are.
 
@@ -92,4 +88,4 @@ def make_planner(
     """
     if name not in _MAKERS:
         raise InvalidInputError.choice("the planner", name, PLANNERS)
-    return _MAKERS[name](_Setting(ground_truth, threshold, accept_way, seed, device))
+    return _MAKERS[name](_Setting(ground_truth, contact_free, seed, device))

@@ -15,9 +15,9 @@ import torch
 from torch import Tensor
 
 from maniskill_tomato.errors import InvalidInputError
-from maniskill_tomato.policies.base import Planner
 from maniskill_tomato.policies.moves import Candidates, moves_needed
 from maniskill_tomato.policies.network_file import holds, load_network, save_network
+from maniskill_tomato.policies.protocol import Planner
 from maniskill_tomato.policies.quality_features import MAP_CHANNELS, SCALARS, quality_features
 from maniskill_tomato.policies.quality_network import ViewQualityNetwork
 from maniskill_tomato.sensing.belief import Belief
@@ -79,8 +79,8 @@ class ViewQuality(Planner):
             ) from error
         return load_view_quality(path, device)
 
-    def begin(self, belief: Belief, env_idx: Tensor) -> None:
-        self.tried.begin(belief, env_idx)
+    def begin(self, belief: Belief, rows: Tensor) -> None:
+        self.tried.begin(belief, rows)
 
     def success_probability(self, belief: Belief) -> Tensor:
         """P(full view) of every candidate. Shape (B, K)."""

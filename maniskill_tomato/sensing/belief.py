@@ -1,7 +1,6 @@
-"""What a policy may know when it decides where to look next, and what a policy is."""
+"""What a policy may know when it decides where to look next."""
 
 from dataclasses import dataclass
-from typing import Protocol
 
 from torch import Tensor
 
@@ -34,24 +33,3 @@ class Belief:
     """Candidates round the target."""
     reachable: Tensor
     """Which candidates the arm reaches. Shape (B, K), bool."""
-
-
-class ViewpointPolicy(Protocol):
-    """Decides on moves of the `pd_look_at` control mode."""
-
-    name: str
-    """In reports and on the command line."""
-    needs_truth: bool
-    """Whether it asks the simulator for what no camera could tell."""
-
-    def begin(self, belief: Belief, env_idx: Tensor) -> None:
-        """Forgets the episodes of some environments.
-
-        Args:
-            belief: The first of the new episodes.
-            env_idx: Which environments begin anew. Shape (b,).
-        """
-
-    def act(self, belief: Belief) -> Tensor:
-        """The next move: right, up, forward, in [-1, 1]. Shape (B, 3)."""
-        ...

@@ -5,30 +5,40 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
+from maniskill_tomato.policies.moves import move_towards
 from maniskill_tomato.raycast.scene import RayScene
+from maniskill_tomato.robot.inverse_kinematics import Reach
 from maniskill_tomato.robot.kinematics import link_transforms
+from maniskill_tomato.robot.look_at_move import LookAtMover
 from maniskill_tomato.tasks.maniskill.planting import Planting
 
 
 class GroundTruth:
-    """Asks the plants themselves. For planners that say `needs_truth`, for certification and for critics."""
+    """Asks the plants themselves: the `policies.protocol.GroundTruth` of an environment."""
 
     def __init__(
         self,
         scene: RayScene,
         planting: Callable[[], Planting],
         target: Callable[[], Tensor],
+        qpos: Callable[[], Tensor],
+        threshold: float,
     ) -> None:
-        """Follows an environment's plants and targets.
+        """Follows an environment's plants, targets and arms.
 
         Args:
             scene: The plants and links.
             planting: Gives the plants as they are now.
             target: Gives the indices of the targets in `Plant.fruits`. Shape (num_envs,).
+            qpos: Gives the joint positions, in [rad]. Shape (num_envs, 7).
+            threshold: V_f above which the task counts the target as fully visible.
         """
         self._scene = scene
         self._planting = planting
         self._target = target
+        self._qpos = qpos
+        self.threshold = threshold
+        self._mover: LookAtMover | None = None
 
     def visible_fraction(
         self,
@@ -71,3 +81,35 @@ class GroundTruth:
         T_world_plant = self._planting().T_world_plant[env_index].expand(count, 4, 4)
         env_idx = torch.full((count,), env_index, device=start_qpos.device)
         return self._scene.clearance_along(start_qpos.float(), end_qpos.float(), T_world_plant, env_idx)
+
+    def can_follow(
+        self, start: Tensor, way: Tensor, target: Tensor, env_index: int = 0, *, contact_free: bool = False
+    ) -> bool:
+        """Whether the arm, from where it stands, can make every move of a way and sees the target at its end.
+
+        Args:
+            start: Where the camera stands, in the world frame, in [m]. Shape (3,).
+            way: Stops of the camera. Shape (n, 3).
+            target: What it looks at. Shape (3,).
+            env_index: Which environment.
+            contact_free: Whether no move may touch the plants.
+        """
+        if not len(way):
+            return False
+        if self._mover is None:
+            self._mover = LookAtMover(start.device)
+        position, target = start[None].double(), target[None].double()
+        joints = [self._qpos()[env_index][None].double()]
+        for stop in way.double():
+            move = self._mover.move(joints[-1], position, target, move_towards(position, target, stop[None]))
+            if int(move.reach[0]) != int(Reach.REACHABLE):
+                return False
+            position = move.T_world_camera[:, :3, 3]
+            joints.append(move.qpos)
+        seen = self.visible_fraction(move.T_world_camera, env_index, joints[-1])
+        if float(seen) <= self.threshold:
+            return False
+        if not contact_free:
+            return True
+        clearance = self.clearance(torch.cat(joints[:-1]), torch.cat(joints[1:]), env_index)
+        return bool((clearance > 0.0).all())

@@ -28,7 +28,7 @@ from maniskill_tomato.deploy.replay import load_recording
 from maniskill_tomato.deploy.steps import KeptSteps, RunResult, Step
 from maniskill_tomato.deploy.stops import Stops
 from maniskill_tomato.deploy.workcell import make_workcell
-from maniskill_tomato.policies.base import Planner
+from maniskill_tomato.policies.protocol import Planner
 from maniskill_tomato.robot import d435
 from maniskill_tomato.sensing.belief import Belief
 

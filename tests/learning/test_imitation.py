@@ -15,14 +15,13 @@ from maniskill_tomato.experiments.view_rollout import run_view_episode
 from maniskill_tomato.experiments.viewpoint_policy import open_viewpoint_policy
 from maniskill_tomato.learning.imitation.collect import ImitationData, collect_demonstrations
 from maniskill_tomato.learning.imitation.fit import (
-    ImitationFitConfig,
     direction_loss,
     fit_actor,
     fit_recurrent,
 )
-from maniskill_tomato.learning.imitation.training import ImitationConfig, train_imitation
+from maniskill_tomato.learning.imitation.imitation_config import ImitationConfig, ImitationFitConfig
+from maniskill_tomato.learning.imitation.training import train_imitation
 from maniskill_tomato.learning.rl.envs import make_env
-from maniskill_tomato.policies.env_truth import EnvironmentTruth
 from maniskill_tomato.policies.lattice_oracle import LatticeOracle
 from maniskill_tomato.policies.recurrent import RecurrentActor, RecurrentPolicy, columns_of, save_recurrent
 from maniskill_tomato.robot.look_at import look_at_pose
@@ -42,10 +41,10 @@ def env() -> Iterator[Any]:
 
 def test_the_lattice_oracle_goes_to_the_nearest_candidate_that_shows_the_target(env: Any) -> None:
     world = env.unwrapped
-    truth = EnvironmentTruth(env)
+    truth = world.ground_truth
     env.reset(seed=3)
     belief = world.belief
-    oracle = LatticeOracle(truth, truth.threshold)
+    oracle = LatticeOracle(truth)
     oracle.begin(belief, ONE)
     target, camera = belief.target_position[0], belief.camera_position[0]
     best, fewest = -1, (math.inf, math.inf)
@@ -67,8 +66,7 @@ def test_the_lattice_oracle_goes_to_the_nearest_candidate_that_shows_the_target(
 def test_what_is_collected_is_what_was_seen_and_what_the_teacher_does(env: Any) -> None:
     data = collect_demonstrations(env, range(3, 5), None, 0.0)
     assert data.lengths.sum() == len(data.actions) == len(data.observations) and len(data.lengths) == 2
-    truth = EnvironmentTruth(env)
-    teacher = LatticeOracle(truth, truth.threshold)
+    teacher = LatticeOracle(env.unwrapped.ground_truth)
     observation, _ = env.reset(seed=4)
     teacher.begin(env.unwrapped.belief, ONE)
     first = int(data.lengths[0])
@@ -80,7 +78,10 @@ def test_what_is_collected_is_what_was_seen_and_what_the_teacher_does(env: Any) 
 
 def test_the_student_leads_and_the_teacher_is_asked(env: Any) -> None:
     class Stays:
-        def begin(self, belief: Any, env_idx: Any) -> None:
+        name = "stays"
+        needs_truth = False
+
+        def begin(self, belief: Any, rows: Any) -> None:
             pass
 
         def act(self, belief: Any) -> torch.Tensor:

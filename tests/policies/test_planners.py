@@ -16,7 +16,6 @@ from maniskill_tomato.experiments.view_rollout import run_view_episode
 from maniskill_tomato.plants.generator import generate_plant
 from maniskill_tomato.plants.organs import Plant
 from maniskill_tomato.policies import baselines, moves
-from maniskill_tomato.policies.base import Planner
 from maniskill_tomato.policies.baselines import FixedSweep, LookAtServoing, RandomStep, RandomViewpoint, Stay
 from maniskill_tomato.policies.deep_move_to_see import (
     DeepMoveToSee,
@@ -34,6 +33,7 @@ from maniskill_tomato.policies.move_to_see import MoveToSee, MoveToSeeOnMemory, 
 from maniskill_tomato.policies.moves import Candidates
 from maniskill_tomato.policies.next_best_view import NextBestDirection, NextBestView, NextBestViewConfig
 from maniskill_tomato.policies.oracle import Oracle, OracleSearch
+from maniskill_tomato.policies.protocol import Planner
 from maniskill_tomato.policies.reach import CameraReach
 from maniskill_tomato.policies.registry import PLANNERS, make_planner
 from maniskill_tomato.raycast.scene import RayScene
@@ -62,7 +62,26 @@ class Box:
         return ((positions >= low) & (positions <= high)).all(dim=-1)
 
 
-class FreeWorld:
+class Truth:
+    """A ground truth without an arm: every way can be followed."""
+
+    threshold = GOOD
+
+    def visible_fraction(
+        self, T_world_camera: Tensor, env_index: int = 0, qpos: Tensor | None = None
+    ) -> Tensor:
+        raise NotImplementedError
+
+    def clearance(self, start_qpos: Tensor, end_qpos: Tensor, env_index: int = 0) -> Tensor:
+        raise NotImplementedError
+
+    def can_follow(
+        self, start: Tensor, way: Tensor, target: Tensor, env_index: int = 0, *, contact_free: bool = False
+    ) -> bool:
+        return True
+
+
+class FreeWorld(Truth):
     """A camera flies within a box before plants and sees a tomato; episodes as the general task has them."""
 
     num_envs = 1
@@ -89,7 +108,9 @@ class FreeWorld:
         values = {**vars(belief), "reachable": self._box.holds(candidates)}
         return Belief(**values)
 
-    def visible_fraction(self, T_world_camera: Tensor, env_index: int) -> Tensor:
+    def visible_fraction(
+        self, T_world_camera: Tensor, env_index: int = 0, qpos: Tensor | None = None
+    ) -> Tensor:
         return self._scene.visible_fraction_from(
             T_world_camera, self._fruit, self._T_world_plant, env_index=env_index
         )
@@ -268,8 +289,10 @@ def test_cameras_that_see_nothing_give_no_gradient() -> None:
 
 
 def test_move_to_see_approaches_a_target_that_nothing_covers(world: FreeWorld) -> None:
-    class Unhidden:
-        def visible_fraction(self, T_world_camera: Tensor, env_index: int) -> Tensor:
+    class Unhidden(Truth):
+        def visible_fraction(
+            self, T_world_camera: Tensor, env_index: int = 0, qpos: Tensor | None = None
+        ) -> Tensor:
             return torch.ones(len(T_world_camera))
 
     world.reset(seed=0)
@@ -404,8 +427,10 @@ def test_greedy_takes_the_best_of_26_moves(world: FreeWorld) -> None:
 def test_the_oracles_way_keeps_to_reachable_stops_and_bends_where_it_must() -> None:
     """V_f is good only behind a wall in which no move may end."""
 
-    class BehindTheWall:
-        def visible_fraction(self, T_world_camera: Tensor, env_index: int) -> Tensor:
+    class BehindTheWall(Truth):
+        def visible_fraction(
+            self, T_world_camera: Tensor, env_index: int = 0, qpos: Tensor | None = None
+        ) -> Tensor:
             place = T_world_camera[:, :3, 3]
             near: Tensor = (place - torch.tensor([0.3, 0.3, 1.0])).norm(dim=1) < 0.06
             return near.float()
@@ -415,31 +440,33 @@ def test_the_oracles_way_keeps_to_reachable_stops_and_bends_where_it_must() -> N
         return free
 
     start, target = torch.tensor([0.3, 0.0, 1.0]), torch.tensor([1.2, 0.0, 1.0])
-    solution = OracleSearch(BehindTheWall(), GOOD, reachable=allowed).solve(start, target)
+    solution = OracleSearch(BehindTheWall(), reachable=allowed).solve(start, target)
     assert solution is not None
     way = torch.cat([start[None], solution.stops])
     assert float(way.diff(dim=0).norm(dim=1).max()) <= MAX_MOVE * 1.0001
     assert bool(allowed(solution.stops, target).all())
     # The good places begin 0.24 m away, two moves, the first of which would end in the wall (0.11 m to 0.19 m).
     assert solution.moves == 3
-    no_wall = OracleSearch(BehindTheWall(), GOOD, reachable=lambda p, t: torch.ones(len(p), dtype=torch.bool))
+    no_wall = OracleSearch(BehindTheWall(), reachable=lambda p, t: torch.ones(len(p), dtype=torch.bool))
     straight = no_wall.solve(start, target)
     # 0.24 m is exactly two moves, and no sample stands exactly there.
     assert straight is not None and straight.moves in (2, 3)
 
 
 def test_the_oracle_says_where_nothing_can_be_seen() -> None:
-    class Hidden:
-        def visible_fraction(self, T_world_camera: Tensor, env_index: int) -> Tensor:
+    class Hidden(Truth):
+        def visible_fraction(
+            self, T_world_camera: Tensor, env_index: int = 0, qpos: Tensor | None = None
+        ) -> Tensor:
             return torch.zeros(len(T_world_camera))
 
-    search = OracleSearch(Hidden(), GOOD, reachable=lambda p, t: Box().holds(p))
+    search = OracleSearch(Hidden(), reachable=lambda p, t: Box().holds(p))
     assert search.solve(torch.tensor([0.2, 0.0, 0.8]), torch.tensor([0.85, 0.0, 0.9]), most_moves=4) is None
 
 
 def test_no_planner_needs_fewer_moves_than_the_oracle(world: FreeWorld) -> None:
     episodes = range(8)
-    oracle = run(world, Oracle(OracleSearch(world, GOOD, reachable=anywhere)), episodes)
+    oracle = run(world, Oracle(OracleSearch(world, reachable=anywhere)), episodes)
     assert sum(e.success for e in oracle) >= 6
     planners = [
         RandomViewpoint(),

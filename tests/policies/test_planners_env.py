@@ -16,7 +16,6 @@ from maniskill_tomato.experiments.benchmark_policies import PolicySpec
 from maniskill_tomato.experiments.view_rollout import run_view_episode
 from maniskill_tomato.learning.imitation.demonstrations import record_demonstrations
 from maniskill_tomato.learning.rl.envs import make_env
-from maniskill_tomato.policies.env_truth import EnvironmentTruth
 from maniskill_tomato.policies.oracle import Oracle, OracleSearch
 
 PLANTS = {"seed": "train", "pool": 2}
@@ -31,8 +30,8 @@ def env() -> Iterator[gym.Env[Any, Any]]:
 
 def test_the_oracle_needs_as_many_moves_as_it_says(env: gym.Env[Any, Any]) -> None:
     world: Any = env.unwrapped
-    truth = EnvironmentTruth(env)
-    search = OracleSearch(truth, truth.threshold, accept=truth.can_follow)
+    truth = world.ground_truth
+    search = OracleSearch(truth)
     solved = 0
     for seed in range(4):
         env.reset(seed=seed)

@@ -1,27 +1,16 @@
 """What a student saw, and what the teacher would have done there."""
 
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any
 
 import gymnasium as gym
 import numpy as np
 import torch
 from torch import Tensor
 
-from maniskill_tomato.policies.env_truth import EnvironmentTruth
 from maniskill_tomato.policies.lattice_oracle import LatticeOracle
+from maniskill_tomato.policies.protocol import Policy
 from maniskill_tomato.sensing.belief import Belief
-
-
-class Student(Protocol):
-    """A policy that learns."""
-
-    def begin(self, belief: Belief, env_idx: Tensor) -> None:
-        """Forgets the last episode."""
-
-    def act(self, belief: Belief) -> Tensor:
-        """Its move. Shape (1, 3)."""
-        ...
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -46,7 +35,7 @@ class ImitationData:
 
 
 def collect_demonstrations(
-    env: gym.Env[Any, Any], seeds: range, student: Student | None, student_share: float
+    env: gym.Env[Any, Any], seeds: range, student: Policy | None, student_share: float
 ) -> ImitationData:
     """Runs episodes led by the student or the teacher, and asks the teacher everywhere (DAgger, Ross et al., 2011).
 
@@ -57,8 +46,7 @@ def collect_demonstrations(
         student_share: Probability that the student leads an episode.
     """
     world: Any = env.unwrapped
-    truth = EnvironmentTruth(env)
-    teacher = LatticeOracle(truth, truth.threshold)
+    teacher = LatticeOracle(world.ground_truth)
     first = torch.zeros(1, dtype=torch.int64)
     observations: list[Tensor] = []
     actions: list[Tensor] = []

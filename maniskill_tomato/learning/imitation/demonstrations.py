@@ -13,7 +13,7 @@ import gymnasium as gym
 import torch
 
 from maniskill_tomato.errors import InvalidInputError
-from maniskill_tomato.policies.base import Planner
+from maniskill_tomato.policies.protocol import Planner
 
 NAME = "trajectory"
 

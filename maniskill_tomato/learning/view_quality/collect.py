@@ -8,9 +8,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from maniskill_tomato.policies.base import Planner
 from maniskill_tomato.policies.moves import Goals
 from maniskill_tomato.policies.next_best_view import NextBestView, NextBestViewConfig
+from maniskill_tomato.policies.protocol import Planner
 from maniskill_tomato.policies.quality_features import quality_features
 from maniskill_tomato.policies.quality_network import ViewQualityNetwork
 from maniskill_tomato.policies.view_quality import ViewQuality, ViewQualityConfig
