@@ -92,7 +92,7 @@ def run_episode(env: gym.Env[Any, Any], policy: Any, label: str, perception: str
         success=bool(info["success"][0]) and true > world.task.full_visibility,
         moves=moves,
         fraction_error=float(np.mean(errors)),
-        position_error_m=float((believed - world._target_position_w[0]).norm()),
+        position_error_m=float((believed - world.target_position_w[0]).norm()),
     )
 
 

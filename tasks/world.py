@@ -100,6 +100,11 @@ class Game(Protocol):
         """Works out again what follows from the state of some environments, and looks at the present view."""
         ...
 
+    @property
+    def observation_size(self) -> int:
+        """Numbers of an environment's observation."""
+        ...
+
     def observation(self) -> dict[str, Tensor]:
         """The parts of the observation by name, each of shape (N, D)."""
         ...

@@ -23,7 +23,7 @@ from maniskill_tomato.experiments.thesis_experiments import THESIS_EPISODES, Exp
 from maniskill_tomato.learning.rl.history import TrainingCurves, load_history
 from maniskill_tomato.plants.organs import SemanticClass
 from maniskill_tomato.plants.spec import PlantPose, PlantSpec
-from maniskill_tomato.tasks.maniskill.planting import grow
+from maniskill_tomato.tasks.planting import grow
 from maniskill_tomato.tasks.thesis.config import ViewpointTaskConfig, guided_task, sparse_task
 
 SEED_COLOURS = ("#3b6ea5", "#d9a441", "#3f7d4e", "#8a5aa5", "#c8402c", "#4aa3a2", "#7a5230", "#5b6770")

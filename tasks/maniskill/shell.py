@@ -238,7 +238,8 @@ class TomatoEnv(BaseEnv):  # type: ignore[misc]
             return plan.target_qpos
         for goal in _stages(plan):
             drive_to(self.scene, self.agent, goal)
-        return self.agent.robot.get_qpos().clone()
+        qpos: Tensor = self.agent.robot.get_qpos().clone()
+        return qpos
 
     def _put_joints(self, qpos: Tensor) -> None:
         robot = self.agent.robot
@@ -260,23 +261,19 @@ class TomatoEnv(BaseEnv):  # type: ignore[misc]
             info["other_reward"] = self._reward_in_mode(info["other_reward"], judged)
         return info
 
-    def get_reward(self, obs: Any, action: Tensor, info: dict[str, Tensor]) -> Tensor:
-        """The reward of the last move in the present mode. Shape (num_envs,)."""
-        return self._reward_in_mode(self.world.reward(info), info)
-
     def compute_dense_reward(self, obs: Any, action: Tensor, info: dict[str, Tensor]) -> Tensor:
         """The task's reward. Shape (num_envs,)."""
         return self.world.reward(info)
 
     def compute_normalized_dense_reward(self, obs: Any, action: Tensor, info: dict[str, Tensor]) -> Tensor:
         """The reward over its largest value. Shape (num_envs,)."""
-        return self.world.reward(info) / self.task.largest_reward
+        return self.world.reward(info) / float(self.task.largest_reward)
 
     def _reward_in_mode(self, dense: Tensor, info: Mapping[str, Tensor]) -> Tensor:
         if self._reward_mode == "dense":
             return dense
         if self._reward_mode == "normalized_dense":
-            return dense / self.task.largest_reward
+            return dense / float(self.task.largest_reward)
         if self._reward_mode == "sparse":
             return info["success"].float() - info["fail"].float()
         return torch.zeros_like(dense)
@@ -378,6 +375,17 @@ class TomatoEnv(BaseEnv):  # type: ignore[misc]
         """Takes back the flat vector that `get_state` gave. Shape (b, D)."""
         like: Any = self._init_raw_state
         self.set_state_dict(unflatten(torch.as_tensor(state, device=self.device), like), env_idx)
+
+    def restore_world(self, saved: Mapping[str, Any], qvel: Tensor) -> None:
+        """Takes back what `World.save` gave, in a scene that holds its plants.
+
+        Args:
+            saved: The world's state.
+            qvel: Speeds of the joints, in [rad/s]. Shape (num_envs, 7).
+        """
+        self.world.restore(saved)
+        self.agent.robot.set_qvel(qvel.to(self.device))
+        self._show_world()
 
 
 class SearchEnv(TomatoEnv):

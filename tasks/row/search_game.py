@@ -21,7 +21,7 @@ from maniskill_tomato.sensing.belief import Belief
 from maniskill_tomato.sensing.observation import ObservationLayout, ViewpointObserver
 from maniskill_tomato.sensing.sensor_noise import SensorNoise
 from maniskill_tomato.sensing.simulated_camera import Perception
-from maniskill_tomato.sensing.true_views import TrueViews
+from maniskill_tomato.sensing.true_views import TRUE_VIEWS, TrueViews
 from maniskill_tomato.tasks import MAX_ROW_STEPS
 from maniskill_tomato.tasks.arm_moves import Plan
 from maniskill_tomato.tasks.row.camera_senses import make_senses
@@ -371,6 +371,11 @@ class SearchGame:
             )
 
     # ---------------------------------------------------------------- outcome
+
+    @property
+    def observation_size(self) -> int:
+        """Numbers of the observer's vector, and of the truth if it is told."""
+        return self.layout.size + (0 if self._true_views is None else TRUE_VIEWS)
 
     def observation(self) -> dict[str, Tensor]:
         """The parts of the observer's vector, and the truth for critics that ask for it."""

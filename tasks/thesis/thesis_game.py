@@ -106,6 +106,11 @@ class ThesisGame:
             "reward_penalty": self.task.pose_penalty(state.reach, forbidden),
         }
 
+    @property
+    def observation_size(self) -> int:
+        """The nine numbers of the thesis."""
+        return 9
+
     def observation(self) -> dict[str, Tensor]:
         """The nine numbers of the thesis by name."""
         viewpoint = self._world.state.viewpoint

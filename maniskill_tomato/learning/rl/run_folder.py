@@ -18,7 +18,7 @@ from maniskill_tomato.learning.rl.presets import MAY_CHANGE, TrainConfig
 
 logger = logging.getLogger(__name__)
 
-RUN_STATE_FORMAT = 2
+RUN_STATE_FORMAT = 3
 """Version of the layout of a checkpoint's `run` entry."""
 
 LOG_NAME = "train.log"
