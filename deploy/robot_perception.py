@@ -9,7 +9,7 @@ import numpy as np
 from maniskill_tomato.deploy.errors import PerceptionError, ProfileError
 from maniskill_tomato.deploy.interface import Float64, Frame
 from maniskill_tomato.errors import TomatoError
-from maniskill_tomato.raycast.picture_caster import ROBOT_LABEL
+from maniskill_tomato.raycast.images import ROBOT_LABEL
 from maniskill_tomato.raycast.view_rays import ViewRays
 from maniskill_tomato.segmentation.instances import Instances
 from maniskill_tomato.segmentation.masks import BinaryMask
