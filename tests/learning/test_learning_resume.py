@@ -549,7 +549,7 @@ def real_run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A run of the guided task that nothing happened to."""
     run_dir = tmp_path_factory.mktemp("real") / "run"
     process = start("train", GUIDED, "--out", str(run_dir), *REAL)
-    process.join(120)
+    process.join(500)
     assert process.exitcode == 0
     return run_dir
 
@@ -567,11 +567,11 @@ def test_a_killed_run_of_the_real_task_ends_as_the_unbroken_one(
         time.sleep(0.01)
     time.sleep(random.Random().uniform(0.0, 0.5))
     os.kill(process.pid, number)
-    process.join(60)
+    process.join(500)
     assert process.exitcode == (-signal.SIGKILL if number == signal.SIGKILL else 0)
     assert 41 <= load_checkpoint(checkpoints(run_dir)[-1])["counters"]["steps"] < 700
     assert (run_dir / "policy.pt").exists() == (number != signal.SIGKILL)
     process = start("train", "--resume", str(run_dir))
-    process.join(120)
+    process.join(500)
     assert process.exitcode == 0
     assert_same_run(real_run, run_dir)
