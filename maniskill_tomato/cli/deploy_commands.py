@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
-from maniskill_tomato.cli.calibrate import DeployCalibrate, end_by_signal
+from maniskill_tomato.cli.calibrate_command import DeployCalibrate, end_by_signal
 from maniskill_tomato.errors import InvalidInputError
 
 if TYPE_CHECKING:

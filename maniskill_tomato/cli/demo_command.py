@@ -4,8 +4,8 @@ import dataclasses
 from dataclasses import dataclass
 from pathlib import Path
 
-from maniskill_tomato.cli.evaluate import summary
-from maniskill_tomato.cli.train import train
+from maniskill_tomato.cli.eval_command import summary
+from maniskill_tomato.cli.train_command import train
 from maniskill_tomato.learning.rl.presets import PRESETS
 
 

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
-from maniskill_tomato.cli.options import EnvId, PlantOptions, shipped_policy
+from maniskill_tomato.cli.shared_options import EnvId, PlantOptions, shipped_policy
 from maniskill_tomato.tasks import GENERAL_IDS
 
 EpisodeList = Literal["validation", "held_out"]

@@ -9,7 +9,7 @@ from typing import Annotated, Any
 import tyro
 
 from maniskill_tomato.cli.arguments import Flat
-from maniskill_tomato.cli.options import PlantOptions, merge_options
+from maniskill_tomato.cli.shared_options import PlantOptions, merge_options
 from maniskill_tomato.errors import InvalidInputError, SeedsFailedError
 from maniskill_tomato.learning.rl.config_file import RunFile, parse_seeds, read_run_config, read_run_file
 from maniskill_tomato.learning.rl.presets import MAY_CHANGE, PRESETS, PresetName, TrainConfig, default_preset
@@ -23,7 +23,7 @@ class Train:
     env_id: Annotated[
         str | None,
         tyro.conf.Positional,
-        tyro.conf.arg(metavar="ENV_ID", help=f"One of {', '.join(TASK_IDS)}; the file or run may say it."),
+        tyro.conf.arg(metavar="ENV_ID", help=f"The task: {', '.join(TASK_IDS)}. The file or run may say it."),
     ] = None
     """Id of the task."""
     preset: PresetName = "td3"
@@ -49,6 +49,15 @@ class Train:
     """Another plant."""
     config: Annotated[TrainConfig, Flat] = PRESETS["td3"]
     """The training configuration."""
+
+    @classmethod
+    def defaults(cls, argv: Sequence[str]) -> "Train":
+        """What holds without further options, by the files and the preset that the arguments name.
+
+        Raises:
+            InvalidInputError: A file or a run cannot be used.
+        """
+        return _default(argv)
 
     def run(self) -> None:
         """Trains and says where the policy is.
@@ -158,7 +167,7 @@ def train(
     return train_run(env_id, config, out, seed, env_options, overwrite=overwrite, resume=resume)
 
 
-def train_default(argv: Sequence[str]) -> Train:
+def _default(argv: Sequence[str]) -> Train:
     """What `train` does without further flags, from the files and the preset that the arguments name."""
     resumed, file = _asked(argv, "--resume"), _asked(argv, "--config")
     if resumed is not None:
