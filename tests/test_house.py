@@ -11,8 +11,11 @@ PACKAGE = "maniskill_tomato"
 MAPPED_FOLDERS = ("assets", "deploy", "tasks")
 """Folders at the root of the repository that install as subpackages of maniskill_tomato."""
 
-FOUNDATION = frozenset({"assets", "errors", "files", "version", "warp_runtime"})
-"""What every room may import: asset files, errors, files on the disk, the version, the start of Warp."""
+FOUNDATION = frozenset(
+    {"assets", "errors", "files", "report_design", "version", "warp_runtime", "worker_pool"}
+)
+"""What every room may import: asset files, errors, files on the disk, the look of reports, the version, the start of
+Warp, the pool of processes."""
 
 WORLD = FOUNDATION | {"robot", "plants", "raycast"}
 SENSES = WORLD | {"segmentation", "sensing"}
