@@ -12,6 +12,7 @@ import os
 import sys
 import traceback
 from collections.abc import Sequence
+from typing import Any
 
 from maniskill_tomato.cli.command_table import COMMANDS, FAMILIES, PROGRAM, command_list, family_list, unknown
 from maniskill_tomato.errors import (
@@ -21,6 +22,8 @@ from maniskill_tomato.errors import (
     TomatoError,
     TrainingDivergedError,
 )
+
+HELP = ("-h", "--help", "help")
 
 FAILED = 1
 """Exit status of a command that failed on its way."""
@@ -59,39 +62,47 @@ def main(argv: Sequence[str] | None = None) -> None:
 
 
 def run(argv: list[str]) -> None:
-    """Finds the command, reads its arguments and runs it.
+    """Runs the command, or prints the list of commands or the version.
 
     Raises:
         TomatoError: It cannot be run, or failed.
-        SystemExit: Its arguments cannot be read.
+        SystemExit: Its arguments cannot be read, or help was asked for.
     """
-    if not argv or argv[0] in ("-h", "--help", "help"):
+    if not argv or argv[0] in HELP:
         print(command_list())
-        return
-    if argv[0] == "--version":
+    elif argv[0] == "--version":
         from maniskill_tomato import __version__
 
         print(f"{PROGRAM} {__version__}")
-        return
-    words = 1
-    if argv[0] in FAMILIES:
-        if len(argv) == 1 or argv[1] in ("-h", "--help"):
-            print(family_list(argv[0]))
-            return
-        words = 2
+    elif argv[0] in FAMILIES and (len(argv) == 1 or argv[1] in HELP):
+        print(family_list(argv[0]))
+    else:
+        command = parse(argv)
+        try:
+            command.run()
+        except InvalidInputError as error:
+            from maniskill_tomato.cli.arguments import with_flags
+
+            raise InvalidInputError(with_flags(str(error), type(command))) from error
+
+
+def parse(argv: Sequence[str]) -> Any:
+    """The command that the arguments describe: a dataclass with a method `run`.
+
+    Raises:
+        InvalidInputError: There is no such command, or a value cannot be used.
+        SystemExit: Its arguments cannot be read, or help was asked for.
+    """
+    words = 2 if argv[0] in FAMILIES else 1
     name, rest = " ".join(argv[:words]), argv[words:]
     if name not in COMMANDS:
-        raise InvalidInputError(unknown(argv[0]) if words == 1 else unknown(argv[1], argv[0]))
+        raise InvalidInputError(unknown(argv[words - 1], argv[0] if words == 2 else ""))
     kind = COMMANDS[name].load()
 
-    from maniskill_tomato.cli.arguments import parse_arguments, with_flags
+    from maniskill_tomato.cli.arguments import parse_arguments
 
     default = kind.defaults(rest) if hasattr(kind, "defaults") else None
-    command = parse_arguments(kind, rest, f"{PROGRAM} {name}", default)
-    try:
-        command.run()
-    except InvalidInputError as error:
-        raise InvalidInputError(with_flags(str(error), kind)) from error
+    return parse_arguments(kind, rest, f"{PROGRAM} {name}", default)
 
 
 def _status(error: TomatoError) -> int:

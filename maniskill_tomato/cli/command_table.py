@@ -101,8 +101,9 @@ def command_list() -> str:
         lines += [f"  {name:<20}{_summary(name)}" for name in names]
     lines += [
         "",
-        f"{PROGRAM} COMMAND --help shows the options of a command, {PROGRAM} --version",
-        "the version. Exit status: 0 done, 1 failed, 2 cannot be done as asked.",
+        f"{PROGRAM} COMMAND --help shows the options of a command.",
+        f"{PROGRAM} --version shows the version.",
+        "Exit status: 0 done, 1 failed on its way, 2 cannot be done as asked.",
     ]
     return "\n".join(lines)
 
@@ -124,7 +125,7 @@ def unknown(word: str, family: str = "") -> str:
     """The message for a word that is no command."""
     known = members(family) if family else tuple(name for names in GROUPS.values() for name in names)
     before = f"{PROGRAM} {family}" if family else PROGRAM
-    return f"{before} has no command {word!r}{did_you_mean(word, known)}; {before} --help lists them"
+    return f"{before} has no command {word!r} ({before} --help lists them){did_you_mean(word, known)}"
 
 
 def _summary(name: str) -> str:

@@ -7,9 +7,6 @@ from maniskill_tomato.errors import InvalidInputError, did_you_mean
 from maniskill_tomato.policies.planner_names import PLANNERS
 from maniskill_tomato.tasks import TASK_IDS
 
-POLICY_FILES = (".pt", ".onnx")
-"""What files of policies end with."""
-
 
 def check_choice(flag: str, value: str, allowed: Sequence[str]) -> None:
     """Accepts one of several words."""
@@ -45,11 +42,10 @@ def check_policy(flag: str, text: str, names: Iterable[str] = PLANNERS) -> None:
     known = tuple(names)
     if text in known or Path(text).is_file():
         return
-    if Path(text).suffix in POLICY_FILES or not known:
-        check_file(flag, Path(text))
+    or_names = f", or one of {', '.join(known)}" if known else ""
     raise InvalidInputError(
-        f"{flag} must be the file of a policy (.pt or .onnx) or one of {', '.join(known)}; got {text!r}"
-        f"{did_you_mean(text, known)}"
+        f"{flag}: no policy at {text!r}; give a .pt or .onnx file{or_names}"
+        f"{did_you_mean(text, known) or _neighbour(Path(text))}"
     )
 
 

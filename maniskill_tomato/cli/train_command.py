@@ -9,6 +9,7 @@ from typing import Annotated, Any
 import tyro
 
 from maniskill_tomato.cli.arguments import Flat
+from maniskill_tomato.cli.early_checks import check_count, check_env_id, check_file
 from maniskill_tomato.cli.shared_options import PlantOptions, merge_options
 from maniskill_tomato.errors import InvalidInputError, SeedsFailedError
 from maniskill_tomato.learning.rl.config_file import RunFile, parse_seeds, read_run_config, read_run_file
@@ -71,6 +72,10 @@ class Train:
             raise InvalidInputError(
                 f"give the task to train on, one of {', '.join(TASK_IDS)}, or --config FILE or --resume DIR"
             )
+        check_env_id(env_id)
+        check_count("--jobs", self.jobs)
+        if self.config.initial_policy is not None:
+            check_file("--initial-policy", Path(self.config.initial_policy))
         if self.resume is not None:
             self._check_resume(run_file)
         env_options = merge_options(run_file.env_options, self.plants.env_options())
@@ -129,10 +134,8 @@ class Train:
             )
 
     def _run_seeds(self, env_id: str, out: Path, seeds: tuple[int, ...], env_options: dict[str, Any]) -> None:
-        from maniskill_tomato.learning.rl.envs import check_env_id
         from maniskill_tomato.learning.rl.seeds import summary_table, train_seeds
 
-        check_env_id(env_id)
         results = train_seeds(
             env_id,
             self.config,
