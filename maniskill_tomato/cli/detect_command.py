@@ -36,9 +36,10 @@ class Detect:
         if not 0 <= self.score_threshold <= 1:
             raise InvalidInputError(f"--score-threshold must be between 0 and 1, got {self.score_threshold}")
 
-        from maniskill_tomato.segmentation.detect import detect, image_files
+        from maniskill_tomato.segmentation.datasets.picture_files import write_picture
+        from maniskill_tomato.segmentation.detection_list import detect, image_files
+        from maniskill_tomato.segmentation.drawing import draw_instances
         from maniskill_tomato.segmentation.instances import Image, Instances
-        from maniskill_tomato.segmentation.pictures import draw_instances, write_picture
         from maniskill_tomato.segmentation.segmenter import open_for_files
 
         image_files(self.images)

@@ -42,7 +42,7 @@ class JudgeOcclusion:
 
         from tqdm import tqdm
 
-        from maniskill_tomato.segmentation.datasets.formats import read_annotated
+        from maniskill_tomato.segmentation.datasets.reading import read_annotated
         from maniskill_tomato.sensing.visible_fraction.occlusion_report import (
             draw_occlusion,
             report_occlusion,
@@ -93,9 +93,10 @@ class JudgeSegmenter:
         check_count("--limit", self.limit)
 
         from maniskill_tomato.files import write_atomically
+        from maniskill_tomato.segmentation.datasets.annotations import SMALLEST_SHARE
+        from maniskill_tomato.segmentation.datasets.reading import read_place
         from maniskill_tomato.segmentation.metrics.detector_evaluation import evaluate_segmenter
         from maniskill_tomato.segmentation.segmenter import open_for_files
-        from maniskill_tomato.segmentation.training.training_pictures import SMALLEST_SHARE, read_place
 
         segmenter = open_for_files(self.segmenter, 0.02, self.thorough)
         found = read_place(self.data)

@@ -84,10 +84,10 @@ class TrainLight(ImageOptions):
 
 @dataclass(frozen=True, kw_only=True)
 class TrainMaskRcnn(ImageOptions):
-    """Train Mask R-CNN with the thesis's settings, or light ones; a training that was stopped goes on."""
+    """Train Mask R-CNN with the thesis's settings, or small enough for a CPU; a training that was stopped goes on."""
 
-    preset: Literal["light", "light-lite0", "strategy-1", "strategy-2", "strategy-3"] = "light"
-    """Settings: `light` and `light-lite0` for a CPU, or those of Tables 4-3, 4-4 and section 6-2."""
+    preset: Literal["light-lite0", "strategy-1", "strategy-2", "strategy-3"] = "light-lite0"
+    """Settings: `light-lite0` for a CPU, or those of Tables 4-3, 4-4 and section 6-2."""
     pretrained: bool = False
     """Start from ImageNet weights of the backbone: of `light-lite0` those of the extra `pretrained`, of the others
     torchvision's, which are downloaded."""

@@ -6,9 +6,10 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from maniskill_tomato.raycast.view_rays import ViewRays, sample_view
+from maniskill_tomato.raycast.view_rays import ViewRays
 from maniskill_tomato.segmentation.masks import BinaryMask
 from maniskill_tomato.sensing.posed_frame import PosedFrame
+from maniskill_tomato.sensing.view_pattern import sample_view
 
 Position = NDArray[np.float64]
 

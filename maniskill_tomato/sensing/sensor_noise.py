@@ -9,7 +9,8 @@ import torch
 from torch import Tensor
 
 from maniskill_tomato.errors import InvalidInputError
-from maniskill_tomato.raycast.view_rays import ViewRays, disturb
+from maniskill_tomato.raycast.view_rays import ViewRays
+from maniskill_tomato.sensing.view_pattern import disturb
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -6,8 +6,8 @@ from typing import Final, Literal
 import numpy as np
 from torch import Tensor
 
-from maniskill_tomato.raycast.cast_image import ImageCaster, PixelLabel
-from maniskill_tomato.raycast.caster import VisibilityCaster
+from maniskill_tomato.raycast.images import PixelLabel
+from maniskill_tomato.raycast.scene import RayScene
 from maniskill_tomato.raycast.view_rays import DEPTH_MODE
 from maniskill_tomato.robot.d435 import CameraIntrinsics, color_intrinsics
 from maniskill_tomato.robot.depth_noise import DepthNoise, measure_depth
@@ -46,7 +46,7 @@ class SimulatedCamera:
 
     def __init__(
         self,
-        caster: VisibilityCaster,
+        scene: RayScene,
         *,
         intrinsics: CameraIntrinsics | None = None,
         noise: DepthNoise | None = None,
@@ -55,15 +55,16 @@ class SimulatedCamera:
         """Prepares the images.
 
         Args:
-            caster: The environments' plants and links.
+            scene: The environments' plants and links.
             intrinsics: Of the images; `IMAGE_SIZE` of the colour camera if None.
             noise: Faults of the depth, the defaults if None.
             picture: Renders the colours of an environment by its index, shape (H, W, 3); if None there are none.
         """
-        self._images = ImageCaster(caster, intrinsics or color_intrinsics(*IMAGE_SIZE))
+        self._scene = scene
+        self._intrinsics = intrinsics or color_intrinsics(*IMAGE_SIZE)
         self._noise = noise or DepthNoise()
         self._picture = picture
-        self._generators = [np.random.default_rng(0) for _ in range(caster.num_envs)]
+        self._generators = [np.random.default_rng(0) for _ in range(scene.num_envs)]
 
     def seed(self, env_index: int, seed: int) -> None:
         """Begins an environment's random numbers, from which all errors of an episode follow."""
@@ -90,19 +91,19 @@ class SimulatedCamera:
             links: World poses of the links. Shape (N, 9, 4, 4).
             mask: Which environments take one, all if None; the others get None. Shape (N,), bool.
         """
-        images = self._images.cast(T_world_camera, target, T_world_plant, links)
+        images = self._scene.image(self._intrinsics, T_world_camera, target, T_world_plant, links)
         frames: list[PosedFrame | None] = []
         for k, generator in enumerate(self._generators):
             if mask is not None and not bool(mask[k]):
                 frames.append(None)
                 continue
             exact = images.depth[k].cpu().numpy().astype(np.float64)
-            depth = measure_depth(exact, self._images.intrinsics, self._noise, generator, stereo=DEPTH_MODE)
+            depth = measure_depth(exact, self._intrinsics, self._noise, generator, stereo=DEPTH_MODE)
             label = images.label[k].cpu().numpy()
             frames.append(
                 PosedFrame(
                     depth_m=depth.astype(np.float32),
-                    intrinsics=self._images.intrinsics,
+                    intrinsics=self._intrinsics,
                     T_world_camera=T_world_camera[k].double().cpu().numpy(),
                     rgb=None if self._picture is None else self._picture(k),
                     robot_mask=label == int(PixelLabel.ROBOT),
@@ -114,7 +115,7 @@ class SimulatedCamera:
 
 def make_camera(
     perception: Perception,
-    caster: VisibilityCaster,
+    scene: RayScene,
     intrinsics: CameraIntrinsics,
     picture: Callable[[int], UInt8],
 ) -> tuple[SimulatedCamera, CameraPerception] | None:
@@ -122,7 +123,7 @@ def make_camera(
 
     Args:
         perception: Which.
-        caster: The environments' plants and links.
+        scene: The environments' plants and links.
         intrinsics: Of rendered pictures.
         picture: Renders them, by the index of an environment.
     """
@@ -135,8 +136,8 @@ def make_camera(
     }
     detector = FruitDetector(segmenter, models.get(perception))
     if perception in RENDERED:
-        camera = SimulatedCamera(caster, intrinsics=intrinsics, picture=picture)
+        camera = SimulatedCamera(scene, intrinsics=intrinsics, picture=picture)
     else:
-        camera = SimulatedCamera(caster)
+        camera = SimulatedCamera(scene)
     known = perception != "segmenter"
-    return camera, CameraPerception(caster.num_envs, detector, identity_known=known, device=caster.device)
+    return camera, CameraPerception(scene.num_envs, detector, identity_known=known, device=scene.device)

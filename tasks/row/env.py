@@ -15,10 +15,7 @@ from maniskill_tomato.errors import InvalidInputError
 from maniskill_tomato.plants.episode_list import Episode
 from maniskill_tomato.plants.row import Row, leaf_density_of
 from maniskill_tomato.plants.spec import PlantSpec
-from maniskill_tomato.raycast.cast_views import CastViews
-from maniskill_tomato.raycast.caster import Visibility
-from maniskill_tomato.raycast.clearance import PlantClearance
-from maniskill_tomato.raycast.view_rays import ViewRayCaster
+from maniskill_tomato.raycast.visibility import Visibility
 from maniskill_tomato.robot.kinematics import link_transforms
 from maniskill_tomato.robot.look_at import camera_to_viewpoint
 from maniskill_tomato.sensing.belief import Belief
@@ -143,14 +140,10 @@ class TomatoViewpointGeneralEnv(TomatoEnv):
 
     def _make_tools(self) -> None:
         n, device = self.num_envs, self.device
-        self._ray_caster = ViewRayCaster(self._caster)
-        self._cast_views = CastViews(self._caster)
-        self._plant_clearance = PlantClearance(self._caster)
         self._observer = ViewpointObserver(n, device, self.layout, self.task.max_moves)
-        self._hard_starts = HardStarts(self.task, self._cast_views, self._plant_clearance, device)
+        self._hard_starts = HardStarts(self.task, self._ray_scene, device)
         self.ground_truth = GroundTruth(
-            self._cast_views,
-            self._plant_clearance,
+            self._ray_scene,
             planting=lambda: self.planting,
             target=lambda: self._target,
             qpos=lambda: self.agent.robot.get_qpos(),
@@ -158,7 +151,9 @@ class TomatoViewpointGeneralEnv(TomatoEnv):
         )
         """What only the simulator knows; for policies that need the truth."""
         self._errors = SensorErrors(self._sensor_noise, n, device)
-        self._camera = make_camera(self.perception, self._caster, self.camera_intrinsics, self._wrist_picture)
+        self._camera = make_camera(
+            self.perception, self._ray_scene, self.camera_intrinsics, self._wrist_picture
+        )
         self._hidden_below: list[float | None] = [None] * n
         self.soft_starts = 0
         """Episodes so far that no drawn start made as hard as asked for."""
@@ -276,7 +271,7 @@ class TomatoViewpointGeneralEnv(TomatoEnv):
         self._path_length[env_idx] = 0.0
         self._gain[env_idx] = 0.0
         qpos = self.agent.robot.get_qpos()
-        clearance = self._plant_clearance.at(qpos, self.planting.T_world_plant)
+        clearance = self._ray_scene.clearance_at(qpos, self.planting.T_world_plant)
         self._clearance[env_idx] = clearance[env_idx]
         self._look_anew(env_idx)
         self._visible_fraction = self._measured_fraction().clone()
@@ -323,11 +318,11 @@ class TomatoViewpointGeneralEnv(TomatoEnv):
         T_w_links = link_transforms(qpos)
         T_w_camera = T_w_links[:, -1] @ self._T_ee_camera
         T_w_plant = self.planting.T_world_plant
-        self._seen: Visibility = self._caster.cast(T_w_camera, self._target, T_w_plant, T_w_links)
+        self._seen: Visibility = self._ray_scene.visibility(T_w_camera, self._target, T_w_plant, T_w_links)
         self._camera_position = T_w_camera[:, :3, 3]
         if self._camera is None:
             known = self._errors.known_target(self._target_position_w)
-            exact = self._ray_caster.cast(T_w_camera, self._target, known, T_w_plant, T_w_links)
+            exact = self._ray_scene.view_rays(T_w_camera, self._target, known, T_w_plant, T_w_links)
             rays = self._errors.rays(exact, mask)
             measured = self._errors.visible_fraction(self._seen.visible_fraction)
         else:
@@ -386,7 +381,7 @@ class TomatoViewpointGeneralEnv(TomatoEnv):
             The way's length, in [m]. Shape (num_envs,).
         """
         qpos = self.agent.robot.get_qpos()
-        self._clearance = self._plant_clearance.along(before, qpos, self.planting.T_world_plant)
+        self._clearance = self._ray_scene.clearance_along(before, qpos, self.planting.T_world_plant)
         T_w_camera = link_transforms(qpos)[:, -1] @ self._T_ee_camera
         length: Tensor = (T_w_camera[:, :3, 3] - position).norm(dim=-1)
         return length

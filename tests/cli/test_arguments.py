@@ -19,7 +19,7 @@ from maniskill_tomato.cli.shared_options import parse_env_options, tell_policy
 from maniskill_tomato.errors import InvalidInputError, NotWrittenError, RenderingUnavailableError
 
 ROOT = Path(__file__).resolve().parents[2]
-HEAVY = ("torch", "mani_skill", "sapien", "warp", "cv2", "matplotlib", "onnxruntime", "mujoco", "scipy")
+HEAVY = ("torch", "mani_skill", "sapien", "warp", "matplotlib", "onnxruntime", "mujoco", "scipy")
 GUIDED, GENERAL = "TomatoViewpointGuided-v1", "TomatoViewpoint-v1"
 
 

@@ -166,4 +166,4 @@ def test_check_looks_at_everything_and_moves_nothing(
 def test_the_defaults_of_the_command_are_the_mock_profile() -> None:
     command = parse(["deploy", "run"])
     assert command.profile == "mock"
-    assert os.fspath(getattr(command, "command").out) == "runs/deploy"
+    assert os.fspath(command.out) == "runs/deploy"

@@ -9,7 +9,7 @@ import torch
 
 import maniskill_tomato  # noqa: F401
 from maniskill_tomato.errors import InvalidInputError
-from maniskill_tomato.raycast.cast_image import ImageCaster, PixelLabel
+from maniskill_tomato.raycast.images import PixelLabel
 from maniskill_tomato.robot.d435 import color_intrinsics
 from maniskill_tomato.robot.kinematics import link_transforms
 from maniskill_tomato.segmentation.instances import Instances
@@ -113,14 +113,18 @@ def test_rendered_perceptions_run_and_their_pictures_lie_on_the_cast_labels(perc
     picture = task._wrist_picture(0).astype(int)
     assert picture.shape == (240, 320, 3)
     T_w_links = link_transforms(task.agent.robot.get_qpos())
-    images = ImageCaster(task._caster, task.camera_intrinsics).cast(
-        T_w_links[:, -1] @ task._T_ee_camera, task._target, task.planting.T_world_plant, T_w_links
+    images = task._ray_scene.image(
+        task.camera_intrinsics,
+        T_w_links[:, -1] @ task._T_ee_camera,
+        task._target,
+        task.planting.T_world_plant,
+        T_w_links,
     )
     target = (images.label[0] == int(PixelLabel.TARGET)).numpy()
     if np.count_nonzero(target) > 20:
         red, green, _ = picture[target].T
         assert np.median(red - green) > 30
-    # Leaves and stems are green where the caster meets the plant.
+    # Leaves and stems are green where rays meet the plant.
     plant = (images.label[0] == int(PixelLabel.PLANT)).numpy()
     nothing = (images.label[0] == int(PixelLabel.NOTHING)).numpy()
     colourful = picture.max(-1) - picture.min(-1)
@@ -134,7 +138,9 @@ class Eye:
     def __init__(self, env: Any, order: int = 1) -> None:
         self.env = env
         width, height = IMAGE_SIZE
-        self.camera = SimulatedCamera(env._caster, picture=lambda k: np.zeros((height, width, 3), np.uint8))
+        self.camera = SimulatedCamera(
+            env._ray_scene, picture=lambda k: np.zeros((height, width, 3), np.uint8)
+        )
         self.perception = CameraPerception(1, FruitDetector(LabelSegmenter(env, order)))
 
     def look(self) -> float:
@@ -181,9 +187,12 @@ class LabelSegmenter:
 
     def __init__(self, env: Any, order: int) -> None:
         T_w_links = link_transforms(env.agent.robot.get_qpos())
-        caster = ImageCaster(env._caster, color_intrinsics(*IMAGE_SIZE))
-        images = caster.cast(
-            T_w_links[:, -1] @ env._T_ee_camera, env._target, env.planting.T_world_plant, T_w_links
+        images = env._ray_scene.image(
+            color_intrinsics(*IMAGE_SIZE),
+            T_w_links[:, -1] @ env._T_ee_camera,
+            env._target,
+            env.planting.T_world_plant,
+            T_w_links,
         )
         target = (images.label[0] == int(PixelLabel.TARGET)).numpy()
         other = np.zeros_like(target)

@@ -6,9 +6,9 @@ from pathlib import Path
 
 from maniskill_tomato.errors import InvalidInputError
 from maniskill_tomato.segmentation.datasets.annotations import AnnotatedImage
+from maniskill_tomato.segmentation.datasets.reading import read_place
 from maniskill_tomato.segmentation.metrics.detection_plots import plot_losses
 from maniskill_tomato.segmentation.training.resumable_training import CHECKPOINT, ResumableTraining
-from maniskill_tomato.segmentation.training.training_pictures import read_place
 from maniskill_tomato.segmentation.yolo import read_history, train_yolo, write_yolo_data
 
 
