@@ -16,8 +16,8 @@ from maniskill_tomato.deploy.loop import Loop
 from maniskill_tomato.deploy.loop_config import LoopConfig
 from maniskill_tomato.deploy.mock.episode import load_episode
 from maniskill_tomato.deploy.mock.options import twin_options, twin_world
-from maniskill_tomato.deploy.perceive import TruthPerception
 from maniskill_tomato.deploy.policies import open_policy
+from maniskill_tomato.deploy.robot_perception import TruthPerception
 from maniskill_tomato.deploy.safety import Safety
 from maniskill_tomato.deploy.safety_config import SafetyConfig
 from maniskill_tomato.deploy.steps import RunResult
