@@ -74,8 +74,8 @@ class ViewQuality(Planner):
             path = asset_path("policies/TomatoViewpoint-v1.pt")
         except FileNotFoundError as error:
             raise InvalidInputError(
-                "no view-quality policy ships with this version; train one with `maniskill-tomato train-view-quality` and "
-                "give its file"
+                "no view-quality policy ships with this version; train one with `maniskill-tomato train-view-quality` "
+                "and give its file"
             ) from error
         return load_view_quality(path, device)
 
