@@ -15,14 +15,12 @@ import tyro
 from tqdm import tqdm
 
 from maniskill_tomato.errors import InvalidInputError, TomatoError
+from maniskill_tomato.experiments.occlusion_figure import draw_steps
+from maniskill_tomato.experiments.occlusion_scores import annotated_fruits, judge, make_view, markdown
 from maniskill_tomato.files import write_atomically
 from maniskill_tomato.segmentation.datasets.reading import read_annotated
-from maniskill_tomato.sensing.visible_fraction.amodal import AmodalModel
 from maniskill_tomato.sensing.visible_fraction.estimate import OcclusionModel
-from maniskill_tomato.sensing.visible_fraction.figure import draw_steps
-from maniskill_tomato.sensing.visible_fraction.improved import ImprovedModel
-from maniskill_tomato.sensing.visible_fraction.judge import annotated_fruits, judge, make_view, markdown
-from maniskill_tomato.sensing.visible_fraction.sphere import SphereModel
+from maniskill_tomato.sensing.visible_fraction.occlusion_models import make_occlusion_model
 from maniskill_tomato.sensing.visible_fraction.thesis import ThesisModel
 
 
@@ -69,15 +67,7 @@ def draw_figure(args: Args, known: dict[str, OcclusionModel]) -> None:
 
 def main(args: Args) -> None:
     """Runs the models, prints the tables and writes them with every single judgement."""
-    known: dict[str, OcclusionModel] = {
-        "thesis": ThesisModel(),
-        "improved": ImprovedModel(),
-        "sphere": SphereModel(),
-        "amodal": AmodalModel(),
-    }
-    for name in args.models:
-        if name not in known:
-            raise InvalidInputError.choice("--models", name, known)
+    known = {name: make_occlusion_model(name) for name in args.models}
     if args.figure is not None:
         draw_figure(args, known)
         return
@@ -85,7 +75,7 @@ def main(args: Args) -> None:
     with tqdm(total=len(images), unit="image", disable=None) as bar:
         judged, milliseconds = judge(
             images,
-            {n: known[n] for n in args.models},
+            known,
             min_visible=args.min_visible,
             min_total=args.min_total,
             on_image=bar.update,
