@@ -240,7 +240,7 @@ class Loop:
         except RefusedError as error:
             self._refuse(step, str(error))
             return
-        self._follow(step, sent)
+        self._follow(step, sent, chosen.then)
 
     def _go_back(self, step: Step) -> None:
         """Without depth nobody knows what is near, a leaf over the lens for one: back to where there was some."""
@@ -258,9 +258,27 @@ class Loop:
             ) from error
         self._follow(step, sent)
 
-    def _follow(self, step: Step, sent: JointMove) -> None:
-        """Waits until the arm stands and has settled, looking for stops all the while."""
+    def _follow(self, step: Step, sent: JointMove, then: tuple[JointMove, ...] = ()) -> None:
+        """Waits for the end of the move, then sends the rest of a way round.
+
+        Where the rest is refused, the next look is from where the arm stands.
+        """
         self._refused_in_a_row = 0
+        self._arrive(step, sent)
+        for move in then:
+            if self._mode == "confirm":
+                self._ask(replace(step, commanded=sent.joint_positions), move, None)
+            try:
+                sent = self._arm.command(move, step.frame.stamp, self._points.points_w)
+            except RefusedError as error:
+                step = replace(step, detail=f"the rest of the way was refused: {error}")
+                break
+            self._arrive(step, sent)
+        self._settled_at = self._clock.now()
+        self._record(replace(step, commanded=sent.joint_positions, outcome="moved"))
+
+    def _arrive(self, step: Step, sent: JointMove) -> None:
+        """Waits until the arm stands and has settled, looking for stops all the while."""
         with self._times.timed("move"):
             try:
                 while not self._arm.wait(WAIT_SLICE):
@@ -274,8 +292,6 @@ class Loop:
                 )
                 self._record(broken)
                 raise error
-        self._settled_at = self._clock.now()
-        self._record(replace(step, commanded=sent.joint_positions, outcome="moved"))
 
     def _ask(self, step: Step, move: JointMove, refusal: Refusal | None) -> None:
         """Shows the move; goes on only if a person wants it."""

@@ -2,9 +2,12 @@
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
-from maniskill_tomato.cli.options import EnvId, PlantOptions, shipped_policy
+from maniskill_tomato.cli.arguments import Flat
+from maniskill_tomato.cli.early_checks import check_count, check_env_id, check_policy
+from maniskill_tomato.cli.shared_options import EnvId, PlantOptions, shipped_policy
+from maniskill_tomato.policies.planner_names import PLANNERS
 from maniskill_tomato.tasks import GENERAL_IDS
 
 EpisodeList = Literal["validation", "held_out"]
@@ -34,7 +37,7 @@ class Eval:
     """Film the first episodes where this machine can render."""
     allow_other_task: bool = False
     """Accept a policy that was trained on another task."""
-    plants: PlantOptions = PlantOptions()
+    plants: Annotated[PlantOptions, Flat] = PlantOptions()
     """Another plant."""
     episode_list: EpisodeList | None = None
     """Episodes of a fixed list, TomatoViewpoint-v1 only: seed i is its i-th; by default held_out, unless options of
@@ -42,20 +45,23 @@ class Eval:
 
     def run(self) -> None:
         """Evaluates and says where the report is."""
+        check_env_id(self.env_id)
+        general = self.env_id in GENERAL_IDS
+        check_count("--episodes", self.episodes)
+        if self.policy is not None:
+            check_policy("--policy", self.policy, ("random", *PLANNERS) if general else ("random",))
+
         from maniskill_tomato.experiments.evaluate import EvaluationConfig, evaluate
         from maniskill_tomato.experiments.exported import open_policy, origin
         from maniskill_tomato.experiments.rollout import ActingPolicy
         from maniskill_tomato.experiments.viewpoint_policy import open_viewpoint_policy
-        from maniskill_tomato.learning.rl.envs import check_env_id
         from maniskill_tomato.learning.rl.policy import RandomPolicy
         from maniskill_tomato.policies.protocol import Planner
-        from maniskill_tomato.policies.registry import PLANNERS
 
-        check_env_id(self.env_id)
         path: Path | None = None
         env_options = self.plants.env_options()
         policy: ActingPolicy | Planner | str = RandomPolicy(self.seed)
-        if self.env_id in GENERAL_IDS:
+        if general:
             if self.policy == "random":
                 policy = "random_step"
             elif self.policy in PLANNERS:
