@@ -19,15 +19,14 @@ import tyro
 from torch import Tensor
 
 from maniskill_tomato.errors import TomatoError
-from maniskill_tomato.learning.rl.envs import make_env
-from maniskill_tomato.policies.baselines import RandomStep
-from maniskill_tomato.policies.deep_move_to_see import (
+from maniskill_tomato.learning.imitation.move_regression import (
     MoveToSeeData,
     RegressionConfig,
-    network_input,
-    save_move_network,
     train_move_network,
 )
+from maniskill_tomato.learning.rl.envs import make_env
+from maniskill_tomato.policies.baselines import RandomStep
+from maniskill_tomato.policies.deep_move_to_see import DeepMoveToSee, network_input, save_deep_move_to_see
 from maniskill_tomato.policies.move_to_see import MoveToSee
 
 logger = logging.getLogger("train_deep_move_to_see")
@@ -89,7 +88,7 @@ def main(args: Args) -> None:
             "epoch %d: loss %.4f, validation %.4f (variance of the moves %.4f)", epoch + 1, loss, held, scale
         ),
     )
-    save_move_network(network, args.out)
+    save_deep_move_to_see(args.out, DeepMoveToSee(network))
     print(f"{args.out}, {time.monotonic() - start:.0f} s")
 
 

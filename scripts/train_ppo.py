@@ -43,9 +43,9 @@ from maniskill_tomato.learning.rl.envs import make_env
 from maniskill_tomato.learning.rl.export import DenseActor, export_actor
 from maniskill_tomato.learning.rl.gymnasium_env import Array, make_gymnasium_env, normalize_observation
 from maniskill_tomato.learning.rl.history import TrainingHistory
-from maniskill_tomato.learning.rl.networks import ObservationNormalizer
 from maniskill_tomato.learning.rl.presets import OBSERVATION_CENTRE, OBSERVATION_HALF_RANGE, get_preset
 from maniskill_tomato.learning.rl.run_folder import check_run_dir
+from maniskill_tomato.policies.actor import ObservationNormalizer
 from maniskill_tomato.tasks import GENERAL_IDS, TASK_IDS
 
 SPS_EVERY = 100

@@ -4,8 +4,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
-from maniskill_tomato.cli.options import EnvId, PlantOptions, shipped_policy
-from maniskill_tomato.tasks import GENERAL_IDS
+from maniskill_tomato.cli.options import EnvId, PlantOptions
 
 EpisodeList = Literal["validation", "held_out"]
 
@@ -43,31 +42,20 @@ class Eval:
     def run(self) -> None:
         """Evaluates and says where the report is."""
         from maniskill_tomato.experiments.evaluate import EvaluationConfig, evaluate
-        from maniskill_tomato.experiments.exported import open_policy, origin
-        from maniskill_tomato.experiments.rollout import ActingPolicy
-        from maniskill_tomato.experiments.viewpoint_policy import open_viewpoint_policy
         from maniskill_tomato.learning.rl.envs import check_env_id
-        from maniskill_tomato.learning.rl.policy import RandomPolicy
-        from maniskill_tomato.policies.protocol import Planner
-        from maniskill_tomato.policies.registry import PLANNERS
+        from maniskill_tomato.policies.adapters import origin
+        from maniskill_tomato.policies.opening import find_policy, open_policy, shipped_policy
+        from maniskill_tomato.policies.protocol import Policy
 
         check_env_id(self.env_id)
-        path: Path | None = None
+        env_id = None if self.allow_other_task else self.env_id
+        found = find_policy(self.policy or shipped_policy(self.env_id), env_id)
+        path = found if isinstance(found, Path) else None
+        policy: Policy | str = str(found)
+        if path is not None:
+            policy = open_policy(path, env_id=env_id)
+            print(f"policy  {origin(policy)}")
         env_options = self.plants.env_options()
-        policy: ActingPolicy | Planner | str = RandomPolicy(self.seed)
-        if self.env_id in GENERAL_IDS:
-            if self.policy == "random":
-                policy = "random_step"
-            elif self.policy in PLANNERS:
-                policy = self.policy
-            else:
-                path = Path(self.policy) if self.policy else shipped_policy(self.env_id)
-                policy = open_viewpoint_policy(path, None if self.allow_other_task else self.env_id)
-        elif self.policy != "random":
-            path = Path(self.policy) if self.policy else shipped_policy(self.env_id)
-            opened = open_policy(path, env_id=None if self.allow_other_task else self.env_id)
-            print(f"policy  {origin(opened)}")
-            policy = opened
         if self.episode_list is not None or (self.env_id == LISTED_ID and not env_options):
             env_options["episodes"] = self.episode_list or "held_out"
         run_dir = path.parent if path is not None and (path.parent / "history.npz").is_file() else None

@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 from pathlib import Path
 
-from maniskill_tomato.cli.options import shipped_policy
+from maniskill_tomato.policies.opening import shipped_policy
 from maniskill_tomato.tasks import THESIS_IDS
 
 

@@ -1,13 +1,11 @@
 """What several commands take, and what they do with it."""
 
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Annotated, Any
 
 import tyro
 
-from maniskill_tomato.errors import InvalidInputError
-from maniskill_tomato.tasks import GENERAL_IDS, TASK_IDS
+from maniskill_tomato.tasks import TASK_IDS
 
 EnvId = Annotated[
     str, tyro.conf.Positional, tyro.conf.arg(metavar="ENV_ID", help=f"One of {', '.join(TASK_IDS)}.")
@@ -55,26 +53,3 @@ def merge_options(base: dict[str, Any], changes: dict[str, Any]) -> dict[str, An
             old = {"preset": old}
         merged[name] = {**old, **value} if isinstance(old, dict) and isinstance(value, dict) else value
     return merged
-
-
-def shipped_policy(env_id: str) -> Path:
-    """The trained policy that ships with the package.
-
-    Raises:
-        InvalidInputError: None ships for this task.
-    """
-    from maniskill_tomato.assets import asset_path
-
-    # One policy serves both general tasks.
-    name = GENERAL_IDS[0] if env_id in GENERAL_IDS else env_id
-    try:
-        return asset_path(f"policies/{name}.pt")
-    except FileNotFoundError as error:
-        how = (
-            "give --policy a planner's name such as nbv, or train one with scripts/train_view_quality.py"
-            if env_id in GENERAL_IDS
-            else f"train one with `maniskill-tomato train {env_id}`"
-        )
-        raise InvalidInputError(
-            f"no policy for {env_id} ships with this version; {how} and give its policy.pt with --policy"
-        ) from error

@@ -21,17 +21,18 @@ import maniskill_tomato
 from maniskill_tomato.assets import asset_path
 from maniskill_tomato.cli import main
 from maniskill_tomato.errors import CheckpointError, InvalidInputError, PolicyError
-from maniskill_tomato.experiments.exported import ExportedPolicy, open_policy, origin
 from maniskill_tomato.experiments.rollout import run_episodes
 from maniskill_tomato.learning.rl.agent import make_agent
 from maniskill_tomato.learning.rl.checkpoint import make_checkpoint, save_checkpoint
 from maniskill_tomato.learning.rl.envs import make_env
 from maniskill_tomato.learning.rl.export import DenseActor, export_actor, export_policy
-from maniskill_tomato.learning.rl.networks import ObservationNormalizer
-from maniskill_tomato.learning.rl.policy import load_policy
 from maniskill_tomato.learning.rl.presets import PRESETS, TrainConfig, get_preset
+from maniskill_tomato.policies.actor import ObservationNormalizer
+from maniskill_tomato.policies.adapters import ObservationPolicy, origin
 from maniskill_tomato.policies.description import PolicyDescription
 from maniskill_tomato.policies.onnx_policy import OnnxPolicy
+from maniskill_tomato.policies.opening import open_policy
+from maniskill_tomato.policies.trained_actor import load_actor
 from maniskill_tomato.sensing.observation import ObservationLayout
 from maniskill_tomato.tasks import THESIS_IDS
 
@@ -80,7 +81,7 @@ def test_an_export_acts_as_the_policy_does_in_torch(tmp_path: Path, preset: str)
     result = export_policy(source, tmp_path / "out")
     random = np.random.default_rng(1).uniform(-2.0, 2.0, (2000, 9)).astype(np.float32)
     for observations in (random, edges()):
-        reference = load_policy(source).act(torch.from_numpy(observations)).numpy()
+        reference = load_actor(source).act(torch.from_numpy(observations)).numpy()
         actions = OnnxPolicy.load(result.model).act(observations)
         assert actions.dtype == np.float32
         assert np.abs(reference).max() > 0.05  # Otherwise a policy that does nothing would pass.
@@ -94,7 +95,7 @@ def test_the_shipped_policies_act_alike_when_exported(tmp_path: Path, env_id: st
     policy = OnnxPolicy.load(export_policy(source, tmp_path).model, env_id)
     random = np.random.default_rng(2).normal(CENTRE, 0.7, (5000, 9)).astype(np.float32)
     for observations in (random, edges()):
-        reference = load_policy(source).act(torch.from_numpy(observations)).numpy()
+        reference = load_actor(source).act(torch.from_numpy(observations)).numpy()
         np.testing.assert_allclose(policy.act(observations), reference, rtol=0.0, atol=1e-5)
 
 
@@ -271,9 +272,9 @@ def test_the_description_says_what_plant_the_training_had(tmp_path: Path) -> Non
         assert content["task"]["trained_with"] == kept
         assert content["task"]["default_plant"]["preset"] == "one_tomato"
         policy = open_policy(model)
-        assert isinstance(policy, ExportedPolicy) and policy.description.trained_with == kept
+        assert isinstance(policy, ObservationPolicy) and policy.describe()["trained_with"] == kept
         lines.append(origin(policy))
-        assert origin(load_policy(tmp_path / "p.pt")) == lines[-1].replace("TD3, ONNX", "TD3")
+        assert origin(open_policy(tmp_path / "p.pt")) == lines[-1].replace("TD3, ONNX", "TD3")
     assert lines == [
         f'TD3, ONNX, trained on {GUIDED} with plant={{"preset": "full"}}, plant_pose=[0.8, 0.1, 0.5]',
         f"TD3, ONNX, trained on {GUIDED} with the task's own plant and options",
@@ -315,11 +316,11 @@ print(json.dumps([actions.tolist(), sorted(loaded)]))
     )
     actions, loaded = json.loads(result.stdout)
     source = exported.with_suffix(".pt")
-    reference = load_policy(source).act(torch.tensor([CENTRE.tolist()])).numpy()
+    reference = load_actor(source).act(torch.tensor([CENTRE.tolist()])).numpy()
     np.testing.assert_allclose(actions, reference, rtol=0.0, atol=1e-5)
     assert loaded == [
         "maniskill_tomato.errors",
-        "maniskill_tomato.policy",
+        "maniskill_tomato.policies",
         "maniskill_tomato.policies.description",
         "maniskill_tomato.policies.layout",
         "maniskill_tomato.policies.onnx_policy",
@@ -465,7 +466,7 @@ def test_an_actor_that_the_export_does_not_know_is_not_exported(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     source = make_policy(tmp_path / "p.pt", gain=100.0)
-    monkeypatch.setattr("maniskill_tomato.learning.rl.networks.torch.relu", torch.nn.functional.gelu)
+    monkeypatch.setattr("maniskill_tomato.policies.actor.torch.relu", torch.nn.functional.gelu)
     with pytest.raises(PolicyError, match="ONNX Runtime and PyTorch differ by .* nothing was written"):
         export_policy(source, tmp_path / "out")
     assert not (tmp_path / "out").exists()
@@ -526,7 +527,9 @@ def test_an_exported_policy_has_the_same_episodes_as_its_source(tmp_path: Path, 
     target = export_policy(source, tmp_path).model
     env = make_env(env_id)
     try:
-        ours, theirs = (run_episodes(env, open_policy(path, env_id), 6, 40) for path in (source, target))
+        ours, theirs = (
+            run_episodes(env, open_policy(path, env_id=env_id), 6, 40) for path in (source, target)
+        )
     finally:
         env.close()
     for a, b in zip(ours, theirs, strict=True):
@@ -559,7 +562,7 @@ def test_a_policy_of_the_general_task_is_exported_with_its_own_layout(tmp_path: 
     save_checkpoint(tmp_path / "p.pt", make_checkpoint(agent, "TomatoViewpoint-v1", bounds, counters))
     exported = OnnxPolicy.load(export_policy(tmp_path / "p.pt", tmp_path).model, "TomatoViewpoint-v1")
     observations = np.random.default_rng(0).uniform(-1.0, 1.0, (5, size)).astype(np.float32)
-    wanted = load_policy(tmp_path / "p.pt").act(torch.from_numpy(observations)).numpy()
+    wanted = load_actor(tmp_path / "p.pt").act(torch.from_numpy(observations)).numpy()
     assert np.abs(wanted).max() > 0.1
     np.testing.assert_allclose(exported.act(observations), wanted, atol=1e-5)
     assert [c.name for c in exported.description.action] == ["right", "up", "forward"]
