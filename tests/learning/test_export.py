@@ -510,7 +510,7 @@ def test_the_command_answers_bad_files_in_words(tmp_path: Path, capsys: pytest.C
     for arguments, message in (
         (("export", "--policy", str(tmp_path / "no.pt")), "no checkpoint at"),
         (("export", "--policy", str(tmp_path / "bad.pt")), "not a readable checkpoint"),
-        (("eval", GUIDED, "--policy", str(tmp_path / "no.onnx")), "cannot read the exported policy"),
+        (("eval", GUIDED, "--policy", str(tmp_path / "no.onnx")), "no policy at"),
         (("eval", GUIDED, "--policy", str(tmp_path / "bad.onnx")), "cannot read the description"),
     ):
         with pytest.raises(SystemExit) as ended:
