@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from maniskill_tomato.deploy.errors import PerceptionError, ProfileError
 from maniskill_tomato.deploy.interface import Float64, Frame
 from maniskill_tomato.errors import TomatoError
-from maniskill_tomato.raycast.picture_caster import ROBOT_LABEL
+from maniskill_tomato.raycast.images import ROBOT_LABEL
 from maniskill_tomato.robot.d435 import CameraIntrinsics
 
 Mask = NDArray[np.bool_]

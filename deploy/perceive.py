@@ -9,7 +9,8 @@ import torch
 from maniskill_tomato.deploy.errors import PerceptionError
 from maniskill_tomato.deploy.fruits import RADIUS_RANGE, Fruit, FruitFinder, Mask, locate, silhouette_area
 from maniskill_tomato.deploy.interface import Float64, Frame
-from maniskill_tomato.raycast.view_rays import ViewRays, sample_view
+from maniskill_tomato.raycast.view_rays import ViewRays
+from maniskill_tomato.sensing.view_pattern import sample_view
 
 Sight = Literal["images", "rays"]
 """From masks and depth images, as on a robot; or from the twin's exact rays, as in the simulated task."""

@@ -16,12 +16,10 @@ from maniskill_tomato.deploy.fruits import TruthFinder
 from maniskill_tomato.deploy.interface import Float64
 from maniskill_tomato.deploy.loop_config import LoopConfig
 from maniskill_tomato.deploy.perceive import Sight
+from maniskill_tomato.deploy.profile_files import profile_names, profile_path
 from maniskill_tomato.deploy.safety_config import SafetyConfig
 from maniskill_tomato.errors import InvalidInputError
 from maniskill_tomato.robot.d435 import T_flange_camera_color_optical
-
-PROFILES: Final = Path(__file__).resolve().parent / "profiles"
-"""Where ours are."""
 
 TABLES: Final = (
     "description",
@@ -122,11 +120,6 @@ class Profile:
     stop: StopConfig = field(default_factory=StopConfig)
 
 
-def profile_names() -> tuple[str, ...]:
-    """The profiles of the package."""
-    return tuple(sorted(path.stem for path in PROFILES.glob("*.toml")))
-
-
 def load_profile(name_or_file: str) -> Profile:
     """Reads and checks a profile.
 
@@ -136,7 +129,7 @@ def load_profile(name_or_file: str) -> Profile:
     Raises:
         ProfileError: There is none, or something in it is wrong.
     """
-    path = PROFILES / f"{name_or_file}.toml" if name_or_file in profile_names() else Path(name_or_file)
+    path = profile_path(name_or_file)
     try:
         text = path.read_text(encoding="utf-8")
     except (FileNotFoundError, IsADirectoryError) as error:

@@ -1,6 +1,13 @@
 """The exceptions of this package, one family under `TomatoError`."""
 
+import difflib
 from collections.abc import Iterable
+
+
+def did_you_mean(value: object, allowed: Iterable[object]) -> str:
+    """The end of a message about a mistyped word: `; did you mean 'train'?`, or nothing where none is near."""
+    near = difflib.get_close_matches(str(value), [str(a) for a in allowed], n=1)
+    return f"; did you mean {near[0]!r}?" if near else ""
 
 
 class TomatoError(Exception):
@@ -13,8 +20,9 @@ class InvalidInputError(TomatoError, ValueError):
     @classmethod
     def choice(cls, name: str, value: object, allowed: Iterable[object]) -> "InvalidInputError":
         """The error for a `value` of the option `name` that is not among the `allowed` ones."""
+        allowed = tuple(allowed)
         listed = ", ".join(repr(a) for a in allowed)
-        return cls(f"{name} must be one of {listed}; got {value!r}")
+        return cls(f"{name} must be one of {listed}; got {value!r}{did_you_mean(value, allowed)}")
 
 
 class PolicyError(TomatoError):

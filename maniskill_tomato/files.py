@@ -6,9 +6,10 @@ import os
 import pickle
 import zipfile
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-import torch
+if TYPE_CHECKING:
+    import torch
 
 from maniskill_tomato.errors import CheckpointError
 
@@ -37,12 +38,14 @@ def write_atomically(path: Path, content: bytes) -> None:
         ) from error
 
 
-def read_tensors(path: Path | str, device: torch.device | str = "cpu") -> Any:
+def read_tensors(path: Path | str, device: "torch.device | str" = "cpu") -> Any:
     """What `torch.save` wrote into a file: tensors, numbers, strings and containers of them, never code.
 
     Raises:
         CheckpointError: The file is missing or damaged.
     """
+    import torch
+
     path = Path(path)
     if not path.is_file():
         raise CheckpointError(

@@ -27,7 +27,7 @@ from mani_skill.utils.structs.types import SimConfig
 
 import maniskill_tomato  # noqa: F401
 from maniskill_tomato.plants.generator import generate_plant
-from maniskill_tomato.raycast.caster import VisibilityCaster
+from maniskill_tomato.raycast.scene import RayScene
 from maniskill_tomato.rendering.vulkan_probe import rendering_available
 from maniskill_tomato.robot.d435 import color_intrinsics
 from maniskill_tomato.robot.iiwa14 import JOINT_LOWER, JOINT_UPPER
@@ -136,15 +136,13 @@ def inverse_kinematics_rate(batch: int) -> float:
 def rays_rate(rays_per_side: int) -> float:
     """Rays per second towards fruits of a full plant, the caller's overhead included."""
     plant = generate_plant("full", 0)
-    caster = VisibilityCaster(
-        plants=[plant], intrinsics=color_intrinsics(640, 480), rays_per_side=rays_per_side
-    )
+    scene = RayScene([plant], color_intrinsics(640, 480), rays_per_side=rays_per_side)
     ripe = [j for j, fruit in enumerate(plant.fruits) if fruit.ripeness == "ripe"]
     pose = torch.eye(4).repeat(1, 1, 1)
     pose[0, :3, :3] = torch.tensor([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
     pose[0, :3, 3] = torch.as_tensor(plant.fruits[ripe[0]].centre) - torch.tensor([0.5, 0.0, 0.0])
     target, plant_pose = torch.tensor([ripe[0]]), torch.eye(4)[None]
-    return rays_per_side**2 * per_second(lambda: caster.cast(pose, target, plant_pose), 400)
+    return rays_per_side**2 * per_second(lambda: scene.visibility(pose, target, plant_pose), 400)
 
 
 def main(args: Args) -> int:

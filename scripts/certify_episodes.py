@@ -9,19 +9,16 @@ Usage:
     python scripts/certify_episodes.py --list held_out --count 200 --fresh-seed 5000000 --out runs/fresh.json
 """
 
+import functools
 import logging
-import multiprocessing
-import os
 import sys
 import time
 from collections.abc import Iterator
-from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
 import tyro
 
 from maniskill_tomato.assets import ASSETS_DIR
@@ -36,6 +33,7 @@ from maniskill_tomato.plants.episode_list import (
 )
 from maniskill_tomato.policies.oracle import OracleSearch
 from maniskill_tomato.tasks.row.episode_sampling import draw_episodes, extend_episodes
+from maniskill_tomato.worker_pool import run_jobs
 
 logger = logging.getLogger("certify_episodes")
 
@@ -86,13 +84,15 @@ def certify_all(episodes: list[Episode], args: Args) -> Iterator[list[Episode]]:
     known = list(episodes)
     open_ones = [i for i, episode in enumerate(episodes) if args.again or not episode.certified]
     blocks = [open_ones[i : i + BLOCK] for i in range(0, len(open_ones), BLOCK)]
-    context = multiprocessing.get_context("spawn")
-    with ProcessPoolExecutor(args.jobs, mp_context=context, initializer=_start_process) as pool:
-        work = [pool.submit(certify, [episodes[i] for i in block], args.contact_free) for block in blocks]
-        for block, future in zip(blocks, work, strict=True):
-            for i, episode in zip(block, future.result(), strict=True):
-                known[i] = episode
-            yield known
+    work = functools.partial(_certify_some, episodes, args.contact_free)
+    for block, certified in run_jobs(work, blocks, args.jobs):
+        for i, episode in zip(block, certified, strict=True):
+            known[i] = episode
+        yield known
+
+
+def _certify_some(episodes: list[Episode], contact_free: bool, numbers: list[int]) -> list[Episode]:
+    return certify([episodes[i] for i in numbers], contact_free)
 
 
 def describe(episodes: list[Episode]) -> str:
@@ -103,11 +103,6 @@ def describe(episodes: list[Episode]) -> str:
         return text
     shares = ", ".join(f"{k}: {np.mean(moves == k):.1%}" for k in sorted(set(moves.tolist())))
     return f"{text}, mean moves {moves.mean():.3f} ({shares})"
-
-
-def _start_process() -> None:
-    os.environ["OMP_NUM_THREADS"] = "1"
-    torch.set_num_threads(1)
 
 
 def main(args: Args) -> None:

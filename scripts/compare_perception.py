@@ -23,7 +23,7 @@ import maniskill_tomato  # noqa: F401  (registers the tasks)
 from maniskill_tomato.errors import InvalidInputError, TomatoError
 from maniskill_tomato.experiments.benchmark_policies import parse_policies
 from maniskill_tomato.files import write_atomically
-from maniskill_tomato.sensing.camera_perception import RENDERED, Perception
+from maniskill_tomato.sensing.simulated_camera import RENDERED, Perception
 
 PERCEPTIONS = get_args(Perception)
 

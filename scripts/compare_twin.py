@@ -25,8 +25,7 @@ from maniskill_tomato.deploy.profile import Profile, load_profile
 from maniskill_tomato.deploy.run import RunConfig, run
 from maniskill_tomato.errors import TomatoError
 from maniskill_tomato.experiments.benchmark_conditions import main_condition
-from maniskill_tomato.experiments.metrics import wilson_interval
-from maniskill_tomato.experiments.statistics import mcnemar_p
+from maniskill_tomato.experiments.statistics import mcnemar_p, wilson_interval
 from maniskill_tomato.experiments.view_rollout import run_view_episode
 from maniskill_tomato.files import write_atomically
 from maniskill_tomato.learning.rl.envs import make_env

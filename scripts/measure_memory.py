@@ -22,9 +22,7 @@ from tqdm import tqdm
 
 from maniskill_tomato.plants.generator import generate_plant
 from maniskill_tomato.plants.organs import Plant, SemanticClass
-from maniskill_tomato.raycast.cast_views import CastViews
-from maniskill_tomato.raycast.caster import VisibilityCaster
-from maniskill_tomato.raycast.view_rays import ViewRayCaster
+from maniskill_tomato.raycast.scene import RayScene
 from maniskill_tomato.robot.d435 import color_intrinsics
 from maniskill_tomato.robot.look_at import camera_to_viewpoint, look_at_pose
 from maniskill_tomato.sensing.observation import PART_SHAPES, ViewpointObserver
@@ -45,7 +43,7 @@ class Episode:
     truth: Tensor
     reachable: Tensor
     order: list[int]
-    caster: VisibilityCaster
+    scene: RayScene
 
 
 def make_episode(seed: int, lattice: ViewLattice) -> Episode | None:
@@ -57,17 +55,17 @@ def make_episode(seed: int, lattice: ViewLattice) -> Episode | None:
         return None
     fruit = int(rng.choice(ripe))
     target = torch.from_numpy(plant.fruits[fruit].centre)[None] + torch.tensor([[PLANT_X, 0.0, 0.0]])
-    caster = VisibilityCaster(plants=[plant], intrinsics=color_intrinsics())
+    scene = RayScene([plant], color_intrinsics())
     positions = lattice.positions(target)[0]
     poses = look_at_pose(positions, target.expand_as(positions))
-    truth = CastViews(caster).visible_fraction(poses, fruit, plant_pose())
+    truth = scene.visible_fraction_from(poses, fruit, plant_pose())
     reachable = lattice.reachable(target)[0]
     hard = torch.nonzero(reachable & (truth < 0.3))[:, 0].tolist()
     if not hard or not bool((reachable & (truth > 0.8)).any()):
         return None
     others = rng.choice(torch.nonzero(reachable)[:, 0].numpy(), max(AFTER_VIEWS) - 1, replace=False)
     order = [int(rng.choice(hard)), *map(int, others)]
-    return Episode(plant, fruit, target, poses, truth, reachable, order, caster)
+    return Episode(plant, fruit, target, poses, truth, reachable, order, scene)
 
 
 def plant_pose() -> Tensor:
@@ -77,11 +75,11 @@ def plant_pose() -> Tensor:
     return pose
 
 
-def look(episode: Episode, observer: ViewpointObserver, rays: ViewRayCaster, k: int) -> Tensor:
+def look(episode: Episode, observer: ViewpointObserver, k: int) -> Tensor:
     """The observation after the k-th view."""
     index = episode.order[k]
     pose = episode.poses[index : index + 1]
-    view = rays.cast(pose, torch.tensor([episode.fruit]), episode.target, plant_pose()[None])
+    view = episode.scene.view_rays(pose, torch.tensor([episode.fruit]), episode.target, plant_pose()[None])
     viewpoint = camera_to_viewpoint(pose, torch.zeros(1, 3))
     return observer.observe(viewpoint, pose, view, episode.truth[index : index + 1], torch.tensor([20 - k]))
 
@@ -92,10 +90,9 @@ def judge(episodes: list[Episode]) -> dict[str, dict[str, float]]:
     observer = ViewpointObserver()
     for episode in tqdm(episodes, unit="episode"):
         observer.begin(torch.tensor([0]), episode.target)
-        rays = ViewRayCaster(episode.caster)
         truth = episode.truth[episode.reachable].numpy()
         for k in range(max(AFTER_VIEWS)):
-            look(episode, observer, rays, k)
+            look(episode, observer, k)
             if k + 1 in rows:
                 predicted = observer.memory.predict(episode.poses[None, :, :3, 3])[0, :, 0]
                 chosen = predicted[episode.reachable].numpy()
@@ -120,25 +117,27 @@ def processor_ms(work: Callable[[], object], repeats: int) -> float:
 
 def measure(episode: Episode) -> dict[str, float]:
     """Processor time of each piece for one environment."""
-    observer, rays = ViewpointObserver(), ViewRayCaster(episode.caster)
+    observer = ViewpointObserver()
     observer.begin(torch.tensor([0]), episode.target)
-    look(episode, observer, rays, 0)
+    look(episode, observer, 0)
     pose = episode.poses[episode.order[0]][None]
     fruit, plant = torch.tensor([episode.fruit]), plant_pose()
     view = observer.belief.rays
     viewpoint, fraction, left = observer.belief.viewpoint, torch.tensor([0.5]), torch.tensor([19])
     generator = torch.Generator().manual_seed(0)
     positions = episode.target[:, None] + 0.3 * torch.randn(1, 2000, 3, generator=generator)
-    views = CastViews(episode.caster)
+    scene = episode.scene
     return {
-        "cast_256_rays_ms": processor_ms(lambda: rays.cast(pose, fruit, episode.target, plant[None]), 200),
+        "cast_256_rays_ms": processor_ms(
+            lambda: scene.view_rays(pose, fruit, episode.target, plant[None]), 200
+        ),
         "observe_ms": processor_ms(lambda: observer.observe(viewpoint, pose, view, fraction, left), 200),
         "predict_500_ms": processor_ms(lambda: observer.memory.predict(positions[:, :500]), 100),
         "predict_2000_ms": processor_ms(lambda: observer.memory.predict(positions), 50),
         "begin_ms": processor_ms(lambda: observer.begin(torch.tensor([0]), episode.target), 20),
         "cast_views_per_second": 1e3
         * len(episode.poses)
-        / processor_ms(lambda: views.visible_fraction(episode.poses, episode.fruit, plant), 5),
+        / processor_ms(lambda: scene.visible_fraction_from(episode.poses, episode.fruit, plant), 5),
     }
 
 
@@ -153,11 +152,11 @@ def draw(episode: Episode, path: Path) -> None:
 
     colours = {SemanticClass.LEAF: (0.45, 0.65, 0.4), SemanticClass.STEM: (0.55, 0.45, 0.3)}
     segmented = SegmentedPlant(episode.plant, COMPARISON_INTRINSICS)
-    observer, rays = ViewpointObserver(), ViewRayCaster(episode.caster)
+    observer = ViewpointObserver()
     observer.begin(torch.tensor([0]), episode.target)
     figure, axes = plt.subplots(3, 6, figsize=(14.0, 7.0), layout="constrained")
     for k, row in enumerate(axes):
-        observation = look(episode, observer, rays, k)[0]
+        observation = look(episode, observer, k)[0]
         pose = episode.poses[episode.order[k]]
         organs = segmented.picture((torch.linalg.inv(plant_pose()) @ pose).double().numpy())
         picture = np.ones((*organs.shape, 3))

@@ -12,7 +12,8 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from maniskill_tomato.learning.imitation.training import ImitationConfig, train_imitation
+from maniskill_tomato.learning.imitation.imitation_config import ImitationConfig
+from maniskill_tomato.learning.imitation.training import train_imitation
 from maniskill_tomato.learning.script import parse_env_options, run_training
 
 

@@ -22,7 +22,8 @@ from maniskill_tomato.learning.interrupt import stop_on_signals
 from maniskill_tomato.segmentation.datasets.annotations import AnnotatedImage
 from maniskill_tomato.segmentation.metrics.detection_plots import plot_losses
 from maniskill_tomato.segmentation.training.detector_presets import MASK_RCNN_PRESETS, YOLO_PRESET
-from maniskill_tomato.segmentation.training.light_training import LightTrainConfig, LightTraining
+from maniskill_tomato.segmentation.training.light_config import LightTrainConfig
+from maniskill_tomato.segmentation.training.light_training import LightTraining
 from maniskill_tomato.segmentation.training.mask_rcnn_training import MaskRcnnTraining
 from maniskill_tomato.segmentation.training.resumable_training import CHECKPOINT, ResumableTraining
 from maniskill_tomato.segmentation.training.training_pictures import read_place

@@ -11,7 +11,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from maniskill_tomato.learning.script import parse_env_options, run_training
-from maniskill_tomato.learning.view_quality.training import QualityTrainConfig, train_view_quality
+from maniskill_tomato.learning.view_quality.quality_config import QualityTrainConfig
+from maniskill_tomato.learning.view_quality.training import train_view_quality
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from maniskill_tomato.deploy.errors import ProfileError
 from maniskill_tomato.deploy.mock.world import TwinWorld
-from maniskill_tomato.raycast.picture_caster import ROBOT_LABEL, Picture
+from maniskill_tomato.raycast.images import ROBOT_LABEL, Picture
 
 _logger = logging.getLogger(__name__)
 

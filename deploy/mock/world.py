@@ -12,9 +12,8 @@ from maniskill_tomato.deploy.interface import Float64, FrameTruth
 from maniskill_tomato.deploy.mock.dynamics import ArmDynamics
 from maniskill_tomato.deploy.mock.episode import TwinEpisode
 from maniskill_tomato.plants.organs import SemanticClass
-from maniskill_tomato.raycast.caster import VisibilityCaster
-from maniskill_tomato.raycast.picture_caster import FIRST_ORGAN_LABEL, Picture, PictureCaster
-from maniskill_tomato.raycast.view_rays import ViewRayCaster
+from maniskill_tomato.raycast.images import FIRST_ORGAN_LABEL, Picture
+from maniskill_tomato.raycast.scene import RayScene
 from maniskill_tomato.robot.d435 import CameraIntrinsics, T_flange_camera_color_optical
 from maniskill_tomato.robot.description import link_meshes
 from maniskill_tomato.robot.kinematics import link_transforms
@@ -47,11 +46,7 @@ class TwinWorld:
         self.clock = clock
         self.arm = ArmDynamics(episode.start_joints)
         self._began = clock.now()
-        self._caster = VisibilityCaster(
-            plants=[episode.plant], intrinsics=intrinsics, robot_meshes=link_meshes()
-        )
-        self._rays = ViewRayCaster(self._caster)
-        self._pictures = PictureCaster(self._caster, intrinsics)
+        self.scene = RayScene([episode.plant], intrinsics, robot_meshes=link_meshes())
         self._mount = torch.tensor(T_flange_camera_color_optical, dtype=torch.float32)
         organs = [organ.semantic_class for organ in episode.plant.organs]
         classes = [SemanticClass.BACKGROUND, SemanticClass.ROBOT, *organs]
@@ -76,7 +71,7 @@ class TwinWorld:
     def picture(self) -> Picture:
         """What the camera sees now, exactly."""
         camera, links = self._poses(self.arm.joint_positions)
-        return self._pictures.draw(camera[0], self.episode.T_world_plant, links[0])
+        return self.scene.picture(self.intrinsics, camera[0], self.episode.T_world_plant, links[0])
 
     def color(self, picture: Picture) -> NDArray[np.uint8]:
         """The picture in flat colours, darker where one looks along a surface. Shape (H, W, 3)."""
@@ -88,9 +83,9 @@ class TwinWorld:
         camera, links = self._poses(self.arm.joint_positions)
         target = torch.tensor([self.episode.target])
         plant = self.episode.T_world_plant[None]
-        seen = self._caster.cast(camera, target, plant, links)
+        seen = self.scene.visibility(camera, target, plant, links)
         known = self.episode.target_position
-        rays = self._rays.cast(camera, target, known[None], plant, links)
+        rays = self.scene.view_rays(camera, target, known[None], plant, links)
         labels = picture.labels.copy()
         labels.setflags(write=False)
         return FrameTruth(

@@ -138,7 +138,8 @@ class DeployProfiles:
 
     def run(self) -> None:
         """Prints."""
-        from maniskill_tomato.deploy.profile import load_profile, profile_names
+        from maniskill_tomato.deploy.profile import load_profile
+        from maniskill_tomato.deploy.profile_files import profile_names
 
         if self.show is not None:
             print(load_profile(self.show).text, end="")

@@ -8,6 +8,7 @@ from typing import Annotated, Any
 
 import tyro
 
+from maniskill_tomato.cli.arguments import Flat
 from maniskill_tomato.cli.options import PlantOptions, merge_options
 from maniskill_tomato.errors import InvalidInputError, SeedsFailedError
 from maniskill_tomato.learning.rl.config_file import RunFile, parse_seeds, read_run_config, read_run_file
@@ -44,9 +45,9 @@ class Train:
     time."""
     overwrite: bool = False
     """Replace a run that the folder already holds."""
-    plants: PlantOptions = PlantOptions()
+    plants: Annotated[PlantOptions, Flat] = PlantOptions()
     """Another plant."""
-    config: TrainConfig = PRESETS["td3"]
+    config: Annotated[TrainConfig, Flat] = PRESETS["td3"]
     """The training configuration."""
 
     def run(self) -> None:

@@ -10,8 +10,8 @@ import numpy as np
 
 import maniskill_tomato
 from maniskill_tomato.experiments.ablation import SOLVED, WINDOW, LearnerVariant
-from maniskill_tomato.experiments.comparison import Interval, bootstrap_interval
 from maniskill_tomato.experiments.comparison_report import interval_text
+from maniskill_tomato.experiments.statistics import Interval, interquartile_interval
 from maniskill_tomato.files import write_atomically
 
 HEAD = (
@@ -110,8 +110,8 @@ def _row(task: str, variant: LearnerVariant, strata: Sequence[Sequence[Result]])
         variant=variant.name,
         title=variant.title,
         seeds=tuple(sorted({int(r["seed"]) for r in results})),
-        success_rate=bootstrap_interval([[r["success_rate"] for r in stratum] for stratum in strata]),
-        mean_steps=bootstrap_interval([[r["mean_steps"] for r in stratum] for stratum in strata]),
+        success_rate=interquartile_interval([[r["success_rate"] for r in stratum] for stratum in strata]),
+        mean_steps=interquartile_interval([[r["mean_steps"] for r in stratum] for stratum in strata]),
         steps_to_solved=float(np.median(solved)) if solved else None,
         solved_runs=len(solved),
         runs=len(results),

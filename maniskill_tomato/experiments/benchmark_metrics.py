@@ -7,8 +7,7 @@ from typing import Any
 import numpy as np
 
 from maniskill_tomato.errors import InvalidInputError
-from maniskill_tomato.experiments.metrics import wilson_interval
-from maniskill_tomato.experiments.statistics import mean_interval, paired_test
+from maniskill_tomato.experiments.statistics import mean_interval, paired_test, wilson_interval
 from maniskill_tomato.experiments.view_episode import ViewEpisode
 
 THRESHOLDS = tuple(round(0.5 + 0.05 * k, 2) for k in range(10))

@@ -8,14 +8,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 from maniskill_tomato.errors import InvalidInputError
+from maniskill_tomato.experiments.statistics import interquartile_band, interquartile_mean
 from maniskill_tomato.learning.rl.presets import PRESETS, TrainConfig, modernise
-
-RESAMPLES = 10_000
-CURVE_RESAMPLES = 1000
-CONFIDENCE = 0.95
 
 CURVE_POINTS = 120
 CURVE_WINDOW = 0.05
@@ -24,17 +21,6 @@ CURVE_WINDOW = 0.05
 REQUIRED_METRICS = ("env_id", "episodes", "seed", "success_rate", "mean_steps")
 
 Float64 = NDArray[np.float64]
-
-
-@dataclass(frozen=True, kw_only=True)
-class Interval:
-    """An interquartile mean and how sure one can be of it."""
-
-    estimate: float
-    low: float | None
-    """Lower end of the 95 % interval; None for fewer than two runs, from which none follows."""
-    high: float | None
-    """Its upper end."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -95,52 +81,6 @@ class Curve:
     """Equal to the mean for a single run. Shape (points,)."""
     high: Float64
     """Shape (points,)."""
-
-
-def interquartile_mean(values: ArrayLike, axis: int = -1) -> Float64:
-    """Mean of the middle half: floor(n / 4) values are left out at either end, none of fewer than four.
-
-    It is what Agarwal et al. (2021) advise for few runs: less noisy than the median, less bent by one failed
-    run than the mean.
-
-    Raises:
-        InvalidInputError: There is no value.
-    """
-    ordered = np.sort(np.asarray(values, dtype=np.float64), axis=axis)
-    count = ordered.shape[axis]
-    if count == 0:
-        raise InvalidInputError("an interquartile mean needs one value or more, got none")
-    cut = count // 4
-    middle = np.take(ordered, range(cut, count - cut), axis=axis)
-    return np.asarray(middle.mean(axis=axis), dtype=np.float64)
-
-
-def bootstrap_interval(
-    strata: Sequence[ArrayLike], resamples: int = RESAMPLES, confidence: float = CONFIDENCE, seed: int = 0
-) -> Interval:
-    """Interquartile mean of all values, with the percentile interval of a stratified bootstrap.
-
-    Args:
-        strata: The runs' scores, one sequence per task; runs are redrawn within their task only.
-        resamples: How often to redraw.
-        confidence: Probability that the interval is made for.
-        seed: Seed of the redrawing.
-
-    Raises:
-        InvalidInputError: A task has no score.
-    """
-    tasks = [np.asarray(values, dtype=np.float64) for values in strata]
-    if not tasks or min(len(values) for values in tasks) == 0:
-        raise InvalidInputError("every task needs the score of one run or more")
-    estimate = float(interquartile_mean(np.concatenate(tasks)))
-    if max(len(values) for values in tasks) < 2:
-        return Interval(estimate=estimate, low=None, high=None)
-    random = np.random.default_rng(seed)
-    redrawn = [values[random.integers(len(values), size=(resamples, len(values)))] for values in tasks]
-    means = interquartile_mean(np.concatenate(redrawn, axis=1))
-    tail = 50.0 * (1.0 - confidence)
-    low, high = np.percentile(means, (tail, 100.0 - tail))
-    return Interval(estimate=estimate, low=float(low), high=float(high))
 
 
 def find_runs(folders: Iterable[Path]) -> list[Path]:
@@ -284,12 +224,7 @@ def training_curve(group: Group, column: str, wall_time: bool) -> Curve | None:
     known = np.isfinite(smooth).all(axis=0)
     smooth, grid = smooth[:, known], grid[known]
     mean = interquartile_mean(smooth, axis=0)
-    low = high = mean
-    if len(series) > 1:
-        rows = np.random.default_rng(0).integers(len(series), size=(CURVE_RESAMPLES, len(series)))
-        means = interquartile_mean(smooth[rows], axis=1)
-        tail = 50.0 * (1.0 - CONFIDENCE)
-        low, high = np.percentile(means, (tail, 100.0 - tail), axis=0)
+    low, high = interquartile_band(smooth)
     return Curve(at=grid, mean=mean, low=low, high=high)
 
 

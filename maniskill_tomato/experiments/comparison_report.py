@@ -16,10 +16,11 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
 import maniskill_tomato
-from maniskill_tomato.experiments.comparison import Group, Interval, bootstrap_interval, training_curve
+from maniskill_tomato.experiments.comparison import Group, training_curve
 from maniskill_tomato.experiments.plots import LEAF, MUTED, SKY, STRAW, TOMATO
 from maniskill_tomato.experiments.plots import STYLE as PLOT_STYLE
 from maniskill_tomato.experiments.report_style import PAGE, STYLE
+from maniskill_tomato.experiments.statistics import Interval, interquartile_interval
 
 COLOURS = (TOMATO, SKY, LEAF, STRAW, "#8a5aa5", "#4a9a9a", "#8c6d4f", MUTED)
 LABEL_WIDTH = 46
@@ -169,7 +170,7 @@ def _draw_curve(axes: Axes, group: Group, column: str, wall_time: bool, index: i
 def _row(task: str, groups: Sequence[Group]) -> ComparisonRow:
     def interval(metric: str) -> Interval | None:
         strata = [scores for group in groups if len(scores := group.scores(metric))]
-        return bootstrap_interval(strata) if strata else None
+        return interquartile_interval(strata) if strata else None
 
     runs = [run for group in groups for run in group.runs]
     runs = [run for run in runs if run.metrics is not None] or runs

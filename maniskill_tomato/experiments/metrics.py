@@ -1,7 +1,6 @@
 """What the episodes amount to: success, steps, visible fraction, and how sure one can be of it."""
 
 import json
-import math
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -9,30 +8,11 @@ from typing import Any
 import numpy as np
 
 import maniskill_tomato
-from maniskill_tomato.errors import InvalidInputError
 from maniskill_tomato.experiments.rollout import Episode
+from maniskill_tomato.experiments.statistics import wilson_interval
 
 WITHIN_STEPS = (1, 3, 5, 10)
 """Step counts at which the share of solved episodes is reported."""
-
-
-def wilson_interval(successes: int, trials: int, z: float = 1.959963984540054) -> tuple[float, float]:
-    """Wilson's interval of a success probability; 95 % by default.
-
-    Unlike the textbook interval it stays within [0, 1] and has a width when all trials succeed.
-
-    Raises:
-        InvalidInputError: There is no trial, or the successes are not among them.
-    """
-    if trials < 1 or not 0 <= successes <= trials:
-        raise InvalidInputError(
-            f"need 0 <= successes <= trials and at least one trial, got {successes} of {trials}"
-        )
-    rate = successes / trials
-    denominator = 1.0 + z * z / trials
-    centre = (rate + z * z / (2 * trials)) / denominator
-    half = z * math.sqrt(rate * (1.0 - rate) / trials + z * z / (4 * trials * trials)) / denominator
-    return max(centre - half, 0.0), min(centre + half, 1.0)
 
 
 def summarise(episodes: Sequence[Episode]) -> dict[str, Any]:

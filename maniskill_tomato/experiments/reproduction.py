@@ -16,6 +16,7 @@ from torch import Tensor
 from maniskill_tomato.errors import InvalidInputError
 from maniskill_tomato.experiments.metrics import summarise
 from maniskill_tomato.experiments.rollout import Episode, run_episodes
+from maniskill_tomato.experiments.statistics import mean_interval
 from maniskill_tomato.experiments.thesis_experiments import Evaluation, Experiment, Variant
 from maniskill_tomato.files import write_atomically
 from maniskill_tomato.learning.rl.agent import make_actor, make_normalizer
@@ -265,22 +266,6 @@ def success_threshold(env_id: str) -> float:
         env.close()
 
 
-def bootstrap_interval(
-    values: Sequence[float], resamples: int = 10_000, seed: int = 0
-) -> tuple[float, float]:
-    """95 % percentile-bootstrap interval of the mean of `values`, one per training seed.
-
-    Raises:
-        InvalidInputError: There is no value.
-    """
-    if len(values) == 0:
-        raise InvalidInputError("a bootstrap needs at least one value")
-    sample = np.asarray(values, dtype=np.float64)
-    rows = np.random.default_rng(seed).integers(len(sample), size=(resamples, len(sample)))
-    low, high = np.percentile(sample[rows].mean(axis=1), (2.5, 97.5))
-    return float(low), float(high)
-
-
 TABLE_HEADER = (
     "| variant | success at the training pose, mean over seeds (95 % interval) | per seed | mean steps | "
     "unreachable steps, training / evaluation | saturated outputs | training steps | first action unreachable |\n"
@@ -292,7 +277,7 @@ def table_row(title: str, summaries: Sequence[dict[str, Any]], untrained: dict[s
     """One row of the ablation table, for Markdown."""
     results = [s["evaluations"]["training-pose"] for s in summaries]
     rates = [r["success_rate"] for r in results]
-    low, high = bootstrap_interval(rates)
+    low, high = mean_interval(rates)
     trained = [s["training"] for s in summaries]
     return (
         f"| {title} | {np.mean(rates):.0%} ({low:.0%} to {high:.0%}) "

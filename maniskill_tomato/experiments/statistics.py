@@ -1,16 +1,33 @@
-"""How sure one can be of a mean, and whether two policies differ on the same episodes."""
+"""How sure one can be of a rate or a mean, and whether two policies differ on the same episodes."""
 
-import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from scipy import stats
 
 from maniskill_tomato.errors import InvalidInputError
 
+Float64 = NDArray[np.float64]
+
 RESAMPLES = 10_000
 """Bootstrap resamples and random sign flips; the Monte-Carlo error of a p-value near 0.05 is then about 0.002."""
+
+BATCH = 500
+"""Resamples at a time, so that thousands of episodes fit in memory."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Interval:
+    """An interquartile mean and how sure one can be of it."""
+
+    estimate: float
+    low: float | None
+    """Lower end of the 95 % interval; None for fewer than two runs, from which none follows."""
+    high: float | None
+    """Its upper end."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -32,11 +49,27 @@ class PairedTest:
     """Two-sided p-value of the sign-flip permutation test that the mean difference is zero."""
 
 
+def wilson_interval(successes: int, trials: int) -> tuple[float, float]:
+    """Wilson's 95 % interval of a success probability.
+
+    Unlike the textbook interval it stays within [0, 1] and has a width when all trials succeed.
+
+    Raises:
+        InvalidInputError: There is no trial, or the successes are not among them.
+    """
+    if trials < 1 or not 0 <= successes <= trials:
+        raise InvalidInputError(
+            f"need 0 <= successes <= trials and at least one trial, got {successes} of {trials}"
+        )
+    interval = stats.binomtest(successes, trials).proportion_ci(confidence_level=0.95, method="wilson")
+    return float(interval.low), float(interval.high)
+
+
 def mean_interval(values: ArrayLike, seed: int = 0) -> tuple[float, float]:
     """95 % percentile bootstrap interval of the mean (Efron and Tibshirani 1993, section 13.3).
 
     Args:
-        values: One number per episode. Shape (N,).
+        values: One number per episode or training seed. Shape (N,).
         seed: Of the resamples, so that the same values give the same interval.
 
     Raises:
@@ -45,26 +78,76 @@ def mean_interval(values: ArrayLike, seed: int = 0) -> tuple[float, float]:
     series = np.asarray(values, dtype=np.float64)
     if series.ndim != 1 or len(series) == 0:
         raise InvalidInputError(f"values must be a list of one or more numbers, got shape {series.shape}")
-    means = _resampled_means(series, np.random.default_rng(seed))
-    low, high = np.percentile(means, [2.5, 97.5])
+    if len(series) == 1:
+        return float(series[0]), float(series[0])
+    low, high = _percentile_interval([series], np.mean, 0.95, RESAMPLES, seed, batch=BATCH)
     return float(low), float(high)
+
+
+def interquartile_mean(values: ArrayLike, axis: int = -1) -> Float64:
+    """Mean of the middle half: floor(n / 4) values are left out at either end, none of fewer than four.
+
+    It is what Agarwal et al. (2021) advise for few runs: less noisy than the median, less bent by one failed
+    run than the mean.
+
+    Raises:
+        InvalidInputError: There is no value.
+    """
+    series = np.asarray(values, dtype=np.float64)
+    if series.shape[axis] == 0:
+        raise InvalidInputError("an interquartile mean needs one value or more, got none")
+    return np.asarray(stats.trim_mean(series, 0.25, axis=axis), dtype=np.float64)
+
+
+def interquartile_interval(strata: Sequence[ArrayLike], confidence: float = 0.95, seed: int = 0) -> Interval:
+    """Interquartile mean of all values, with the percentile interval of a stratified bootstrap.
+
+    Args:
+        strata: The runs' scores, one sequence per task; runs are redrawn within their task only.
+        confidence: Probability that the interval is made for.
+        seed: Seed of the redrawing.
+
+    Raises:
+        InvalidInputError: A task has no score.
+    """
+    tasks = [np.asarray(values, dtype=np.float64) for values in strata]
+    if not tasks or min(len(values) for values in tasks) == 0:
+        raise InvalidInputError("every task needs the score of one run or more")
+    estimate = float(interquartile_mean(np.concatenate(tasks)))
+    low, high = _interquartile_bounds(tasks, confidence, RESAMPLES, seed)
+    if low is None or high is None:
+        return Interval(estimate=estimate, low=None, high=None)
+    return Interval(estimate=estimate, low=float(low), high=float(high))
+
+
+def interquartile_band(runs: Float64, resamples: int = 1000) -> tuple[Float64, Float64]:
+    """Pointwise 95 % bootstrap interval of the interquartile mean over several runs.
+
+    Args:
+        runs: Shape (runs, points).
+        resamples: How often to redraw the runs.
+
+    Returns:
+        Lower and upper ends, the mean itself for a single run. Shape (points,) each.
+    """
+    low, high = _interquartile_bounds([runs], 0.95, resamples, 0)
+    if low is None or high is None:
+        mean = interquartile_mean(runs, axis=0)
+        return mean, mean
+    return low, high
 
 
 def mcnemar_p(only_a: int, only_b: int) -> float:
     """Two-sided exact McNemar test: under the null each discordant episode is a fair coin's throw.
-
-    The p-value is twice the binomial tail of the smaller count, at most 1 (McNemar 1947; exact form: Fagerland,
-    Lydersen and Laake 2013).
 
     Raises:
         InvalidInputError: A count is negative.
     """
     if only_a < 0 or only_b < 0:
         raise InvalidInputError(f"counts must be 0 or more, got {only_a} and {only_b}")
-    trials, fewer = only_a + only_b, min(only_a, only_b)
-    tail = sum(math.comb(trials, k) for k in range(fewer + 1))
-    # Integers keep the tail exact for thousands of trials, where 0.5 ** n would vanish.
-    return min(float(2 * tail / 2**trials), 1.0)
+    if only_a + only_b == 0:
+        return 1.0
+    return float(stats.binomtest(only_a, only_a + only_b, 0.5).pvalue)
 
 
 def sign_flip_p(differences: ArrayLike, seed: int = 0) -> float:
@@ -75,20 +158,28 @@ def sign_flip_p(differences: ArrayLike, seed: int = 0) -> float:
         seed: Of the random flips.
 
     Returns:
-        The share of sign flips, the observed one among them, whose mean is as far from zero.
+        The share of sign flips whose mean is as far from zero as the observed one. All flips are counted where there
+        are at most `RESAMPLES`, otherwise that many random ones and the observed one, so that it is never 0.
     """
     series = np.asarray(differences, dtype=np.float64)
     series = series[series != 0.0]
-    if len(series) == 0:
-        return 1.0
-    observed = abs(series.sum())
-    rng = np.random.default_rng(seed)
-    as_far = 1
-    for first in range(0, RESAMPLES, 1000):
-        count = min(1000, RESAMPLES - first)
-        signs = rng.integers(0, 2, (count, len(series)), dtype=np.int8) * 2 - 1
-        as_far += int((np.abs(signs @ series) >= observed * (1.0 - 1e-12)).sum())
-    return as_far / (RESAMPLES + 1)
+    if len(series) < 2:
+        return 1.0  # Both signs of a single difference are as far from zero.
+
+    def distance(values: Float64, axis: int) -> Float64:
+        return np.asarray(np.abs(values.mean(axis=axis)))
+
+    result = stats.permutation_test(
+        (series,),
+        distance,
+        permutation_type="samples",
+        n_resamples=RESAMPLES,
+        batch=BATCH,
+        alternative="greater",
+        vectorized=True,
+        rng=np.random.default_rng(seed),
+    )
+    return float(result.pvalue)
 
 
 def paired_test(
@@ -126,10 +217,41 @@ def paired_test(
     )
 
 
-def _resampled_means(series: NDArray[np.float64], rng: np.random.Generator) -> NDArray[Any]:
-    """Means of resamples with replacement, a block at a time so that thousands of episodes fit in memory."""
-    blocks = []
-    for first in range(0, RESAMPLES, 500):
-        rows = rng.integers(0, len(series), (min(500, RESAMPLES - first), len(series)))
-        blocks.append(series[rows].mean(axis=1))
-    return np.concatenate(blocks)
+def _interquartile_bounds(
+    strata: Sequence[Float64], confidence: float, resamples: int, seed: int
+) -> tuple[Any, Any]:
+    """Bounds of the interquartile mean over runs, the first axis; None where every stratum has one run."""
+    redrawn = [runs for runs in strata if len(runs) > 1]
+    if not redrawn:
+        return None, None
+    single = [runs for runs in strata if len(runs) == 1]
+
+    def statistic(*samples: Float64, axis: int) -> Float64:
+        fixed = [np.broadcast_to(np.moveaxis(runs, 0, -1), (*samples[0].shape[:-1], 1)) for runs in single]
+        return interquartile_mean(np.concatenate([*samples, *fixed], axis=axis), axis=axis)
+
+    return _percentile_interval(
+        [np.moveaxis(runs, 0, -1) for runs in redrawn], statistic, confidence, resamples, seed
+    )
+
+
+def _percentile_interval(
+    samples: Sequence[Float64],
+    statistic: Any,
+    confidence: float,
+    resamples: int,
+    seed: int,
+    batch: int | None = None,
+) -> tuple[Any, Any]:
+    interval = stats.bootstrap(
+        samples,
+        statistic,
+        n_resamples=resamples,
+        batch=batch,
+        axis=-1,
+        confidence_level=confidence,
+        vectorized=True,
+        method="percentile",
+        rng=np.random.default_rng(seed),
+    ).confidence_interval
+    return interval.low, interval.high

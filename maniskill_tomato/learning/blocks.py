@@ -1,9 +1,7 @@
 """Data made in blocks by several processes, each kept in a file of its own, so that what is there is not made again."""
 
 import io
-import multiprocessing
 from collections.abc import Callable, Sequence
-from concurrent.futures import Future, ProcessPoolExecutor, as_completed
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -12,6 +10,7 @@ import torch
 from torch import Tensor
 
 from maniskill_tomato.files import read_tensors, write_atomically
+from maniskill_tomato.worker_pool import run_jobs
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -45,25 +44,8 @@ def run_blocks(blocks: Sequence[Block], jobs: int, report: Callable[[str], None]
         CheckpointError: A file cannot be written.
     """
     missing = [block for block in blocks if not block.path.is_file()]
-    if jobs == 1 or not missing:
-        for done, block in enumerate(missing, start=1):
-            report(_told(block, _make(block), done, len(missing)))
-        return
-    # ManiSkill and Warp start once in each process, which must not be a fork of one that has them.
-    context = multiprocessing.get_context("spawn")
-    with ProcessPoolExecutor(min(jobs, len(missing)), mp_context=context) as pool:
-        futures: dict[Future[int], Block] = {pool.submit(_run_block, block): block for block in missing}
-        for done, future in enumerate(as_completed(futures), start=1):
-            report(_told(futures[future], future.result(), done, len(missing)))
-
-
-def _told(block: Block, rows: int, done: int, count: int) -> str:
-    return f"{block.path.name}: {rows} rows ({done} of {count} blocks)"
-
-
-def _run_block(block: Block) -> int:
-    torch.set_num_threads(1)
-    return _make(block)
+    for done, (block, rows) in enumerate(run_jobs(_make, missing, jobs), start=1):
+        report(f"{block.path.name}: {rows} rows ({done} of {len(missing)} blocks)")
 
 
 def _make(block: Block) -> int:

@@ -1,8 +1,6 @@
 """Depth images with labels by ray casting: what a camera with a perfect segmenter sees, without a renderer."""
 
-from dataclasses import dataclass
-from enum import IntEnum
-from typing import Any, Final
+from typing import Any
 
 import torch
 import warp as wp
@@ -11,34 +9,10 @@ from torch import Tensor
 from maniskill_tomato.errors import InvalidInputError
 from maniskill_tomato.raycast import image_kernels, view_ray_kernels
 from maniskill_tomato.raycast.caster import VisibilityCaster
+from maniskill_tomato.raycast.images import BACKGROUND_DEPTH, CastImages
 from maniskill_tomato.raycast.view_buffers import make_view
 from maniskill_tomato.robot.d435 import CameraIntrinsics
 from maniskill_tomato.robot.iiwa14 import LINK_NAMES
-
-BACKGROUND_DEPTH: Final = 4.0
-"""Depth of a pixel that shows neither plant nor robot, in [m]: somewhere in a greenhouse there is always a wall."""
-
-
-class PixelLabel(IntEnum):
-    """What a pixel shows."""
-
-    NOTHING = 0
-    """The background."""
-    TARGET = 1
-    """The target fruit."""
-    PLANT = 2
-    """A leaf, a stem or another fruit."""
-    ROBOT = 3
-
-
-@dataclass(frozen=True, eq=False)
-class CastImages:
-    """B images."""
-
-    depth: Tensor
-    """Along the optical axis, in [m]; `BACKGROUND_DEPTH` for the background. Shape (B, H, W)."""
-    label: Tensor
-    """Values of `PixelLabel`, int8. Shape (B, H, W)."""
 
 
 class ImageCaster:

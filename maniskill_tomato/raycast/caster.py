@@ -18,7 +18,6 @@ holds the camera. It has no silhouette then, and T is that of such a sphere stra
 """
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -33,6 +32,7 @@ from maniskill_tomato.raycast import kernels
 from maniskill_tomato.raycast.lattice import ray_lattice
 from maniskill_tomato.raycast.meshes import PlantMeshCache, PlantMeshes, build_mesh
 from maniskill_tomato.raycast.view_buffers import make_view
+from maniskill_tomato.raycast.visibility import Visibility
 from maniskill_tomato.robot.d435 import CameraIntrinsics
 from maniskill_tomato.robot.iiwa14 import LINK_NAMES
 from maniskill_tomato.warp_runtime import start_warp
@@ -42,43 +42,6 @@ LinkMeshes = Mapping[str, tuple[NDArray[Any], NDArray[Any]]]
 
 _COARSE_RAYS_PER_SIDE = 6
 _FAR_AWAY = 1.0e6
-
-
-@dataclass(frozen=True, eq=False)
-class Visibility:
-    """What the camera of each environment sees of its target."""
-
-    rows: Tensor
-    """The answers below, one row each, float32. Shape (8, B)."""
-
-    @property
-    def visible_fraction(self) -> Tensor:
-        """V_f = V / T (Eq. 4-4), in [0, 1]. Shape (B,)."""
-        return self.rows[0]
-
-    @property
-    def visible(self) -> Tensor:
-        """V: visible area of the target, in [px] of the configured camera. Shape (B,)."""
-        return self.rows[1]
-
-    @property
-    def total(self) -> Tensor:
-        """T: area of the target's whole silhouette, in [px] of the configured camera. Shape (B,)."""
-        return self.rows[2]
-
-    @property
-    def any_visible(self) -> Tensor:
-        """Whether the target or another ripe fruit of the plant is seen by any ray, bool. Shape (B,)."""
-        return self.rows[3] > 0.5
-
-    @property
-    def occluders(self) -> Tensor:
-        """The hidden part of T by what hides it: image edge, leaf or stem, other fruit, robot. Shape (B, 4).
-
-        Fractions of T: each row and the visible fraction add up to 1. What lies outside the image counts for
-        the edge alone, what a link hides for the robot alone, the rest for the organ nearest to the camera.
-        """
-        return self.rows[4:8].T
 
 
 class VisibilityCaster:

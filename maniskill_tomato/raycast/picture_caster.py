@@ -1,7 +1,6 @@
 """Pictures by ray casting at the meshes of a `VisibilityCaster`: depth, labels and shading, without a renderer."""
 
-from dataclasses import dataclass
-from typing import Any, Final
+from typing import Any
 
 import numpy as np
 import torch
@@ -12,28 +11,12 @@ from torch import Tensor
 from maniskill_tomato.errors import InvalidInputError
 from maniskill_tomato.raycast import picture_kernels
 from maniskill_tomato.raycast.caster import VisibilityCaster
+from maniskill_tomato.raycast.images import Picture
 from maniskill_tomato.raycast.meshes import FRUIT_CLASSES
 from maniskill_tomato.robot.d435 import CAMERA_FAR, CameraIntrinsics
 from maniskill_tomato.robot.iiwa14 import LINK_NAMES
 
-ROBOT_LABEL: Final = int(picture_kernels.ROBOT)
-"""Label of the robot."""
-FIRST_ORGAN_LABEL: Final = int(picture_kernels.FIRST_FACE_LABEL)
-"""Label of the plant's organ 0; organ k has this plus k."""
-
 _FAR_AWAY = 1.0e6
-
-
-@dataclass(frozen=True, eq=False)
-class Picture:
-    """What a pinhole camera sees, exactly; H x W pixels, one ray through the middle of each."""
-
-    depth: NDArray[np.float32]
-    """Along the optical axis, in [m], 0 where there is nothing. Shape (H, W)."""
-    labels: NDArray[np.int32]
-    """0 nothing, `ROBOT_LABEL`, or `FIRST_ORGAN_LABEL` plus the index in `Plant.organs`. Shape (H, W)."""
-    facing: NDArray[np.float32]
-    """Cosine of the angle between ray and surface, 1 where one looks straight at it. Shape (H, W)."""
 
 
 class PictureCaster:

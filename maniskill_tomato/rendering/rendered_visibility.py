@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from maniskill_tomato.plants.generator import generate_plant
 from maniskill_tomato.plants.organs import Plant
-from maniskill_tomato.raycast.caster import VisibilityCaster
+from maniskill_tomato.raycast.scene import RayScene
 from maniskill_tomato.rendering.plant_actors import build_plant_actors
 from maniskill_tomato.robot.d435 import CAMERA_NEAR, R_CAMERA_OPTICAL, CameraIntrinsics
 
@@ -176,7 +176,7 @@ def compare(
     Args:
         num_plants: The presets take turns; plants have the seeds from `seed` on.
         views_per_plant: Random views of each.
-        rays_per_side: As for `VisibilityCaster`.
+        rays_per_side: As for `RayScene`.
         seed: Which plants and views.
         on_plant: Called with the number of finished plants.
 
@@ -188,13 +188,11 @@ def compare(
     for index in range(num_plants):
         plant = generate_plant(_PRESETS[index % len(_PRESETS)], seed + index, "training")
         segmented = SegmentedPlant(plant, COMPARISON_INTRINSICS)
-        caster = VisibilityCaster(
-            plants=[plant], intrinsics=COMPARISON_INTRINSICS, rays_per_side=rays_per_side
-        )
+        scene = RayScene([plant], COMPARISON_INTRINSICS, rays_per_side=rays_per_side)
         for _ in range(views_per_plant):
             target, pose = random_view(plant, rng)
             visible, total = segmented.count(pose, target)
-            seen = caster.cast(
+            seen = scene.visibility(
                 torch.from_numpy(pose.astype(np.float32))[None],
                 torch.tensor([target]),
                 torch.eye(4)[None],

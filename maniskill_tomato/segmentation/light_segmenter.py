@@ -17,9 +17,9 @@ from maniskill_tomato.segmentation.fruit_network import (
     STRIDE,
     FruitMaps,
     FruitNetwork,
-    FruitNetworkConfig,
     place_centres,
 )
+from maniskill_tomato.segmentation.fruit_network_config import FruitNetworkConfig
 from maniskill_tomato.segmentation.fruit_session import FruitSession
 from maniskill_tomato.segmentation.instances import (
     FRUIT_CATEGORIES,

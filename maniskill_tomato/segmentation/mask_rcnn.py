@@ -20,7 +20,8 @@ from torchvision.ops.feature_pyramid_network import FeaturePyramidNetwork, LastL
 from torchvision.ops.misc import FrozenBatchNorm2d
 
 from maniskill_tomato.errors import MissingWeightsError
-from maniskill_tomato.segmentation.efficientnet_lite import FEATURE_WIDTHS, FIXED_BLOCKS, EfficientNetLite0
+from maniskill_tomato.segmentation.efficientnet_lite import FEATURE_WIDTHS, EfficientNetLite0
+from maniskill_tomato.segmentation.fruit_network_config import FIXED_BLOCKS
 from maniskill_tomato.segmentation.training.detector_presets import MaskRcnnConfig
 
 ASPECT_RATIOS = (0.5, 1.0, 2.0)

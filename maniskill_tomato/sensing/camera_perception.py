@@ -1,258 +1,175 @@
-"""Perception in the loop: V_f, the target's place and the rays' labels from a camera image instead of the simulator.
+"""From the frames of N cameras to what is known of their targets: V_f, position, rays about it.
 
-Depth is the D435's with its faults; masks are a perfect segmenter's or, rendered colours given, a trained one's; V and
-T come from an occlusion model. Depth and labels are cast, so that without colours no Vulkan device is needed.
+Simulated worlds and the robot use the same class; what differs is who takes the frames.
 """
 
-from collections.abc import Callable
-from typing import Final, Literal
+from collections.abc import Sequence
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
-from maniskill_tomato.raycast.cast_image import ImageCaster, PixelLabel
-from maniskill_tomato.raycast.caster import VisibilityCaster
-from maniskill_tomato.raycast.view_rays import DEPTH_MODE, ViewRays, sample_view
-from maniskill_tomato.robot.d435 import CameraIntrinsics, color_intrinsics
-from maniskill_tomato.robot.depth_noise import DepthNoise, measure_depth
-from maniskill_tomato.segmentation.instances import TOMATO
-from maniskill_tomato.segmentation.masks import BinaryMask
-from maniskill_tomato.segmentation.segmenter import Segmenter, make_segmenter
+from maniskill_tomato.errors import InvalidInputError
+from maniskill_tomato.raycast.view_rays import RAYS_PER_SIDE, RayLabel, ViewRays
+from maniskill_tomato.sensing.fruit_detector import FruitDetector
+from maniskill_tomato.sensing.measurement import Measurement, Position
+from maniskill_tomato.sensing.observation import ViewpointObserver
+from maniskill_tomato.sensing.posed_frame import PosedFrame
 from maniskill_tomato.sensing.target_tracker import TargetTracker
-from maniskill_tomato.sensing.visible_fraction.estimate import (
-    Estimate,
-    Float64,
-    OcclusionModel,
-    TomatoView,
-    UInt8,
-    fruit_depth,
+
+_NO_RAYS = ViewRays(
+    torch.tensor([0.0, 0.0, 1.0]).expand(1, RAYS_PER_SIDE**2, 3),
+    torch.zeros(1, RAYS_PER_SIDE**2),
+    torch.full((1, RAYS_PER_SIDE**2), int(RayLabel.OUTSIDE), dtype=torch.int8),
 )
-from maniskill_tomato.sensing.visible_fraction.improved import ImprovedModel
-from maniskill_tomato.sensing.visible_fraction.sphere import SphereConfig, SphereModel
-from maniskill_tomato.sensing.visible_fraction.thesis import ThesisModel
-
-Perception = Literal["ground_truth", "occlusion_model", "thesis_model", "improved_model", "segmenter"]
-"""What reward, observation and the target's position come from.
-
-`occlusion_model`: `SphereModel` on a perfect mask and noisy depth. `thesis_model`, `improved_model`: those models on
-the same and rendered colours. `segmenter`: the light segmenter's masks in rendered colours, then `SphereModel`."""
-
-RENDERED: Final[tuple[Perception, ...]] = ("thesis_model", "improved_model", "segmenter")
-"""Those that need colours, and so a renderer."""
-
-IMAGE_SIZE: Final = (320, 240)
-"""Width and height of cast images, in [px]."""
-
-RENDERED_SIZE: Final = (640, 480)
-"""Width and height of rendered ones unless `sensor_configs` says otherwise, in [px]: the camera's own."""
-
-MIN_SEEN: Final = 12
-"""Pixels of the target in which it counts as seen."""
-
-COARSE_POSITION: Final = 0.03
-"""Standard deviation of each coordinate of a target's position before it was first seen, in [m]: that of a map of the
-row made from further away."""
-
-USUAL_RADIUS: Final = 0.029
-"""Median radius of the tasks' tomatoes, in [m]."""
 
 
 class CameraPerception:
-    """What a wrist camera tells of the targets of B environments."""
+    """Measures the frames of N environments and follows one target in each."""
 
     def __init__(
         self,
-        caster: VisibilityCaster,
+        num_envs: int,
+        detector: FruitDetector,
         *,
-        intrinsics: CameraIntrinsics | None = None,
-        noise: DepthNoise | None = None,
-        model: OcclusionModel | None = None,
-        segmenter: Segmenter | None = None,
-        picture: Callable[[int], UInt8] | None = None,
+        identity_known: bool = False,
+        device: str | torch.device = "cpu",
     ) -> None:
-        """Begins with all targets where they are.
+        """Begins with all targets at the origin.
 
         Args:
-            caster: The environments' plants and links.
-            intrinsics: Of the images; `IMAGE_SIZE` of the colour camera if None.
-            noise: Faults of the depth, the defaults if None.
-            model: Estimates V_f; if None a sphere model that knows the size of the tasks' tomatoes.
-            segmenter: Finds fruits in colours; if None masks are perfect.
-            picture: Renders the colours of an environment by its index, shape (height, width, 3); if None they are
-                black.
+            num_envs: Number of environments N.
+            detector: Finds and measures fruits.
+            identity_known: Whether frames hold no fruit but the target, so that none can be mistaken for it.
+            device: Where tensors live.
         """
-        self._images = ImageCaster(caster, intrinsics or color_intrinsics(*IMAGE_SIZE))
-        self._noise = noise or DepthNoise()
-        self._model = model or SphereModel(SphereConfig(radius_m=USUAL_RADIUS, radius_spread=0.14))
-        self._segmenter, self._picture = segmenter, picture
-        b, device = caster.num_envs, caster.device
-        self._rng = [np.random.default_rng(0) for _ in range(b)]
-        self._hidden_below: list[float | None] = [None] * b
-        self._choices = [TargetTracker() for _ in range(b)]
-        self._offset = torch.zeros(b, 3, device=device)
-        self.located = torch.zeros(b, dtype=torch.bool, device=device)
-        """Whether the camera has seen where the target is. Shape (B,)."""
-        self.visible_fraction = torch.zeros(b, device=device)
-        """V_f of the last look as the model estimates it, 0 for a target that is not seen. Shape (B,)."""
-        self._seen_at = torch.zeros(b, 3, device=device)
-        self._depth: list[Float64] = []
-        self._mask: list[BinaryMask] = []
-        self._robot: list[BinaryMask] = []
+        self.num_envs = num_envs
+        self.detector = detector
+        """Finds and measures fruits."""
+        self._identity_known = identity_known
+        self._device = torch.device(device)
+        self._trackers = [TargetTracker(np.zeros(3)) for _ in range(num_envs)]
+        self._views: list[list[Measurement]] = [[] for _ in range(num_envs)]
+        self._fruit: list[int | None] = [None] * num_envs
 
-    def begin(self, env_index: int, rng: np.random.RandomState, hidden_below: float | None = None) -> None:
-        """Begins an episode; `forget` comes next.
+    def begin(
+        self,
+        env_index: int,
+        position_w: Position,
+        *,
+        is_located: bool = False,
+        hidden_below: float | None = None,
+    ) -> None:
+        """Forgets an environment's views and begins with a new target.
 
         Args:
             env_index: Which environment's.
-            rng: Where the number that its errors follow from is drawn.
-            hidden_below: Its first view shows less of its first target than this V_f; None if that is not known.
+            position_w: As for `TargetTracker`, like the others. Shape (3,).
+            is_located: Whether it was measured.
+            hidden_below: The first view shows less of the target than this V_f; None if that is not known.
         """
-        self._rng[env_index] = np.random.default_rng(int(rng.randint(2**31 - 1)))
-        self._hidden_below[env_index] = hidden_below
+        self._trackers[env_index] = TargetTracker(
+            position_w,
+            is_located=is_located,
+            hidden_below=hidden_below,
+            identity_known=self._identity_known,
+        )
+        self.forget_views(env_index)
 
-    def forget(self, env_idx: Tensor) -> None:
-        """Begins with other targets, which are known from afar only. Shape (b,)."""
-        for k in (int(i) for i in env_idx):
-            offset = self._rng[k].normal(0.0, COARSE_POSITION, 3)
-            self._offset[k] = torch.as_tensor(offset).to(self._offset)
-            self._choices[k], self._hidden_below[k] = TargetTracker(self._hidden_below[k]), None
-        self.located[env_idx] = False
+    def forget_views(self, env_index: int) -> None:
+        """Forgets an environment's views but not where its target is believed to be."""
+        self._views[env_index] = []
+        self._fruit[env_index] = None
 
-    def known_target(self, target_position: Tensor) -> Tensor:
-        """Where targets are believed to be, given where they are. Shape (B, 3)."""
-        return target_position + self._offset
-
-    def look(
-        self, T_world_camera: Tensor, target: Tensor, known: Tensor, T_world_plant: Tensor, links: Tensor
-    ) -> None:
-        """Takes images and estimates V_f.
+    def look(self, frames: Sequence[PosedFrame | None]) -> Tensor:
+        """Measures new frames and finds the targets in them.
 
         Args:
-            T_world_camera: Poses of the optical frames. Shape (B, 4, 4).
-            target: Indices of the targets in `Plant.fruits`. Shape (B,).
-            known: Where the targets are believed to be. Shape (B, 3).
-            T_world_plant: Poses of the plants. Shape (B, 4, 4).
-            links: World poses of the links. Shape (B, 9, 4, 4).
-        """
-        images = self._images.cast(T_world_camera, target, T_world_plant, links)
-        i = self._images.intrinsics
-        self._depth, self._mask, self._robot = [], [], []
-        for k in range(len(self._rng)):
-            true = images.depth[k].cpu().numpy().astype(np.float64)
-            depth = measure_depth(true, i, self._noise, self._rng[k], stereo=DEPTH_MODE)
-            pose = T_world_camera[k].double().cpu().numpy()
-            rgb = np.zeros((i.height, i.width, 3), np.uint8) if self._picture is None else self._picture(k)
-            masks, kinds = self._found(rgb, depth, (images.label[k] == int(PixelLabel.TARGET)).cpu().numpy())
-            estimates = self._model(TomatoView(rgb=rgb, depth_m=depth, masks=tuple(masks), intrinsics=i))
-            centres = [
-                _in_world(estimate, mask, depth, i, pose)
-                for estimate, mask in zip(estimates, masks, strict=True)
-            ]
-            if self._segmenter is None:
-                chosen = 0 if masks else None
-            else:
-                fractions = [estimate.visible_fraction for estimate in estimates]
-                believed = known[k].double().cpu().numpy()
-                chosen = self._choices[k].choose(centres, fractions, kinds, believed, bool(self.located[k]))
-            self._depth.append(depth)
-            self._robot.append((images.label[k] == int(PixelLabel.ROBOT)).cpu().numpy())
-            self._mask.append(np.zeros(depth.shape, bool) if chosen is None else masks[chosen])
-            fraction = 0.0 if chosen is None else estimates[chosen].visible_fraction
-            self.visible_fraction[k] = fraction if np.isfinite(fraction) else 0.0
-            self._seen_at[k] = float("nan")
-            if chosen is not None and (centre := centres[chosen]) is not None:
-                self._seen_at[k] = torch.as_tensor(centre).to(self._seen_at)
-
-    def _found(
-        self, rgb: UInt8, depth_m: Float64, target_mask: BinaryMask
-    ) -> tuple[list[BinaryMask], list[str]]:
-        """Masks and kinds of the fruits that can be seen; of the target alone where masks are perfect."""
-        masks, kinds = [target_mask], [TOMATO]
-        if self._segmenter is not None:
-            found = self._segmenter(rgb, depth_m.astype(np.float32))
-            masks, kinds = list(found.masks), list(found.categories)
-        seen = [n for n, mask in enumerate(masks) if np.count_nonzero(mask) >= MIN_SEEN]
-        return [masks[n] for n in seen], [kinds[n] for n in seen]
-
-    def locate(self, target_position: Tensor) -> Tensor:
-        """Takes the position from the last look for the targets that were first seen in it.
-
-        Args:
-            target_position: Where targets are, in the world frame, in [m]. Shape (B, 3).
+            frames: One for each environment, None for those that do not look.
 
         Returns:
-            Which targets these are. Shape (B,), bool.
-        """
-        new = ~self.located & self._seen_at.isfinite().all(-1)
-        self._offset = torch.where(new[:, None], self._seen_at - target_position, self._offset)
-        self.located = self.located | new
-        return new
+            The environments whose target was first located in this view: what they have seen before should be taken
+            in again, about the new position, with `recall`. Shape (N,), bool.
 
-    def rays(self, T_world_camera: Tensor, target_position: Tensor) -> ViewRays:
-        """The pattern read from the last images.
+        Raises:
+            InvalidInputError: The number of frames is wrong, or one lacks what segmentation needs.
+        """
+        if len(frames) != self.num_envs:
+            raise InvalidInputError(
+                f"frames must be {self.num_envs}, one for each environment; got {len(frames)}"
+            )
+        located = self.is_located
+        for k, frame in enumerate(frames):
+            if frame is not None:
+                self.add(k, self.detector.measure(frame))
+        return self.is_located & ~located
+
+    def add(self, env_index: int, measurement: Measurement) -> None:
+        """Takes in a view that was measured already."""
+        self._views[env_index].append(measurement)
+        self._fruit[env_index] = self._trackers[env_index].update(measurement)
+
+    def views(self, env_index: int) -> Sequence[Measurement]:
+        """All views of an environment's target so far, in order."""
+        return self._views[env_index]
+
+    def target_fruit(self, env_index: int) -> int | None:
+        """Index of the target among the fruits of the last view; None if it does not show it."""
+        return self._fruit[env_index]
+
+    @property
+    def is_located(self) -> Tensor:
+        """Whether the camera has measured where the targets are. Shape (N,), bool."""
+        return torch.tensor([tracker.is_located for tracker in self._trackers], device=self._device)
+
+    @property
+    def target_position(self) -> Tensor:
+        """Where targets are believed to be, world frame, in [m]. Shape (N, 3), float32."""
+        positions = np.stack([tracker.position_w for tracker in self._trackers])
+        return torch.as_tensor(positions, dtype=torch.float32, device=self._device)
+
+    @property
+    def visible_fraction(self) -> Tensor:
+        """V_f of the targets in the last views, 0 for one that is not seen. Shape (N,), float32."""
+        fractions = [0.0] * self.num_envs
+        for k, fruit in enumerate(self._fruit):
+            if fruit is not None and np.isfinite(v := self._views[k][-1].fruits[fruit].visible_fraction):
+                fractions[k] = v
+        return torch.tensor(fractions, dtype=torch.float32, device=self._device)
+
+    def rays(self) -> ViewRays:
+        """The pattern about the believed positions, read from the last views; OUTSIDE where there is none yet."""
+        last = [views[-1] if views else None for views in self._views]
+        return self._rays(list(zip(last, self._fruit, strict=True)))
+
+    def recall(self, observer: ViewpointObserver, env_idx: Tensor) -> None:
+        """Begins the memory of some environments anew about where their targets are believed to be now, and takes in
+        what was seen before the last view.
 
         Args:
-            T_world_camera: As for `look`. Shape (B, 4, 4).
-            target_position: Where the targets are believed to be. Shape (B, 3).
+            observer: Whose memory.
+            env_idx: Which environments. Shape (b,).
         """
+        observer.begin(env_idx, self.target_position[env_idx])
+        rows = [int(i) for i in env_idx]
+        poses = torch.eye(4, device=self._device).repeat(self.num_envs, 1, 1)
+        for k in range(max((len(self._views[i]) - 1 for i in rows), default=0)):
+            seen: list[tuple[Measurement | None, int | None]] = [(None, None)] * self.num_envs
+            for i in rows:
+                if k < len(self._views[i]) - 1:
+                    view = self._views[i][k]
+                    seen[i] = (view, self._trackers[i].find(view))
+                    poses[i] = torch.as_tensor(view.frame.T_world_camera).to(poses)
+            mask = torch.tensor([view is not None for view, _ in seen], device=self._device)
+            observer.memory.integrate(poses, self._rays(seen), mask)
+
+    def _rays(self, seen: Sequence[tuple[Measurement | None, int | None]]) -> ViewRays:
         parts = [
-            sample_view(
-                self._depth[k],
-                self._mask[k],
-                self._images.intrinsics,
-                T_world_camera[k],
-                target_position[k],
-                self._robot[k],
-            )
-            for k in range(len(self._depth))
+            _NO_RAYS if view is None else view.rays(tracker.position_w, fruit)
+            for tracker, (view, fruit) in zip(self._trackers, seen, strict=True)
         ]
         return ViewRays(
-            torch.cat([p.direction_c for p in parts]),
-            torch.cat([p.distance for p in parts]),
-            torch.cat([p.label for p in parts]),
+            torch.cat([part.direction_c for part in parts]).to(self._device),
+            torch.cat([part.distance for part in parts]).to(self._device),
+            torch.cat([part.label for part in parts]).to(self._device),
         )
-
-
-def make_perception(
-    perception: Perception,
-    caster: VisibilityCaster,
-    intrinsics: CameraIntrinsics,
-    picture: Callable[[int], UInt8],
-) -> CameraPerception | None:
-    """The camera of a kind of perception; None for ground truth.
-
-    Args:
-        perception: Which.
-        caster: The environments' plants and links.
-        intrinsics: Of rendered pictures.
-        picture: Renders them, by the index of an environment.
-    """
-    if perception == "ground_truth":
-        return None
-    if perception == "occlusion_model":
-        return CameraPerception(caster)
-    if perception == "segmenter":
-        return CameraPerception(
-            caster, intrinsics=intrinsics, segmenter=make_segmenter("light"), picture=picture
-        )
-    model = ThesisModel() if perception == "thesis_model" else ImprovedModel()
-    return CameraPerception(caster, intrinsics=intrinsics, model=model, picture=picture)
-
-
-def _in_world(
-    estimate: Estimate, mask: BinaryMask, depth_m: Float64, intrinsics: CameraIntrinsics, pose: Float64
-) -> Float64 | None:
-    """Where a fruit is, in [m], shape (3,): as the model says, or a usual radius behind the middle of its mask."""
-    optical: NDArray[np.float64]
-    if estimate.centre_optical is not None:
-        optical = np.array(estimate.centre_optical)
-    else:
-        z = fruit_depth(depth_m, mask)
-        if not np.isfinite(z):
-            return None
-        rows, columns = np.nonzero(mask)
-        pixel = np.array([columns.mean() + 0.5, rows.mean() + 0.5])
-        optical = intrinsics.ray_directions(pixel) * (z + 0.7 * USUAL_RADIUS)
-    return np.asarray(pose[:3, :3] @ optical + pose[:3, 3])

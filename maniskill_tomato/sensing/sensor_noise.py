@@ -9,7 +9,8 @@ import torch
 from torch import Tensor
 
 from maniskill_tomato.errors import InvalidInputError
-from maniskill_tomato.raycast.view_rays import ViewRays, disturb
+from maniskill_tomato.raycast.view_rays import ViewRays
+from maniskill_tomato.sensing.view_pattern import disturb
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -56,7 +57,7 @@ class SensorNoise:
 
 
 class SensorErrors:
-    """Draws the errors of one environment object, the same ones for the same seeds."""
+    """Draws the errors of N environments, each from its own random numbers."""
 
     def __init__(self, noise: SensorNoise, num_envs: int, device: torch.device) -> None:
         """Begins without errors.
@@ -67,7 +68,7 @@ class SensorErrors:
             device: Where tensors live.
         """
         self._noise = noise
-        self._generator = torch.Generator(device=device)
+        self._generators = [torch.Generator(device=device) for _ in range(num_envs)]
         self._offset = torch.zeros(num_envs, 3, device=device)
         self._errs_in_rays = any((noise.depth_noise, noise.dropout, noise.false_target, noise.missed_target))
 
@@ -77,25 +78,37 @@ class SensorErrors:
             offset = rng.normal(0.0, self._noise.target_position, 3)
             self._offset[env_index] = torch.as_tensor(offset).to(self._offset)
         if self._errs_in_rays:
-            self._generator.manual_seed(int(rng.randint(2**31 - 1)))
+            self._generators[env_index].manual_seed(int(rng.randint(2**31 - 1)))
 
     def known_target(self, target_position: Tensor) -> Tensor:
         """Where targets are believed to be. Shape (B, 3)."""
         return target_position + self._offset if self._noise.target_position else target_position
 
-    def rays(self, rays: ViewRays) -> ViewRays:
-        """The rays as they are measured."""
+    def rays(self, rays: ViewRays, mask: Tensor | None = None) -> ViewRays:
+        """The rays as they are measured.
+
+        Args:
+            rays: What is there.
+            mask: The environments that look, all if None; the rays of the others stay as they are. Shape (B,), bool.
+        """
         if not self._errs_in_rays:
             return rays
         noise = self._noise
-        return disturb(
-            rays,
-            self._generator,
-            depth_noise=noise.depth_noise,
-            dropout=noise.dropout,
-            false_target=noise.false_target,
-            missed_target=noise.missed_target,
-        )
+        direction_c, distance, label = rays.direction_c.clone(), rays.distance.clone(), rays.label.clone()
+        for k, generator in enumerate(self._generators):
+            if mask is not None and not bool(mask[k]):
+                continue
+            own = slice(k, k + 1)
+            measured = disturb(
+                ViewRays(direction_c[own], distance[own], label[own]),
+                generator,
+                depth_noise=noise.depth_noise,
+                dropout=noise.dropout,
+                false_target=noise.false_target,
+                missed_target=noise.missed_target,
+            )
+            distance[own], label[own] = measured.distance, measured.label
+        return ViewRays(direction_c, distance, label)
 
     def visible_fraction(self, visible_fraction: Tensor) -> Tensor:
         """V_f as it is measured. Shape (B,)."""

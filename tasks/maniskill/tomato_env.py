@@ -17,7 +17,7 @@ from torch import Tensor
 from maniskill_tomato.errors import InvalidInputError, RenderingUnavailableError
 from maniskill_tomato.plants.organs import SemanticClass
 from maniskill_tomato.plants.spec import PlantPose, PlantSpec
-from maniskill_tomato.raycast.caster import VisibilityCaster
+from maniskill_tomato.raycast.scene import RayScene
 from maniskill_tomato.robot.d435 import CameraIntrinsics, T_flange_camera_color_optical
 from maniskill_tomato.robot.description import link_meshes
 from maniskill_tomato.robot.inverse_kinematics import Reach
@@ -99,7 +99,7 @@ class TomatoEnv(BaseEnv):  # type: ignore[misc]
         self._plant_pose_noise = options.check_half_ranges("plant_pose_noise", plant_pose_noise, 3)
         self.motion = motion
         self._rays_per_side = rays_per_side
-        self._has_caster = False
+        self._has_ray_scene = False
         rendering = options.needs_rendering(obs_mode, render_mode) or self._takes_pictures
         render_backend = options.pick_render_backend(render_backend, rendering)
         # A new plant to look at needs new actors, and so a new scene.
@@ -147,15 +147,15 @@ class TomatoEnv(BaseEnv):  # type: ignore[misc]
         self.planting = Planting(
             self.scene, self._choice, seeds, self.device, with_actors=not self._swaps_plants
         )
-        if not self._has_caster:
-            self._has_caster = True
-            self._caster = VisibilityCaster(
-                plants=self.planting.plants,
-                intrinsics=self.camera_intrinsics,
+        if not self._has_ray_scene:
+            self._has_ray_scene = True
+            self._ray_scene = RayScene(
+                self.planting.plants,
+                self.camera_intrinsics,
                 robot_meshes=link_meshes(),
                 rays_per_side=self._rays_per_side,
                 cached_plants=GROWN_PLANTS,
-                device=str(self.device),
+                device=self.device,
             )
             n, device = self.num_envs, self.device
             self._T_ee_camera = torch.tensor(
@@ -167,10 +167,10 @@ class TomatoEnv(BaseEnv):  # type: ignore[misc]
             self._make_tools()
         else:
             for i, plant in enumerate(self.planting.plants):
-                self._caster.replace_plant(i, plant)
+                self._ray_scene.replace_plant(i, plant)
 
     def _make_tools(self) -> None:
-        """Makes what a task needs beside the caster, once."""
+        """Makes what a task needs beside the ray-traced scene, once."""
 
     def _load_lighting(self, options: dict[str, Any]) -> None:
         scenery.light(self.scene, shadows=self.enable_shadow)
@@ -216,7 +216,7 @@ class TomatoEnv(BaseEnv):  # type: ignore[misc]
 
     def _show_plant(self, env_index: int, seed: int) -> None:
         if self._swaps_plants and seed != self.planting.seeds[env_index]:
-            self._caster.replace_plant(env_index, self.planting.replace(env_index, seed))
+            self._ray_scene.replace_plant(env_index, self.planting.replace(env_index, seed))
 
     def _look_up_target(self) -> None:
         rows = torch.arange(self.num_envs, device=self.device)

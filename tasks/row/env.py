@@ -15,16 +15,13 @@ from maniskill_tomato.errors import InvalidInputError
 from maniskill_tomato.plants.episode_list import Episode
 from maniskill_tomato.plants.row import Row, leaf_density_of
 from maniskill_tomato.plants.spec import PlantSpec
-from maniskill_tomato.raycast.cast_views import CastViews
-from maniskill_tomato.raycast.caster import Visibility
-from maniskill_tomato.raycast.clearance import PlantClearance
-from maniskill_tomato.raycast.view_rays import ViewRayCaster
+from maniskill_tomato.raycast.visibility import Visibility
 from maniskill_tomato.robot.kinematics import link_transforms
 from maniskill_tomato.robot.look_at import camera_to_viewpoint
 from maniskill_tomato.sensing.belief import Belief
-from maniskill_tomato.sensing.camera_perception import RENDERED, RENDERED_SIZE, Perception, make_perception
 from maniskill_tomato.sensing.observation import ObservationLayout, ViewpointObserver
 from maniskill_tomato.sensing.sensor_noise import SensorErrors, SensorNoise
+from maniskill_tomato.sensing.simulated_camera import RENDERED, RENDERED_SIZE, Perception, make_camera
 from maniskill_tomato.sensing.true_views import TrueViews
 from maniskill_tomato.tasks import MAX_GENERAL_STEPS, options
 from maniskill_tomato.tasks.maniskill.tomato_env import TomatoEnv
@@ -69,7 +66,7 @@ class TomatoViewpointGeneralEnv(TomatoEnv):
       keeps no errors: taken back, the views are measured anew.
     - `perception`: `"ground_truth"`, or a `Perception` with which V_f, success, reward, the target's position and the
       rays' labels come from a camera image with noisy depth; the info then also has `true_visible_fraction` and
-      `true_success`. Those in `camera_perception.RENDERED` need a renderer, and `segmenter` the extra `perception`.
+      `true_success`. Those in `simulated_camera.RENDERED` need a renderer, and `segmenter` the extra `perception`.
     - `privileged`: whether the observation ends with the truth about the views around (`sensing.true_views`), for
       critics; `belief` never has it.
 
@@ -143,14 +140,10 @@ class TomatoViewpointGeneralEnv(TomatoEnv):
 
     def _make_tools(self) -> None:
         n, device = self.num_envs, self.device
-        self._ray_caster = ViewRayCaster(self._caster)
-        self._cast_views = CastViews(self._caster)
-        self._plant_clearance = PlantClearance(self._caster)
         self._observer = ViewpointObserver(n, device, self.layout, self.task.max_moves)
-        self._hard_starts = HardStarts(self.task, self._cast_views, self._plant_clearance, device)
+        self._hard_starts = HardStarts(self.task, self._ray_scene, device)
         self.ground_truth = GroundTruth(
-            self._cast_views,
-            self._plant_clearance,
+            self._ray_scene,
             planting=lambda: self.planting,
             target=lambda: self._target,
             qpos=lambda: self.agent.robot.get_qpos(),
@@ -158,9 +151,10 @@ class TomatoViewpointGeneralEnv(TomatoEnv):
         )
         """What only the simulator knows; for policies that need the truth."""
         self._errors = SensorErrors(self._sensor_noise, n, device)
-        self._eyes = make_perception(
-            self.perception, self._caster, self.camera_intrinsics, self._wrist_picture
+        self._camera = make_camera(
+            self.perception, self._ray_scene, self.camera_intrinsics, self._wrist_picture
         )
+        self._hidden_below: list[float | None] = [None] * n
         self.soft_starts = 0
         """Episodes so far that no drawn start made as hard as asked for."""
         self._true_views = TrueViews(n, self._observer.lattice) if self._privileged else None
@@ -243,9 +237,10 @@ class TomatoViewpointGeneralEnv(TomatoEnv):
         self._set_arm(env_idx, viewpoint, torch.stack([start.qpos for start in starts]))
         for i, rng, start in zip(indices, rngs, starts, strict=True):
             self._errors.begin(i, rng)
-            if self._eyes is not None:
+            if self._camera is not None:
+                self._camera[0].seed(i, int(rng.randint(2**31 - 1)))
                 hidden = start.is_hard and options.get("camera_position") is None
-                self._eyes.begin(i, rng, self.task.start_visibility[1] if hidden else None)
+                self._hidden_below[i] = self.task.start_visibility[1] if hidden else None
         self._begin(env_idx)
 
     def _start(
@@ -276,7 +271,7 @@ class TomatoViewpointGeneralEnv(TomatoEnv):
         self._path_length[env_idx] = 0.0
         self._gain[env_idx] = 0.0
         qpos = self.agent.robot.get_qpos()
-        clearance = self._plant_clearance.at(qpos, self.planting.T_world_plant)
+        clearance = self._ray_scene.clearance_at(qpos, self.planting.T_world_plant)
         self._clearance[env_idx] = clearance[env_idx]
         self._look_anew(env_idx)
         self._visible_fraction = self._measured_fraction().clone()
@@ -288,8 +283,13 @@ class TomatoViewpointGeneralEnv(TomatoEnv):
 
     def _forget(self, env_idx: Tensor) -> None:
         """Begins with other targets, of which nothing was seen yet."""
-        if self._eyes is not None:
-            self._eyes.forget(env_idx)
+        if self._camera is None:
+            return
+        camera, perception = self._camera
+        for i in env_idx.tolist():
+            position = camera.coarse_position(i, self._target_position_w[i].double().cpu().numpy())
+            perception.begin(i, position, hidden_below=self._hidden_below[i])
+            self._hidden_below[i] = None
 
     def _look_first(self, env_idx: Tensor) -> None:
         self._ask_truth(env_idx)
@@ -313,30 +313,25 @@ class TomatoViewpointGeneralEnv(TomatoEnv):
         self._views[rows, self._view_count[rows].clamp_max(MAX_VIEWS - 1)] = qpos[rows]
         self._view_count[rows] += 1
         self._observe(qpos, mask)
-        if self._eyes is not None:
-            located = self._eyes.locate(self._target_position_w)
-            if mask is not None:
-                located = located & mask
-            if bool(located.any()):
-                # What was seen before stands about the place where the target was thought to be.
-                self._replay(located.nonzero()[:, 0])
 
     def _observe(self, qpos: Tensor, mask: Tensor | None) -> None:
         T_w_links = link_transforms(qpos)
         T_w_camera = T_w_links[:, -1] @ self._T_ee_camera
         T_w_plant = self.planting.T_world_plant
-        self._seen: Visibility = self._caster.cast(T_w_camera, self._target, T_w_plant, T_w_links)
-        known = self._known_target_position()
+        self._seen: Visibility = self._ray_scene.visibility(T_w_camera, self._target, T_w_plant, T_w_links)
         self._camera_position = T_w_camera[:, :3, 3]
-        if self._eyes is None:
-            rays = self._errors.rays(
-                self._ray_caster.cast(T_w_camera, self._target, known, T_w_plant, T_w_links)
-            )
+        if self._camera is None:
+            known = self._errors.known_target(self._target_position_w)
+            exact = self._ray_scene.view_rays(T_w_camera, self._target, known, T_w_plant, T_w_links)
+            rays = self._errors.rays(exact, mask)
             measured = self._errors.visible_fraction(self._seen.visible_fraction)
         else:
-            self._eyes.look(T_w_camera, self._target, known, T_w_plant, T_w_links)
-            rays = self._eyes.rays(T_w_camera, known)
-            measured = self._eyes.visible_fraction.clone()
+            camera, perception = self._camera
+            located = perception.look(camera.take(T_w_camera, self._target, T_w_plant, T_w_links, mask))
+            if bool(located.any()):
+                # What was seen before stands about the place where the target was thought to be.
+                perception.recall(self._observer, located.nonzero()[:, 0])
+            rays, measured = perception.rays(), perception.visible_fraction
         self._observation = self._observer.observe(
             self._viewpoint, T_w_camera, rays, measured, self._moves_left(), mask
         )
@@ -351,11 +346,11 @@ class TomatoViewpointGeneralEnv(TomatoEnv):
 
     def _measured_fraction(self) -> Tensor:
         """V_f that success and reward go by. Shape (num_envs,)."""
-        return self._seen.visible_fraction if self._eyes is None else self._eyes.visible_fraction
+        return self._seen.visible_fraction if self._camera is None else self._camera[1].visible_fraction
 
     def _known_target_position(self) -> Tensor:
-        if self._eyes is not None:
-            return self._eyes.known_target(self._target_position_w)
+        if self._camera is not None:
+            return self._camera[1].target_position
         return self._errors.known_target(self._target_position_w)
 
     def _moves_left(self) -> Tensor:
@@ -386,7 +381,7 @@ class TomatoViewpointGeneralEnv(TomatoEnv):
             The way's length, in [m]. Shape (num_envs,).
         """
         qpos = self.agent.robot.get_qpos()
-        self._clearance = self._plant_clearance.along(before, qpos, self.planting.T_world_plant)
+        self._clearance = self._ray_scene.clearance_along(before, qpos, self.planting.T_world_plant)
         T_w_camera = link_transforms(qpos)[:, -1] @ self._T_ee_camera
         length: Tensor = (T_w_camera[:, :3, 3] - position).norm(dim=-1)
         return length
@@ -395,7 +390,7 @@ class TomatoViewpointGeneralEnv(TomatoEnv):
         """What came of the last move: V_f, whether that is a success, and what the move touched."""
         fraction = self._visible_fraction
         truth = {}
-        if self._eyes is not None:
+        if self._camera is not None:
             seen = self._seen.visible_fraction
             truth = {"true_visible_fraction": seen.clone(), "true_success": seen > self.task.full_visibility}
         return truth | {
@@ -461,6 +456,9 @@ class TomatoViewpointGeneralEnv(TomatoEnv):
     def _replay(self, indices: Tensor) -> None:
         """Looks again from where some environments looked, so that their memory is what it was."""
         self._observer.begin(indices, self._known_target_position()[indices])
+        if self._camera is not None:
+            for i in indices.tolist():
+                self._camera[1].forget_views(i)
         chosen = torch.zeros(self.num_envs, dtype=torch.bool, device=self.device)
         chosen[indices] = True
         count = self._view_count.clamp_max(MAX_VIEWS)

@@ -6,8 +6,7 @@ import torch
 from torch import Tensor
 
 from maniskill_tomato.policies.moves import move_towards
-from maniskill_tomato.raycast.cast_views import CastViews
-from maniskill_tomato.raycast.clearance import PlantClearance
+from maniskill_tomato.raycast.scene import RayScene
 from maniskill_tomato.robot.inverse_kinematics import Reach
 from maniskill_tomato.robot.kinematics import link_transforms
 from maniskill_tomato.robot.look_at_move import LookAtMover
@@ -19,8 +18,7 @@ class GroundTruth:
 
     def __init__(
         self,
-        cast_views: CastViews,
-        clearance: PlantClearance,
+        scene: RayScene,
         planting: Callable[[], Planting],
         target: Callable[[], Tensor],
         qpos: Callable[[], Tensor],
@@ -29,15 +27,13 @@ class GroundTruth:
         """Follows an environment's plants, targets and arms.
 
         Args:
-            cast_views: Casts the rays.
-            clearance: Measures distances.
+            scene: The plants and links.
             planting: Gives the plants as they are now.
             target: Gives the indices of the targets in `Plant.fruits`. Shape (num_envs,).
             qpos: Gives the joint positions, in [rad]. Shape (num_envs, 7).
             threshold: V_f above which the task counts the target as fully visible.
         """
-        self._cast_views = cast_views
-        self._clearance = clearance
+        self._scene = scene
         self._planting = planting
         self._target = target
         self._qpos = qpos
@@ -66,12 +62,12 @@ class GroundTruth:
         links = None if qpos is None else link_transforms(qpos.float())
         target = int(self._target()[env_index]) if fruit is None else fruit
         T_world_plant = self._planting().T_world_plant[env_index]
-        return self._cast_views.visible_fraction(
+        return self._scene.visible_fraction_from(
             T_world_camera.float(), target, T_world_plant, links, env_index
         )
 
     def clearance(self, start_qpos: Tensor, end_qpos: Tensor, env_index: int = 0) -> Tensor:
-        """How near the arm comes to an environment's plants on K moves; see `PlantClearance.along`.
+        """How near the arm comes to an environment's plants on K moves; see `RayScene.clearance_along`.
 
         Args:
             start_qpos: Joint positions, in [rad]. Shape (K, 7).
@@ -84,7 +80,7 @@ class GroundTruth:
         count = len(start_qpos)
         T_world_plant = self._planting().T_world_plant[env_index].expand(count, 4, 4)
         env_idx = torch.full((count,), env_index, device=start_qpos.device)
-        return self._clearance.along(start_qpos.float(), end_qpos.float(), T_world_plant, env_idx)
+        return self._scene.clearance_along(start_qpos.float(), end_qpos.float(), T_world_plant, env_idx)
 
     def can_follow(
         self, start: Tensor, way: Tensor, target: Tensor, env_index: int = 0, *, contact_free: bool = False

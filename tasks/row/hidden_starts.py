@@ -9,8 +9,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from maniskill_tomato.errors import InvalidInputError
-from maniskill_tomato.raycast.cast_views import CastViews
-from maniskill_tomato.raycast.clearance import PlantClearance
+from maniskill_tomato.raycast.scene import RayScene
 from maniskill_tomato.robot.inverse_kinematics import Reach
 from maniskill_tomato.robot.kinematics import link_transforms
 from maniskill_tomato.robot.look_at_move import LookAtMove, LookAtMover
@@ -47,21 +46,18 @@ class HardStarts:
     def __init__(
         self,
         task: GeneralTaskConfig,
-        cast_views: CastViews,
-        clearance: PlantClearance,
+        scene: RayScene,
         device: torch.device,
     ) -> None:
         """Keeps the ranges.
 
         Args:
             task: The task, whose start fields are drawn from.
-            cast_views: Says what is seen.
-            clearance: Says what is touched.
+            scene: Says what is seen and what is touched.
             device: Where results go.
         """
         self._task = task
-        self._cast_views = cast_views
-        self._clearance = clearance
+        self._scene = scene
         self._device = device
         self._low, self._high = np.array(task.start_box).T
         self._mover = LookAtMover(device)
@@ -159,11 +155,11 @@ class HardStarts:
         nearest: tuple[float, Start] | None = None
         for i in range(0, len(all_qpos), AT_ONCE):
             qpos, poses = all_qpos[i : i + AT_ONCE], all_poses[i : i + AT_ONCE]
-            fraction = self._cast_views.visible_fraction(
+            fraction = self._scene.visible_fraction_from(
                 poses, target, T_world_plant, link_transforms(qpos), env_index
             )
             env_idx = torch.full((len(qpos),), env_index, device=self._device)
-            clearance = self._clearance.at(qpos, T_world_plant.expand(len(qpos), 4, 4), env_idx)
+            clearance = self._scene.clearance_at(qpos, T_world_plant.expand(len(qpos), 4, 4), env_idx)
             excess = torch.maximum(low - fraction, fraction - high).clamp_min(0.0)
             is_hard = (fraction >= low) & (fraction < high)
             cost = torch.where(clearance > 0.0, torch.where(is_hard, 0.0, excess + 1e-6), torch.inf)

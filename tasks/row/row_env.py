@@ -191,7 +191,7 @@ class TomatoViewpointRowEnv(TomatoViewpointGeneralEnv):
         legs = len(passed) - 1
         T_w_plant = self.planting.T_world_plant[env_index].expand(legs, 4, 4)
         env_idx = torch.full((legs,), env_index, device=self.device)
-        clearance = self._plant_clearance.along(passed[:-1], passed[1:], T_w_plant, env_idx).min()
+        clearance = self._ray_scene.clearance_along(passed[:-1], passed[1:], T_w_plant, env_idx).min()
         row = torch.arange(self.num_envs, device=self.device) == env_index
         self._clearance = torch.where(row, self._clearance.minimum(clearance), self._clearance)
         self._joint_path = self._joint_path + row * way.joint_path_rad

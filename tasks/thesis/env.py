@@ -104,7 +104,7 @@ class TomatoViewpointEnv(TomatoEnv):
 
     def _judge(self, target: Tensor, T_w_links: Tensor) -> dict[str, Tensor]:
         """The present view as one of `target`, indices in `Plant.fruits`. Shape (num_envs,)."""
-        seen = self._caster.cast(
+        seen = self._ray_scene.visibility(
             T_w_links[:, -1] @ self._T_ee_camera, target, self.planting.T_world_plant, T_w_links
         )
         fraction, tomato_seen = seen.visible_fraction, seen.any_visible

@@ -23,7 +23,8 @@ from maniskill_tomato.deploy.loop_config import Proposal
 from maniskill_tomato.deploy.mock.episode import load_episode
 from maniskill_tomato.deploy.perceive import ImagePerception, View
 from maniskill_tomato.deploy.policies import TASK, default_policy
-from maniskill_tomato.deploy.profile import Profile, load_profile, parse_profile, profile_names
+from maniskill_tomato.deploy.profile import Profile, load_profile, parse_profile
+from maniskill_tomato.deploy.profile_files import profile_names
 from maniskill_tomato.deploy.steps import KeptSteps, RunResult
 from maniskill_tomato.deploy.stops import Stops
 from maniskill_tomato.deploy.workcell import Workcell, make_workcell

@@ -29,7 +29,6 @@ from maniskill_tomato.deploy.steps import KeptSteps, RunResult, Step
 from maniskill_tomato.deploy.stops import Stops
 from maniskill_tomato.deploy.workcell import make_workcell
 from maniskill_tomato.policies.protocol import Planner
-from maniskill_tomato.raycast.picture_caster import PictureCaster
 from maniskill_tomato.robot import d435
 from maniskill_tomato.sensing.belief import Belief
 
@@ -97,13 +96,12 @@ def record(path: Path, of: TwinWorld, postures: Sequence[Float64]) -> None:
     """What a D435 would send from these postures: colours, and raw depth from the left infrared imager."""
     from maniskill_tomato.deploy.realsense.recording import write_recording
 
-    depth_caster = PictureCaster(of._caster, DEPTH)
     pictures: list[tuple[NDArray[np.uint8], NDArray[np.uint16]]] = []
     for joints in postures:
         camera, links = of._poses(joints)
-        picture = of._pictures.draw(camera[0], of.episode.T_world_plant, links[0])
+        picture = of.scene.picture(of.intrinsics, camera[0], of.episode.T_world_plant, links[0])
         left = camera[0] @ torch.tensor(np.array(d435.T_color_optical_depth_optical), dtype=torch.float32)
-        depth = depth_caster.draw(left, of.episode.T_world_plant, links[0]).depth
+        depth = of.scene.picture(DEPTH, left, of.episode.T_world_plant, links[0]).depth
         pictures.append((of.color(picture), np.round(1000.0 * depth).astype(np.uint16)))
     write_recording(path, pictures, COLOR, DEPTH, np.array(d435.T_color_optical_depth_optical))
 

@@ -17,7 +17,7 @@ from maniskill_tomato.deploy.mock.dynamics import ArmDynamics
 from maniskill_tomato.deploy.mock.episode import load_episode
 from maniskill_tomato.deploy.observing import Observing
 from maniskill_tomato.deploy.perceive import ImagePerception, TruthPerception
-from maniskill_tomato.raycast.picture_caster import FIRST_ORGAN_LABEL, ROBOT_LABEL
+from maniskill_tomato.raycast.images import FIRST_ORGAN_LABEL, ROBOT_LABEL
 from maniskill_tomato.raycast.view_rays import DEPTH_MODE, RayLabel
 from maniskill_tomato.robot.d435 import (
     T_flange_camera_color_optical,

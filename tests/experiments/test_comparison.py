@@ -11,7 +11,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-import scipy.stats
 import torch
 from torch.utils.tensorboard import SummaryWriter
 
@@ -19,10 +18,8 @@ from maniskill_tomato.cli import main
 from maniskill_tomato.errors import InvalidInputError
 from maniskill_tomato.experiments.comparison import (
     Group,
-    bootstrap_interval,
     find_runs,
     group_runs,
-    interquartile_mean,
     load_run,
     read_clock,
     trailing_mean,
@@ -82,60 +79,6 @@ def run_script(*arguments: str) -> subprocess.CompletedProcess[str]:
     environment = {**os.environ, "PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1"}
     command = [sys.executable, *arguments]
     return subprocess.run(command, capture_output=True, text=True, cwd=ROOT, env=environment, timeout=300)
-
-
-def test_the_interquartile_mean_leaves_out_a_quarter_at_either_end() -> None:
-    assert interquartile_mean([5.0]) == 5.0
-    assert interquartile_mean([9.0, 0.0, 0.0]) == 3.0  # Fewer than four: none is left out.
-    assert interquartile_mean([100.0, 2.0, 0.0, 1.0]) == 1.5
-    assert interquartile_mean([7.0, 1.0, 2.0, 3.0, 90.0]) == 4.0
-    assert interquartile_mean([0.0, 0.0, 1.0, 2.0, 3.0, 4.0, 50.0, 60.0]) == 2.5
-    with pytest.raises(InvalidInputError, match="one value or more"):
-        interquartile_mean([])
-
-
-def test_the_interquartile_mean_agrees_with_scipys_trimmed_mean_along_either_axis() -> None:
-    values = np.random.default_rng(0).normal(size=(11, 7))
-    for axis in (0, 1):
-        expected = scipy.stats.trim_mean(values, 0.25, axis=axis)
-        np.testing.assert_allclose(interquartile_mean(values, axis=axis), expected, rtol=1e-12)
-
-
-def test_the_bootstrap_of_two_runs_has_the_three_means_that_they_can_give() -> None:
-    # Redrawing {0, 1} gives the means 0, 1/2, 1 with probabilities 1/4, 1/2, 1/4.
-    wide = bootstrap_interval([[0.0, 1.0]])
-    assert (wide.estimate, wide.low, wide.high) == (0.5, 0.0, 1.0)
-    narrow = bootstrap_interval([[0.0, 1.0]], confidence=0.4)
-    assert (narrow.low, narrow.high) == (0.5, 0.5)
-
-
-def test_runs_are_redrawn_within_their_task_only() -> None:
-    stratified = bootstrap_interval([[0.0, 0.0], [1.0, 1.0]])
-    assert (stratified.estimate, stratified.low, stratified.high) == (0.5, 0.5, 0.5)
-    mixed = bootstrap_interval([[0.0, 0.0, 1.0, 1.0]])
-    assert (mixed.low, mixed.high) == (0.0, 1.0)
-
-
-def test_the_bootstrap_interval_agrees_with_scipys() -> None:
-    scores = np.random.default_rng(3).normal(size=20)
-    ours = bootstrap_interval([scores])
-    theirs = scipy.stats.bootstrap(
-        (scores,),
-        lambda values, axis: scipy.stats.trim_mean(values, 0.25, axis=axis),
-        n_resamples=10_000,
-        method="percentile",
-        rng=np.random.default_rng(1),
-    ).confidence_interval
-    # Each end has a random error of about 0.01 with 10,000 redraws of scores whose deviation is 1.
-    assert ours.low == pytest.approx(theirs.low, abs=0.04)
-    assert ours.high == pytest.approx(theirs.high, abs=0.04)
-
-
-def test_a_single_run_gives_no_interval_and_no_run_is_refused() -> None:
-    single = bootstrap_interval([[0.7]])
-    assert (single.estimate, single.low, single.high) == (0.7, None, None)
-    with pytest.raises(InvalidInputError, match="every task"):
-        bootstrap_interval([[0.7], []])
 
 
 def test_a_folder_stands_for_the_runs_in_it(tmp_path: Path) -> None:

@@ -17,7 +17,7 @@ from torch import Tensor
 from maniskill_tomato.errors import InvalidInputError
 from maniskill_tomato.experiments import evaluate as evaluation
 from maniskill_tomato.experiments.evaluate import EvaluationConfig, write_trajectories
-from maniskill_tomato.experiments.metrics import make_metrics, summarise, wilson_interval, write_metrics
+from maniskill_tomato.experiments.metrics import make_metrics, summarise, write_metrics
 from maniskill_tomato.experiments.plots import (
     default_windows,
     moving_average,
@@ -146,22 +146,6 @@ def test_the_horizon_ends_an_episode_without_success() -> None:
 def test_impossible_numbers_of_episodes_and_seeds_are_refused(episodes: int, seed: int) -> None:
     with pytest.raises(InvalidInputError, match="must be"):
         run(1, episodes, seed)
-
-
-def test_wilson_intervals_agree_with_published_values() -> None:
-    # Newcombe (1998), Statistics in Medicine 17, table I, method 3.
-    for successes, trials, low, high in (
-        (81, 263, 0.2553, 0.3662),
-        (15, 148, 0.0624, 0.1605),
-        (0, 20, 0.0, 0.1611),
-        (1, 29, 0.0061, 0.1718),
-    ):
-        assert wilson_interval(successes, trials) == pytest.approx((low, high), abs=5e-5)
-    assert wilson_interval(20, 20) == pytest.approx((1 - 0.1611, 1.0), abs=5e-5)
-    with pytest.raises(InvalidInputError):
-        wilson_interval(1, 0)
-    with pytest.raises(InvalidInputError):
-        wilson_interval(5, 4)
 
 
 def test_metrics_by_hand(tmp_path: Path) -> None:

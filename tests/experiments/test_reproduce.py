@@ -20,7 +20,6 @@ from maniskill_tomato.experiments.reproduction import (
     SATURATED,
     ReachCounter,
     Reproduction,
-    bootstrap_interval,
     load_episodes,
     saturated_share,
     save_episodes,
@@ -167,16 +166,6 @@ def test_averaged_curves_agree_with_a_plain_loop(window: int) -> None:
     expected = [(end, sum(values[end - width : end]) / width) for end in range(width, len(values) + 1)]
     assert ends.tolist() == [end for end, _ in expected]
     np.testing.assert_allclose(average, [mean for _, mean in expected], rtol=0, atol=1e-12)
-
-
-def test_bootstrap_interval_of_three_seeds_can_be_counted_by_hand() -> None:
-    # All seeds equal: no spread. One of two seeds: the means 0, 0.5, 1 have probabilities 1/4, 1/2, 1/4.
-    assert bootstrap_interval([0.7, 0.7, 0.7]) == pytest.approx((0.7, 0.7))
-    assert bootstrap_interval([0.0, 1.0]) == (0.0, 1.0)
-    # One success of five: the mean is at most 0.4 with probability 0.942 and at most 0.6 with 0.993.
-    assert bootstrap_interval([0.0, 0.0, 0.0, 0.0, 1.0]) == pytest.approx((0.0, 0.6))
-    with pytest.raises(InvalidInputError):
-        bootstrap_interval([])
 
 
 def test_saturated_share_counts_outputs_near_one() -> None:

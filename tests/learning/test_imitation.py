@@ -14,12 +14,12 @@ from maniskill_tomato.errors import InvalidInputError, PolicyError
 from maniskill_tomato.experiments.view_rollout import run_view_episode
 from maniskill_tomato.learning.imitation.collect import ImitationData, collect_demonstrations
 from maniskill_tomato.learning.imitation.fit import (
-    ImitationFitConfig,
     direction_loss,
     fit_actor,
     fit_recurrent,
 )
-from maniskill_tomato.learning.imitation.training import ImitationConfig, train_imitation
+from maniskill_tomato.learning.imitation.imitation_config import ImitationConfig, ImitationFitConfig
+from maniskill_tomato.learning.imitation.training import train_imitation
 from maniskill_tomato.learning.rl.envs import make_env
 from maniskill_tomato.policies.lattice_oracle import LatticeOracle
 from maniskill_tomato.policies.opening import open_policy

@@ -21,8 +21,9 @@ from maniskill_tomato.experiments.view_rollout import run_view_episode
 from maniskill_tomato.learning.rl.envs import make_env
 from maniskill_tomato.learning.script import parse_env_options, run_training
 from maniskill_tomato.learning.view_quality.collect import QualityData, collect_episodes
-from maniskill_tomato.learning.view_quality.fit import FitConfig, fit, judge, mirrored
-from maniskill_tomato.learning.view_quality.training import QualityTrainConfig, train_view_quality
+from maniskill_tomato.learning.view_quality.fit import fit, judge, mirrored
+from maniskill_tomato.learning.view_quality.quality_config import FitConfig, QualityTrainConfig
+from maniskill_tomato.learning.view_quality.training import train_view_quality
 from maniskill_tomato.policies.adapters import as_state_policy
 from maniskill_tomato.policies.moves import move_towards
 from maniskill_tomato.policies.next_best_view import NextBestView

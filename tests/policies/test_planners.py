@@ -40,9 +40,8 @@ from maniskill_tomato.policies.oracle import Oracle, OracleSearch
 from maniskill_tomato.policies.protocol import Planner
 from maniskill_tomato.policies.reach import CameraReach
 from maniskill_tomato.policies.registry import PLANNERS, PRIVILEGED
-from maniskill_tomato.raycast.cast_views import CastViews
-from maniskill_tomato.raycast.caster import VisibilityCaster
-from maniskill_tomato.raycast.view_rays import ViewRayCaster, ray_pattern
+from maniskill_tomato.raycast.scene import RayScene
+from maniskill_tomato.raycast.view_rays import ray_pattern
 from maniskill_tomato.robot.d435 import color_intrinsics
 from maniskill_tomato.robot.look_at import camera_to_viewpoint, look_at_pose, look_frame
 from maniskill_tomato.robot.look_at_move import MAX_MOVE, MIN_DISTANCE, moved_position
@@ -95,9 +94,7 @@ class FreeWorld(Truth):
     def __init__(self, plants: list[Plant], box: Box = Box()) -> None:
         self._plants = plants
         self._box = box
-        self._caster = VisibilityCaster(plants=plants[:1], intrinsics=color_intrinsics())
-        self._rays = ViewRayCaster(self._caster)
-        self._views = CastViews(self._caster)
+        self._scene = RayScene(plants[:1], color_intrinsics())
         self._observer = ViewpointObserver(1, layout=ObservationLayout.without_memory(), max_moves=HORIZON)
         self._T_world_plant = torch.eye(4)
         self._T_world_plant[0, 3] = 0.85
@@ -118,14 +115,14 @@ class FreeWorld(Truth):
     def visible_fraction(
         self, T_world_camera: Tensor, env_index: int = 0, qpos: Tensor | None = None
     ) -> Tensor:
-        return self._views.visible_fraction(
+        return self._scene.visible_fraction_from(
             T_world_camera, self._fruit, self._T_world_plant, env_index=env_index
         )
 
     def reset(self, *, seed: int, options: Any = None) -> tuple[Tensor, dict[str, Tensor]]:
         rng = np.random.default_rng(seed)
         plant = self._plants[int(rng.integers(len(self._plants)))]
-        self._caster.replace_plant(0, plant)
+        self._scene.replace_plant(0, plant)
         ripe = [i for i, f in enumerate(plant.fruits) if f.ripeness == "ripe" and 0.4 < f.centre[2] < 1.2]
         while True:
             self._fruit = int(rng.choice(ripe))
@@ -150,8 +147,8 @@ class FreeWorld(Truth):
     def _look(self) -> tuple[Tensor, dict[str, Tensor]]:
         pose = look_at_pose(self._position, self._target)[None]
         fruit, plant = torch.tensor([self._fruit]), self._T_world_plant[None]
-        seen = self._caster.cast(pose, fruit, plant).visible_fraction
-        rays = self._rays.cast(pose, fruit, self._target[None], plant)
+        seen = self._scene.visibility(pose, fruit, plant).visible_fraction
+        rays = self._scene.view_rays(pose, fruit, self._target[None], plant)
         viewpoint = camera_to_viewpoint(pose, torch.tensor([[0.0, math.pi / 2, 0.0]]))
         left = torch.tensor([HORIZON - self._elapsed])
         observation = self._observer.observe(viewpoint, pose, rays, seen, left)

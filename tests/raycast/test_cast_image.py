@@ -6,10 +6,12 @@ import torch
 
 from maniskill_tomato.errors import InvalidInputError
 from maniskill_tomato.plants.generator import generate_plant
-from maniskill_tomato.raycast.cast_image import BACKGROUND_DEPTH, ImageCaster, PixelLabel
+from maniskill_tomato.raycast.cast_image import ImageCaster
 from maniskill_tomato.raycast.caster import VisibilityCaster
-from maniskill_tomato.raycast.view_rays import RayLabel, ViewRayCaster, sample_view
+from maniskill_tomato.raycast.images import BACKGROUND_DEPTH, PixelLabel
+from maniskill_tomato.raycast.view_rays import RayLabel, ViewRayCaster
 from maniskill_tomato.robot.d435 import CameraIntrinsics
+from maniskill_tomato.sensing.view_pattern import sample_view
 
 INTRINSICS = CameraIntrinsics.from_fov(width=160, height=120, fov_y=np.deg2rad(42.5))
 

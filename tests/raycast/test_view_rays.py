@@ -24,14 +24,13 @@ from maniskill_tomato.raycast.view_rays import (
     RayLabel,
     ViewRayCaster,
     ViewRays,
-    disturb,
     ray_pattern,
-    sample_view,
 )
 from maniskill_tomato.robot.d435 import CameraIntrinsics, color_intrinsics, depth_noise_std
 from maniskill_tomato.robot.description import link_meshes
 from maniskill_tomato.robot.iiwa14 import LINK_NAMES
 from maniskill_tomato.robot.look_at import look_at_pose, look_frame
+from maniskill_tomato.sensing.view_pattern import disturb, sample_view
 
 RAYS = RAYS_PER_SIDE**2
 RADIUS = 0.035

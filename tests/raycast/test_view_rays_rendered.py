@@ -8,9 +8,10 @@ import torch
 
 from maniskill_tomato.plants.generator import generate_plant
 from maniskill_tomato.raycast.caster import VisibilityCaster
-from maniskill_tomato.raycast.view_rays import RANGE, RayLabel, ViewRayCaster, sample_view
+from maniskill_tomato.raycast.view_rays import RANGE, RayLabel, ViewRayCaster
 from maniskill_tomato.robot.look_at import camera_to_viewpoint, look_at_pose
 from maniskill_tomato.sensing.observation import ViewpointObserver
+from maniskill_tomato.sensing.view_pattern import sample_view
 
 pytestmark = pytest.mark.render
 

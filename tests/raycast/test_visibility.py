@@ -12,7 +12,8 @@ from numpy.typing import NDArray
 from maniskill_tomato.errors import InvalidInputError
 from maniskill_tomato.plants.generator import generate_plant
 from maniskill_tomato.plants.organs import Fruit, MeshPart, Organ, Plant, Ripeness, SemanticClass
-from maniskill_tomato.raycast.caster import LinkMeshes, Visibility, VisibilityCaster
+from maniskill_tomato.raycast.caster import LinkMeshes, VisibilityCaster
+from maniskill_tomato.raycast.visibility import Visibility
 from maniskill_tomato.robot.d435 import (
     CAMERA_NEAR,
     CameraIntrinsics,

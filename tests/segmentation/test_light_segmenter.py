@@ -18,9 +18,9 @@ from maniskill_tomato.segmentation.fruit_network import (
     STRIDE,
     FruitMaps,
     FruitNetwork,
-    FruitNetworkConfig,
     place_centres,
 )
+from maniskill_tomato.segmentation.fruit_network_config import FruitNetworkConfig
 from maniskill_tomato.segmentation.fruit_session import FruitSession
 from maniskill_tomato.segmentation.light_segmenter import (
     LightSegmenter,
@@ -31,10 +31,10 @@ from maniskill_tomato.segmentation.light_segmenter import (
 )
 from maniskill_tomato.segmentation.masks import EncodedMask
 from maniskill_tomato.segmentation.metrics.detection_metrics import box_overlaps
-from maniskill_tomato.segmentation.training.augmentation import AugmentationConfig, augmented
+from maniskill_tomato.segmentation.training.augmentation import augmented
 from maniskill_tomato.segmentation.training.fruit_targets import TrainingPicture, fruit_losses, make_targets
+from maniskill_tomato.segmentation.training.light_config import AugmentationConfig, LightTrainConfig
 from maniskill_tomato.segmentation.training.light_training import (
-    LightTrainConfig,
     LightTraining,
     learning_rate,
 )

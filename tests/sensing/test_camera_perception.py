@@ -9,11 +9,13 @@ import torch
 
 import maniskill_tomato  # noqa: F401
 from maniskill_tomato.errors import InvalidInputError
-from maniskill_tomato.raycast.cast_image import ImageCaster, PixelLabel
+from maniskill_tomato.raycast.images import PixelLabel
 from maniskill_tomato.robot.d435 import color_intrinsics
 from maniskill_tomato.robot.kinematics import link_transforms
 from maniskill_tomato.segmentation.instances import Instances
-from maniskill_tomato.sensing.camera_perception import COARSE_POSITION, IMAGE_SIZE, CameraPerception
+from maniskill_tomato.sensing.camera_perception import CameraPerception
+from maniskill_tomato.sensing.fruit_detector import FruitDetector
+from maniskill_tomato.sensing.simulated_camera import COARSE_POSITION, IMAGE_SIZE, SimulatedCamera
 
 
 def make(**options: Any) -> Any:
@@ -33,13 +35,13 @@ def test_what_the_camera_measures_is_near_the_truth() -> None:
             *_, info = env.step(action)
             measured.append(float(info["visible_fraction"][0]))
             true.append(float(info["true_visible_fraction"][0]))
-            if bool(env._eyes.located[0]):
-                offset = env.belief.target_position - env._target_position_w
-                offsets.append(float(offset.norm()))
+        if max(measured[-5:]) > 0.2:
+            # A target that was seen as well as that has been located.
+            offsets.append(float((env.belief.target_position - env._target_position_w).norm()))
     errors = np.abs(np.array(measured) - np.array(true))
     assert max(true) > 0.3, "the views must not all be blind"
     assert errors.mean() < 0.1
-    assert np.median(offsets) < 0.015
+    assert len(offsets) >= 2 and np.median(offsets) < 0.015
     env.close()
 
 
@@ -56,12 +58,20 @@ def test_the_same_seed_measures_the_same() -> None:
 
 
 def test_an_unseen_target_is_known_from_afar_only() -> None:
-    env = make(perception="occlusion_model", start_visibility=(0.0, 0.001))
-    env.reset(seed=1)
-    if not bool(env._eyes.located[0]):
-        offset = env.belief.target_position - env._target_position_w
-        assert 0.0 < float(offset.norm()) < 5 * COARSE_POSITION
-        assert float(env._eyes.visible_fraction[0]) == 0.0
+    env: Any = gym.make(
+        "TomatoViewpoint-v1",
+        perception="occlusion_model",
+        start_visibility=(0.0, 0.001),
+        obs_mode="state",
+        render_backend="none",
+    ).unwrapped
+    offsets = []
+    for seed in range(5):
+        env.reset(seed=seed)
+        assert float(env.belief.visible_fraction[0]) == 0.0
+        offsets.append((env.belief.target_position - env._target_position_w)[0].numpy())
+    # 15 draws: the standard deviation is known to 18 %, three times which is 55 %.
+    assert np.std(offsets) == pytest.approx(COARSE_POSITION, rel=0.55)
     env.close()
 
 
@@ -103,14 +113,18 @@ def test_rendered_perceptions_run_and_their_pictures_lie_on_the_cast_labels(perc
     picture = task._wrist_picture(0).astype(int)
     assert picture.shape == (240, 320, 3)
     T_w_links = link_transforms(task.agent.robot.get_qpos())
-    images = ImageCaster(task._caster, task.camera_intrinsics).cast(
-        T_w_links[:, -1] @ task._T_ee_camera, task._target, task.planting.T_world_plant, T_w_links
+    images = task._ray_scene.image(
+        task.camera_intrinsics,
+        T_w_links[:, -1] @ task._T_ee_camera,
+        task._target,
+        task.planting.T_world_plant,
+        T_w_links,
     )
     target = (images.label[0] == int(PixelLabel.TARGET)).numpy()
     if np.count_nonzero(target) > 20:
         red, green, _ = picture[target].T
         assert np.median(red - green) > 30
-    # Leaves and stems are green where the caster meets the plant.
+    # Leaves and stems are green where rays meet the plant.
     plant = (images.label[0] == int(PixelLabel.PLANT)).numpy()
     nothing = (images.label[0] == int(PixelLabel.NOTHING)).numpy()
     colourful = picture.max(-1) - picture.min(-1)
@@ -118,22 +132,38 @@ def test_rendered_perceptions_run_and_their_pictures_lie_on_the_cast_labels(perc
     env.close()
 
 
+class Eye:
+    """A simulated camera that looks from where an environment's arm stands, with a segmenter of the test's."""
+
+    def __init__(self, env: Any, order: int = 1) -> None:
+        self.env = env
+        width, height = IMAGE_SIZE
+        self.camera = SimulatedCamera(
+            env._ray_scene, picture=lambda k: np.zeros((height, width, 3), np.uint8)
+        )
+        self.perception = CameraPerception(1, FruitDetector(LabelSegmenter(env, order)))
+
+    def look(self) -> float:
+        T_w_links = link_transforms(self.env.agent.robot.get_qpos())
+        T_w_camera = T_w_links[:, -1] @ self.env._T_ee_camera
+        frames = self.camera.take(T_w_camera, self.env._target, self.env.planting.T_world_plant, T_w_links)
+        self.perception.look(frames)
+        return float(self.perception.visible_fraction[0])
+
+
 def test_of_several_fruits_found_the_one_near_the_known_place_is_the_target() -> None:
     env = make(perception="occlusion_model")
     env.reset(seed=2)
-    looks = []
+    place = env._target_position_w[0].numpy()
+    seen = []
     for order in (1, -1):
-        eyes = CameraPerception(env._caster, segmenter=LabelSegmenter(env, order))
-        eyes.begin(0, np.random.RandomState(0))
-        T_w_links = link_transforms(env.agent.robot.get_qpos())
-        T_w_camera = T_w_links[:, -1] @ env._T_ee_camera
-        place = env._target_position_w
-        eyes.look(T_w_camera, env._target, place, env.planting.T_world_plant, T_w_links)
-        near = eyes.visible_fraction.clone()
-        eyes.look(T_w_camera, env._target, place + 1.0, env.planting.T_world_plant, T_w_links)
-        assert float(eyes.visible_fraction[0]) == 0.0, "a fruit a metre away is another one"
-        looks.append(float(near[0]))
-    assert looks[0] == looks[1] > 0.0
+        eye = Eye(env, order)
+        eye.perception.begin(0, place)
+        seen.append(eye.look())
+        eye = Eye(env, order)
+        eye.perception.begin(0, place + 1.0)
+        assert eye.look() == 0.0, "a fruit a metre away is another one"
+    assert seen[0] == seen[1] > 0.0
     env.close()
 
 
@@ -144,14 +174,9 @@ def test_what_the_first_view_of_a_hidden_target_shows_well_is_not_taken_for_it()
     env.reset(seed=0)
     seen = []
     for hidden_below in (None, 0.3):
-        eyes = CameraPerception(env._caster, segmenter=LabelSegmenter(env, 1))
-        eyes.begin(0, np.random.RandomState(0), hidden_below)
-        eyes.forget(torch.tensor([0]))
-        T_w_links = link_transforms(env.agent.robot.get_qpos())
-        T_w_camera = T_w_links[:, -1] @ env._T_ee_camera
-        for _ in range(2):
-            eyes.look(T_w_camera, env._target, env._target_position_w, env.planting.T_world_plant, T_w_links)
-            seen.append(float(eyes.visible_fraction[0]))
+        eye = Eye(env)
+        eye.perception.begin(0, env._target_position_w[0].numpy(), hidden_below=hidden_below)
+        seen += [eye.look(), eye.look()]
     assert min(seen[:2]) > 0.45
     assert seen[2:] == [0.0, 0.0]
     env.close()
@@ -162,9 +187,12 @@ class LabelSegmenter:
 
     def __init__(self, env: Any, order: int) -> None:
         T_w_links = link_transforms(env.agent.robot.get_qpos())
-        caster = ImageCaster(env._caster, color_intrinsics(*IMAGE_SIZE))
-        images = caster.cast(
-            T_w_links[:, -1] @ env._T_ee_camera, env._target, env.planting.T_world_plant, T_w_links
+        images = env._ray_scene.image(
+            color_intrinsics(*IMAGE_SIZE),
+            T_w_links[:, -1] @ env._T_ee_camera,
+            env._target,
+            env.planting.T_world_plant,
+            T_w_links,
         )
         target = (images.label[0] == int(PixelLabel.TARGET)).numpy()
         other = np.zeros_like(target)

@@ -10,8 +10,8 @@ from torch.testing import assert_close
 
 from maniskill_tomato.errors import InvalidInputError
 from maniskill_tomato.plants.generator import generate_plant
-from maniskill_tomato.raycast.caster import VisibilityCaster
-from maniskill_tomato.raycast.view_rays import RAYS_PER_SIDE, RayLabel, ViewRayCaster, ViewRays
+from maniskill_tomato.raycast.scene import RayScene
+from maniskill_tomato.raycast.view_rays import RAYS_PER_SIDE, RayLabel, ViewRays
 from maniskill_tomato.robot.d435 import color_intrinsics
 from maniskill_tomato.robot.look_at import camera_to_viewpoint, look_at_pose, look_frame
 from maniskill_tomato.sensing.observation import (
@@ -48,9 +48,7 @@ class Episode:
         centre = torch.from_numpy(plant.fruits[self.fruit].centre) + T_WORLD_PLANT[:3, 3]
         self.num_envs, self.device = num_envs, device
         self.target = centre.to(device).expand(num_envs, 3)
-        self._rays = ViewRayCaster(
-            VisibilityCaster(plants=[plant] * num_envs, intrinsics=color_intrinsics(), device=device)
-        )
+        self._scene = RayScene([plant] * num_envs, color_intrinsics(), device=device)
         self.observer = ViewpointObserver(num_envs, device, layout)
         self.observer.begin(torch.arange(num_envs, device=device), self.target)
 
@@ -60,7 +58,7 @@ class Episode:
     def view(self, poses: Tensor) -> ViewRays:
         fruits = torch.full((self.num_envs,), self.fruit, device=self.device)
         plant_poses = T_WORLD_PLANT.to(self.device).expand(self.num_envs, 4, 4)
-        return self._rays.cast(poses, fruits, self.target, plant_poses)
+        return self._scene.view_rays(poses, fruits, self.target, plant_poses)
 
     def look(
         self,

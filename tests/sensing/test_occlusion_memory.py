@@ -10,9 +10,8 @@ from torch.testing import assert_close
 
 from maniskill_tomato.errors import InvalidInputError
 from maniskill_tomato.plants.generator import generate_plant
-from maniskill_tomato.raycast.cast_views import CastViews
-from maniskill_tomato.raycast.caster import VisibilityCaster
-from maniskill_tomato.raycast.view_rays import RANGE, RayLabel, ViewRayCaster, ViewRays
+from maniskill_tomato.raycast.scene import RayScene
+from maniskill_tomato.raycast.view_rays import RANGE, RayLabel, ViewRays
 from maniskill_tomato.robot.d435 import color_intrinsics
 from maniskill_tomato.robot.look_at import look_at_pose
 from maniskill_tomato.sensing.occlusion_memory import (
@@ -294,16 +293,17 @@ def test_what_is_predicted_agrees_with_what_is_seen_the_better_the_more_views() 
     rng = np.random.default_rng(0)
     for seed in range(8):
         plant = generate_plant("full", seed, "training")
-        caster = VisibilityCaster(plants=[plant], intrinsics=color_intrinsics())
+        scene = RayScene([plant], color_intrinsics())
         target = next(i for i, fruit in enumerate(plant.fruits) if fruit.ripeness == "ripe")
         centre = torch.from_numpy(plant.fruits[target].centre)
         offset = torch.from_numpy(rng.normal(size=(300, 3)) * (0.1, 0.25, 0.2) + (-0.45, 0, 0)).float()
         cameras = look_at_pose(centre + offset, centre.expand(300, 3))
-        truth = CastViews(caster).visible_fraction(cameras, target, torch.eye(4))
+        truth = scene.visible_fraction_from(cameras, target, torch.eye(4))
         memory = begun(tuple(centre.tolist()))
-        view = ViewRayCaster(caster)
         for k in range(6):
-            rays = view.cast(cameras[k : k + 1], torch.tensor([target]), centre[None], torch.eye(4)[None])
+            rays = scene.view_rays(
+                cameras[k : k + 1], torch.tensor([target]), centre[None], torch.eye(4)[None]
+            )
             memory.integrate(cameras[k : k + 1], rays)
             if k + 1 in correlations:
                 predicted = memory.predict(cameras[None, 6:, :3, 3])[0, :, 0]

@@ -20,7 +20,7 @@ from maniskill_tomato.plants.episode_list import (
     write_episodes,
 )
 from maniskill_tomato.plants.spec import SEED_SPLITS
-from maniskill_tomato.raycast.caster import VisibilityCaster
+from maniskill_tomato.raycast.scene import RayScene
 from maniskill_tomato.robot.iiwa14 import NUM_JOINTS
 from maniskill_tomato.robot.kinematics import forward_kinematics
 from maniskill_tomato.robot.look_at import flange_to_camera
@@ -110,16 +110,16 @@ def test_starts_are_hidden_free_of_contact_and_look_at_a_ripe_fruit_of_the_middl
     assert base.soft_starts == 0
 
 
-def test_visible_fraction_is_that_of_another_caster(env: Any) -> None:
+def test_visible_fraction_is_that_of_another_scene(env: Any) -> None:
     base, rng = env.unwrapped, np.random.default_rng(0)
     for seed in range(3):
         env.reset(seed=seed)
-        caster = VisibilityCaster(plants=base.planting.plants, intrinsics=base.camera_intrinsics)
+        scene = RayScene(base.planting.plants, base.camera_intrinsics)
         for _ in range(4):
             *_, info = env.step(action(rng))
             T = flange_to_camera(forward_kinematics(base.agent.robot.get_qpos()))
-            seen = caster.cast(T, base.target_fruit, base.planting.T_world_plant)
-            # The other caster knows no robot, which can only hide more.
+            seen = scene.visibility(T, base.target_fruit, base.planting.T_world_plant)
+            # The other scene knows no robot, which can only hide more.
             assert float(info["visible_fraction"]) <= float(seen.visible_fraction) + 1e-6
             truth = base.ground_truth.visible_fraction(T)
             torch.testing.assert_close(truth, seen.visible_fraction)

@@ -1,43 +1,21 @@
 """Fitting a student to the teacher's moves."""
 
 from collections.abc import Callable
-from dataclasses import dataclass
 
 import torch
 from torch import Tensor, nn
 from torch.nn import functional
 from torch.nn.utils.rnn import pack_padded_sequence, pad_packed_sequence
 
-from maniskill_tomato.errors import InvalidInputError, TrainingDivergedError
+from maniskill_tomato.errors import TrainingDivergedError
 from maniskill_tomato.learning.imitation.collect import ImitationData
+from maniskill_tomato.learning.imitation.imitation_config import ImitationFitConfig
 
 MAGNITUDE_WEIGHT = 0.2
 """Weight of the error in the length of a move beside that of its direction."""
 
 MOVE_MIN = 1e-3
 """A move of the teacher shorter than this has no direction."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class ImitationFitConfig:
-    """How a student is fitted."""
-
-    steps: int = 4000
-    """Batches of each round."""
-    batch_size: int = 256
-    """Moves in each; for a recurrent student the moves of about as many episodes as this by 8."""
-    learning_rate: float = 1e-3
-    """Of AdamW at the start; it falls to nothing along half a cosine."""
-    weight_decay: float = 1e-3
-    """Of AdamW."""
-    seed: int = 0
-
-    def __post_init__(self) -> None:
-        for name in ("steps", "batch_size"):
-            if getattr(self, name) < 1:
-                raise InvalidInputError(f"{name} must be 1 or more, got {getattr(self, name)}")
-        if not 0.0 < self.learning_rate < 1.0:
-            raise InvalidInputError(f"learning_rate must be in (0, 1), got {self.learning_rate}")
 
 
 def direction_loss(moves: Tensor, wanted: Tensor) -> Tensor:

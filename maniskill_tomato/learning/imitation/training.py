@@ -3,9 +3,9 @@
 import dataclasses
 import json
 from collections.abc import Callable
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -15,7 +15,8 @@ from maniskill_tomato.errors import InvalidInputError
 from maniskill_tomato.files import write_atomically
 from maniskill_tomato.learning.blocks import Block, run_blocks
 from maniskill_tomato.learning.imitation.collect import ImitationData, collect_demonstrations
-from maniskill_tomato.learning.imitation.fit import ImitationFitConfig, fit_actor, fit_recurrent
+from maniskill_tomato.learning.imitation.fit import fit_actor, fit_recurrent
+from maniskill_tomato.learning.imitation.imitation_config import ImitationConfig
 from maniskill_tomato.learning.rl.agent import make_agent
 from maniskill_tomato.learning.rl.checkpoint import make_checkpoint, save_checkpoint
 from maniskill_tomato.learning.rl.envs import make_env
@@ -30,40 +31,6 @@ from maniskill_tomato.policies.recurrent import (
 from maniskill_tomato.sensing.observation import ObservationLayout
 
 ENV_ID = "TomatoViewpoint-v1"
-
-StudentKind = Literal["actor", "recurrent"]
-
-
-@dataclass(frozen=True, kw_only=True)
-class ImitationConfig:
-    """A training."""
-
-    student: StudentKind = "actor"
-    """`actor`: the network of the preset `general-td3` on the whole observation; `recurrent`: a GRU on what the present
-    view tells, without the memory."""
-    rounds: tuple[int, ...] = (1500, 1000, 1000, 1000)
-    """Episodes of each round. The teacher leads the first, which alone is behaviour cloning; the student of the round
-    before leads `student_share` of the later ones (DAgger)."""
-    student_share: float = 0.9
-    """Share of the later rounds' episodes that the student leads."""
-    pool: int = 120
-    """Training plants that three quarters of the episodes draw from; the others grow a new one each."""
-    block: int = 100
-    """Episodes that a process runs and writes at a time; what a stopped training repeats."""
-    fit: ImitationFitConfig = field(default_factory=ImitationFitConfig)
-    """How each round's student is fitted, always from scratch to the data of all rounds."""
-    seed: int = 0
-
-    def __post_init__(self) -> None:
-        for name in ("pool", "block"):
-            if getattr(self, name) < 1:
-                raise InvalidInputError(f"{name} must be 1 or more, got {getattr(self, name)}")
-        if not self.rounds or min(self.rounds) < 1:
-            raise InvalidInputError(f"rounds must list one or more numbers above 0, got {self.rounds}")
-        if not 0.0 <= self.student_share <= 1.0:
-            raise InvalidInputError(f"student_share must be from 0 to 1, got {self.student_share}")
-        if not 0 <= self.seed < 100:
-            raise InvalidInputError(f"seed must be from 0 to 99, got {self.seed}")
 
 
 def train_imitation(

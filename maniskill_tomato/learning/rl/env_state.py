@@ -92,7 +92,7 @@ def set_env_state(env: LearnerEnv, state: dict[str, Any] | None) -> None:
     if getattr(base, "_swaps_plants", False):
         for i, seed in enumerate(int(s) for s in state["sim"]["task"]["plant_seed"][:, 0]):
             if seed != base.planting.seeds[i]:
-                base._caster.replace_plant(i, base.planting.replace(i, seed))
+                base._ray_scene.replace_plant(i, base.planting.replace(i, seed))
     base.set_state_dict(_map_tensors(state["sim"], base.device))
     base._elapsed_steps[:] = state["elapsed_steps"].to(base.device)
     base._reconfig_counter = state["reconfig_counter"]

@@ -2,50 +2,16 @@
 
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 from torch.nn import functional
 
-from maniskill_tomato.errors import InvalidInputError, TrainingDivergedError
+from maniskill_tomato.errors import TrainingDivergedError
 from maniskill_tomato.learning.view_quality.collect import QualityData
+from maniskill_tomato.learning.view_quality.quality_config import FitConfig
 from maniskill_tomato.policies.quality_network import ViewQualityNetwork
 from maniskill_tomato.policies.view_quality import new_network
-
-
-@dataclass(frozen=True, kw_only=True)
-class FitConfig:
-    """How the network is trained."""
-
-    steps: int = 4000
-    """Batches."""
-    batch_size: int = 128
-    """Looks in each."""
-    learning_rate: float = 2e-3
-    """Of AdamW at the start; it falls to nothing along half a cosine."""
-    weight_decay: float = 1e-3
-    """Of AdamW."""
-    width: int = 32
-    """Channels of the network's maps."""
-    blocks: int = 3
-    """Its residual blocks."""
-    full_visibility: float = 0.8
-    """V_f above which a view is a full one."""
-    fraction_weight: float = 2.0
-    """Weight of the squared error of V_f beside the cross entropy of full views."""
-    mirror: bool = True
-    """Also learn from the mirror images of the looks, left and right exchanged."""
-    seed: int = 0
-
-    def __post_init__(self) -> None:
-        for name in ("steps", "batch_size", "width", "blocks"):
-            if getattr(self, name) < 1:
-                raise InvalidInputError(f"{name} must be 1 or more, got {getattr(self, name)}")
-        if not 0.0 < self.learning_rate < 1.0:
-            raise InvalidInputError(f"learning_rate must be in (0, 1), got {self.learning_rate}")
-        if not 0.0 < self.full_visibility < 1.0:
-            raise InvalidInputError(f"full_visibility must be in (0, 1), got {self.full_visibility}")
 
 
 def losses(

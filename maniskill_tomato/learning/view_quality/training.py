@@ -5,7 +5,7 @@ import json
 import logging
 import time
 from collections.abc import Callable
-from dataclasses import asdict, dataclass, field, fields
+from dataclasses import asdict, fields
 from pathlib import Path
 from typing import Any
 
@@ -17,45 +17,14 @@ from maniskill_tomato.files import write_atomically
 from maniskill_tomato.learning.blocks import Block, run_blocks
 from maniskill_tomato.learning.rl.envs import make_env
 from maniskill_tomato.learning.view_quality.collect import QualityData, collect_episodes
-from maniskill_tomato.learning.view_quality.fit import FitConfig, fit
+from maniskill_tomato.learning.view_quality.fit import fit
+from maniskill_tomato.learning.view_quality.quality_config import VALIDATION_SEED, QualityTrainConfig
 from maniskill_tomato.policies.quality_network import ViewQualityNetwork
 from maniskill_tomato.policies.view_quality import ViewQuality, load_view_quality, save_view_quality
 
 logger = logging.getLogger(__name__)
 
 ENV_ID = "TomatoViewpoint-v1"
-
-VALIDATION_SEED = 900_000_000
-"""Seed of the first validation episode; training episodes stay below."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class QualityTrainConfig:
-    """A training."""
-
-    rounds: tuple[int, ...] = (3000, 3000)
-    """Episodes of each round. The first is led by the planner on the occupancy map, the later ones mostly by the
-    network of the round before."""
-    pool: int = 120
-    """Training plants that three quarters of the episodes draw from; the others grow a new one each."""
-    block: int = 100
-    """Episodes that a process runs and writes at a time; what a stopped training repeats."""
-    validation_episodes: int = 200
-    """Episodes on the validation plants, for the losses in the log."""
-    fit: FitConfig = field(default_factory=FitConfig)
-    """How each round's network is trained, the first from scratch, the others going on from the one before."""
-    seed: int = 0
-
-    def __post_init__(self) -> None:
-        for name in ("pool", "block", "validation_episodes"):
-            if getattr(self, name) < 1:
-                raise InvalidInputError(f"{name} must be 1 or more, got {getattr(self, name)}")
-        if not self.rounds or min(self.rounds) < 1:
-            raise InvalidInputError(f"rounds must list one or more numbers above 0, got {self.rounds}")
-        if not 0 <= self.seed < 100 or max(self.rounds) * len(self.rounds) > VALIDATION_SEED // 100:
-            raise InvalidInputError(
-                "seed must be from 0 to 99 and the rounds hold less than 9 million episodes"
-            )
 
 
 def train_view_quality(

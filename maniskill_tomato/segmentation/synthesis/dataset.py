@@ -6,9 +6,7 @@ annotated is whole; the final files put the scenes together. All random numbers 
 
 import json
 import logging
-import multiprocessing
-import os
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any, Final, Literal
@@ -29,6 +27,7 @@ from maniskill_tomato.segmentation.datasets.annotations import (
 )
 from maniskill_tomato.segmentation.datasets.coco import read_coco, write_coco
 from maniskill_tomato.segmentation.datasets.voc import write_voc
+from maniskill_tomato.worker_pool import run_jobs
 
 logger = logging.getLogger(__name__)
 
@@ -117,7 +116,8 @@ def make_dataset(
         on_scene(sum(len(_numbers(config, k)) for k in range(config.scenes) if k not in set(missing)))
     if missing and not rendering_available():
         raise RenderingUnavailableError(NO_RENDERING_HINT)
-    for scene in _render_scenes(config, out, missing, jobs):
+    processes = max(1, min(jobs, len(missing)))
+    for _, scene in run_jobs(_render_one, [(config, out, scene) for scene in missing], processes):
         if on_scene is not None:
             on_scene(len(_numbers(config, scene)))
     parts = [read_coco(_scene_file(out, k), root=out) for k in range(config.scenes)]
@@ -173,25 +173,6 @@ def _finished(config: DatasetConfig, out: Path, scene: int) -> bool:
         return False
     done = {int(Path(image.file_name).stem) for image in read_coco(path, root=out).images}
     return done.issuperset(_numbers(config, scene))
-
-
-def _render_scenes(config: DatasetConfig, out: Path, scenes: list[int], jobs: int) -> Iterator[int]:
-    if jobs <= 1 or len(scenes) <= 1:
-        for scene in scenes:
-            yield render_scene(config, out, scene)
-        return
-    context = multiprocessing.get_context("spawn")
-    with context.Pool(min(jobs, len(scenes)), initializer=_one_thread) as pool:
-        yield from pool.imap_unordered(_render_one, [(config, out, scene) for scene in scenes])
-
-
-def _one_thread() -> None:
-    import torch
-
-    # Mesa's CPU renderer would take all cores for each process.
-    os.environ.setdefault("LP_NUM_THREADS", "1")
-    torch.set_num_threads(1)
-    cv2.setNumThreads(1)
 
 
 def _render_one(work: tuple[DatasetConfig, Path, int]) -> int:

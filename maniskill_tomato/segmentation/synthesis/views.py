@@ -8,7 +8,7 @@ from numpy.random import Generator
 from numpy.typing import NDArray
 
 from maniskill_tomato.plants.organs import Plant
-from maniskill_tomato.raycast.caster import VisibilityCaster
+from maniskill_tomato.raycast.scene import RayScene
 from maniskill_tomato.robot.d435 import CameraIntrinsics
 
 Float64 = NDArray[np.float64]
@@ -53,14 +53,14 @@ def draw_views(plant: Plant, count: int, intrinsics: CameraIntrinsics, rng: Gene
     """Viewpoints whose targets' visible fractions fall into `BANDS` in turn, as far as some tries allow."""
     ripe = [k for k, fruit in enumerate(plant.fruits) if fruit.ripeness != "green"]
     targets = ripe or list(range(len(plant.fruits)))
-    caster = VisibilityCaster(plants=[plant], intrinsics=intrinsics)
+    scene = RayScene([plant], intrinsics)
     views = []
     for number in range(count):
         low, high = BANDS[number % len(BANDS)]
         pool = targets if number % 5 else list(range(len(plant.fruits)))
         view = draw_view(plant, pool, rng)
         for _ in range(TRIES):
-            seen = caster.cast(
+            seen = scene.visibility(
                 torch.from_numpy(view.T_plant_optical.astype(np.float32))[None],
                 torch.tensor([view.target_fruit]),
                 torch.eye(4)[None],

@@ -1,7 +1,6 @@
 """Training pictures made from annotated ones: other scale, place, light and company."""
 
 from collections.abc import Callable
-from dataclasses import dataclass
 
 import cv2
 import numpy as np
@@ -9,38 +8,7 @@ from numpy.typing import NDArray
 
 from maniskill_tomato.segmentation.instances import mask_box
 from maniskill_tomato.segmentation.training.fruit_targets import TrainingPicture
-
-
-@dataclass(frozen=True, kw_only=True)
-class AugmentationConfig:
-    """How pictures are varied for the light segmenter."""
-
-    size: int = 320
-    """Height and width of a training picture in [px]."""
-    scale: tuple[float, float] = (0.6, 1.6)
-    """Range of the factor on the picture's size, uniform in its logarithm."""
-    mosaic_probability: float = 0.5
-    """How often four pictures share one."""
-    flip_probability: float = 0.5
-    """How often a picture is mirrored left to right."""
-    brightness: tuple[float, float] = (0.6, 1.4)
-    """Factor on all colours."""
-    contrast: tuple[float, float] = (0.7, 1.3)
-    """Factor on the difference from the mean."""
-    gamma: tuple[float, float] = (0.7, 1.4)
-    """Exponent of the colours."""
-    channel_gain: tuple[float, float] = (0.85, 1.15)
-    """Factor on each colour for itself: white balance."""
-    saturation: tuple[float, float] = (0.6, 1.4)
-    """Factor on the difference from grey."""
-    blur_probability: float = 0.2
-    """How often a picture is blurred, by a Gaussian of up to 1.5 px."""
-    noise_probability: float = 0.3
-    """How often each pixel gets Gaussian noise, of up to 10 of 255."""
-    smallest_side: float = 5.0
-    """Fruits narrower than this in [px] are neither asked for nor punished."""
-    smallest_share: float = 0.2
-    """Nor are those of which less than this is left in the picture."""
+from maniskill_tomato.segmentation.training.light_config import AugmentationConfig
 
 
 def augmented(

@@ -5,7 +5,7 @@ import json
 import logging
 import math
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -13,69 +13,23 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from maniskill_tomato.errors import CheckpointError, InvalidInputError
+from maniskill_tomato.errors import CheckpointError
 from maniskill_tomato.segmentation.datasets.annotations import AnnotatedImage
-from maniskill_tomato.segmentation.efficientnet_lite import FIXED_BLOCKS, EfficientNetLite0
-from maniskill_tomato.segmentation.fruit_network import FruitNetwork, FruitNetworkConfig
-from maniskill_tomato.segmentation.training.augmentation import AugmentationConfig, augmented
+from maniskill_tomato.segmentation.efficientnet_lite import EfficientNetLite0
+from maniskill_tomato.segmentation.fruit_network import FruitNetwork
+from maniskill_tomato.segmentation.training.augmentation import augmented
 from maniskill_tomato.segmentation.training.fruit_targets import (
     LOSS_WEIGHTS,
     TrainingPicture,
     fruit_losses,
     make_targets,
 )
+from maniskill_tomato.segmentation.training.light_config import AugmentationConfig, LightTrainConfig
 from maniskill_tomato.segmentation.training.resumable_training import ResumableTraining
 from maniskill_tomato.segmentation.training.training_pictures import PictureDraw, training_picture
 from maniskill_tomato.segmentation.weights import load_weights, save_weights
 
 logger = logging.getLogger(__name__)
-
-
-@dataclass(frozen=True, kw_only=True)
-class LightTrainConfig:
-    """How to train the light segmenter."""
-
-    steps: int = 8000
-    """Batches in all."""
-    batch_size: int = 8
-    """Pictures in a batch."""
-    learning_rate: float = 1.5e-3
-    """Of AdamW, after the warm-up; it falls to a hundredth along a cosine."""
-    weight_decay: float = 1e-3
-    """Of AdamW."""
-    warmup_steps: int = 200
-    """Steps over which the learning rate rises from 0."""
-    gradient_norm: float = 20.0
-    """Longest gradient; longer ones are shortened."""
-    averaging: float = 0.998
-    """Share of the averaged weights, which are those that are kept, that stays at each step."""
-    bfloat16: bool = True
-    """Multiply in 16 bits, which processors with AMX or AVX-512 BF16 do several times faster."""
-    backbone_rate: float = 0.3
-    """Learning rate of a backbone with ImageNet weights, as a share of the others'."""
-    fixed_blocks: int = FIXED_BLOCKS
-    """First blocks of a backbone with ImageNet weights that stay as they are, with the stem."""
-    plain_share: float = 0.0
-    """Last share of the steps without mosaics, so that the last pictures look like those to come."""
-    seed: int = 0
-    """Of the weights and the pictures."""
-    log_every: int = 50
-    """Steps between two lines of the history."""
-    save_every: int = 200
-    """Steps between two checkpoints."""
-    network: FruitNetworkConfig = field(default_factory=FruitNetworkConfig)
-    """Size of the network."""
-    augmentation: AugmentationConfig = field(default_factory=AugmentationConfig)
-    """How pictures are varied."""
-
-    def __post_init__(self) -> None:
-        for name in ("steps", "batch_size", "log_every", "save_every"):
-            if getattr(self, name) < 1:
-                raise InvalidInputError(f"{name} must be at least 1, got {getattr(self, name)}")
-        if not 0 < self.learning_rate < 1:
-            raise InvalidInputError(f"learning_rate must be between 0 and 1, got {self.learning_rate}")
-        if not 0 <= self.averaging < 1:
-            raise InvalidInputError(f"averaging must be from 0 to below 1, got {self.averaging}")
 
 
 class LightTraining(ResumableTraining):

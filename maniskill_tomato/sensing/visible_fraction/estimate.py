@@ -66,6 +66,8 @@ class Estimate:
     """The whole silhouette inside the image. Shape (height, width)."""
     centre_optical: tuple[float, float, float] | None = None
     """The tomato's centre in the optical frame, in [m], if the model knows it."""
+    radius_m: float = float("nan")
+    """Its radius in [m]; NaN if the model does not know it."""
 
     @property
     def visible_fraction(self) -> float:

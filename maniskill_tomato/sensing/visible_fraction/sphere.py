@@ -218,6 +218,7 @@ class _Fit:
             total=int(np.count_nonzero(whole)) + outside,
             whole=whole,
             centre_optical=centre,
+            radius_m=self.radius_m if self.measured else float("nan"),
         )
 
 

@@ -1,0 +1,267 @@
+"""What each experiment is asked to do. The command line fills these; nothing here is slow to import."""
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Literal
+
+from maniskill_tomato.errors import InvalidInputError
+
+ExperimentName = Literal["guided", "sparse"]
+
+DEFAULT_POLICIES = (
+    "random_viewpoint,fixed_sweep,3dmts,gradient_nbv,nbv_direction,nbv,view_quality,greedy_truth,oracle"
+)
+
+
+def check_positive(**values: int | None) -> None:
+    """Raises an `InvalidInputError` for the first value below 1; None is accepted."""
+    for name, value in values.items():
+        if value is not None and value < 1:
+            raise InvalidInputError(f"--{name.replace('_', '-')} must be 1 or more, got {value}")
+
+
+def check_seeds(seeds: tuple[int, ...]) -> None:
+    """Raises an `InvalidInputError` unless these are one or more different numbers of 0 or more."""
+    if not seeds or len(set(seeds)) != len(seeds) or min(seeds) < 0:
+        raise InvalidInputError(f"--seeds must be one or more different numbers of 0 or more, got {seeds}")
+
+
+@dataclass(frozen=True, kw_only=True)
+class EvaluationConfig:
+    """What to evaluate and what to write."""
+
+    env_id: str
+    episodes: int
+    seed: int
+    out: Path
+    """Folder of the results."""
+    env_options: dict[str, Any] = field(default_factory=dict)
+    """Options for `gymnasium.make` beside the defaults, for instance another plant."""
+    baseline: bool = True
+    """Also run uniformly random actions from the same seeds."""
+    video: bool = True
+    """Film the first episodes where the machine can render."""
+    films: int = 3
+    """How many episodes to film."""
+    title: str = "Evaluation"
+    training_run: Path | None = None
+    """A run whose training curves the report shows."""
+    show_progress: bool = True
+
+
+@dataclass(frozen=True, kw_only=True)
+class BenchmarkConfig:
+    """Compare policies on the same held-out episodes: benchmark.json, benchmark.md and plots."""
+
+    policies: str = DEFAULT_POLICIES
+    """Names of planners, files of trained policies, or LABEL=FILE, with commas between them."""
+    episodes: int = 500
+    """How many episodes of the list."""
+    episode_list: str = "held_out"
+    """Which fixed list: held_out to report, validation to choose, or a file of `scripts/certify_episodes.py`."""
+    seed: int = 0
+    """The first of them."""
+    out: Path = Path("runs/benchmark")
+    """Folder of the results. A benchmark that was stopped goes on there, and one with more policies or episodes keeps
+    what is done."""
+    jobs: int | None = None
+    """Processes at a time; by default one per processor core."""
+    sweeps: str = ""
+    """Also sweep over these, with commas: leaf_density, start_visibility, segmentation, depth, pose; or `all`."""
+    sweep_episodes: int = 100
+    """Episodes for each value of a sweep."""
+    sweep_policies: str = ""
+    """Which of the policies to sweep; all by default."""
+    contact_free_oracle: bool = False
+    """Let the oracle avoid the plant."""
+    pictures: bool = True
+    """Draw a grid of last views where this machine can render."""
+
+    def __post_init__(self) -> None:
+        check_positive(jobs=self.jobs)
+
+
+@dataclass(frozen=True, kw_only=True)
+class RowBenchmarkConfig:
+    """Judge policies on rows: how many of the tomatoes that can be seen they see, and what it costs.
+
+    Which tomatoes can be seen is asked of the truth, once for every row.
+    """
+
+    policies: str = "view_quality,nbv,random_viewpoint"
+    """Names of planners, files of trained policies, or LABEL=FILE, with commas between them."""
+    rows: int = 30
+    """How many rows."""
+    seed: int = 1000
+    """Seed of the first; the others follow."""
+    split: str = "held_out"
+    """Split of the plants: held_out to report, validation to choose."""
+    transits: str = "both"
+    """When the arm goes by its ready posture: none, target, refused or both."""
+    jobs: int = 1
+    """Processes at a time."""
+    out: Path = Path("runs/rows")
+    """Folder of the results; rows that are there are not searched again."""
+
+    def __post_init__(self) -> None:
+        check_positive(rows=self.rows, jobs=self.jobs)
+
+
+@dataclass(frozen=True, kw_only=True)
+class PerceptionConfig:
+    """Measure what a policy loses when it sees through the camera instead of the simulator, on the same episodes.
+
+    An episode ends when the robot believes that the target is fully visible, or after the last move. It is a success
+    if that is then true.
+    """
+
+    policies: str = "nbv"
+    """Names of planners, files of trained policies, or LABEL=FILE, with commas between them."""
+    episodes: int = 100
+    """How many of the list."""
+    seed: int = 0
+    """The first of them."""
+    episode_list: str = "held_out"
+    """Which fixed list."""
+    perceptions: tuple[str, ...] = ("ground_truth", "occlusion_model")
+    """What the policies see through; `segmenter` and the thesis's models need a renderer and seconds for a move."""
+    jobs: int = 1
+    """Processes at a time."""
+    out: Path = Path("runs/perception")
+    """Folder of the results; episodes that are there are not run again."""
+
+    def __post_init__(self) -> None:
+        check_positive(episodes=self.episodes, jobs=self.jobs)
+
+
+@dataclass(frozen=True, kw_only=True)
+class TwinConfig:
+    """Run the twin of `deploy` and the simulated task on the same held-out episodes with the same policy.
+
+    The difference of the two rates is what perception, depth noise, dynamics and the safety checks cost. An episode
+    whose run cannot begin, or ends with a fault, counts as failed.
+    """
+
+    profile: str = "mock"
+    """The twin's: name or TOML file."""
+    policy: str | None = None
+    """As for `deploy run`; by default the one that ships."""
+    episodes: int = 100
+    """How many episodes of the held-out list."""
+    seed: int = 0
+    """The first of them."""
+    record: bool = False
+    """Keep the recording of every run."""
+    out: Path = Path("runs/twin")
+    """Folder of summary.json and a folder for each run; episodes that are there are not run again."""
+
+    def __post_init__(self) -> None:
+        check_positive(episodes=self.episodes)
+
+
+@dataclass(frozen=True, kw_only=True)
+class RunComparisonConfig:
+    """Compare training runs: a report with a table over seeds and training curves over steps and time.
+
+    Runs of the same task and options are one configuration; their seeds give the interquartile mean and its 95 %
+    interval. A folder that holds run folders stands for all of them.
+    """
+
+    runs: tuple[Path, ...]
+    """Run folders, or folders that hold some."""
+    out: Path = Path("runs/comparison")
+    """Folder of the report."""
+    evaluate: int | None = None
+    """First judge the runs that have no evaluation, in this many episodes on the plants of their training."""
+    eval_seed: int = 1000
+    """Seed of the first of these episodes; the others follow."""
+
+    def __post_init__(self) -> None:
+        check_positive(evaluate=self.evaluate)
+
+
+@dataclass(frozen=True, kw_only=True)
+class AblationConfig:
+    """Compare a preset with variants of it that change one option each, over seeds and tasks.
+
+    What is already there is kept, so that it can be stopped and started again; the table is written after every run.
+    """
+
+    preset: str = "td3"
+    """The configuration that is varied."""
+    variants: tuple[str, ...] = ()
+    """Names of variants; by default all."""
+    env_ids: tuple[str, ...] = ("TomatoViewpointGuided-v1", "TomatoViewpointSparse-v1")
+    """Tasks."""
+    seeds: tuple[int, ...] = (0, 1, 2, 3, 4)
+    """Training seeds."""
+    episodes: int = 100
+    """Evaluation episodes of each run."""
+    total_timesteps: int | None = None
+    """Another length of the training than the preset's, for trials."""
+    jobs: int = 1
+    """Runs at a time."""
+    out: Path = Path("runs/ablation")
+    """Folder of the runs and of ablation.json and ablation.md."""
+
+    def __post_init__(self) -> None:
+        check_positive(episodes=self.episodes, jobs=self.jobs)
+        check_seeds(self.seeds)
+
+
+@dataclass(frozen=True, kw_only=True)
+class ReproductionConfig:
+    """Reproduce an experiment of the thesis over several seeds and draw the counterparts of its figures.
+
+    What is already there is kept, so that it can be stopped and started again.
+    """
+
+    experiment: ExperimentName
+    """guided: section 5-1; sparse: section 5-2."""
+    seeds: tuple[int, ...] = (0, 1, 2, 3, 4)
+    """Training seeds."""
+    out: Path = Path("runs/thesis")
+    """Folder of the results; each experiment and variant gets one in it."""
+    variant: tuple[str, ...] = ()
+    """Names of variants; by default the exact settings alone, or all of them with --ablate. A+B makes two changes, and
+    td3-without-A+B puts two parts of the preset td3 back to the exact settings."""
+    ablate: bool = False
+    """Judge each variant at the training pose only, draw nothing, and write the table ablation.md."""
+    episodes: int = 100
+    """Evaluation episodes; the first six are the thesis's."""
+    untrained: int = 200
+    """Freshly initialised actors whose first step is examined."""
+    views: bool = True
+    """Take the first and last view of the target where this machine can render."""
+    training_episodes: int | None = None
+    """Another length of the training, for trials."""
+    jobs: int = 1
+    """Trainings at a time."""
+    progress: bool = True
+    """Draw progress bars."""
+
+    def __post_init__(self) -> None:
+        check_positive(episodes=self.episodes, jobs=self.jobs, training_episodes=self.training_episodes)
+        check_seeds(self.seeds)
+
+
+@dataclass(frozen=True, kw_only=True)
+class OcclusionConfig:
+    """Judge occlusion models by their error in V_f on rendered images of plants that nothing was tuned on."""
+
+    data: Path
+    """A folder of `maniskill-tomato dataset`."""
+    out: Path = Path("runs/occlusion")
+    """Folder of the results."""
+    models: tuple[str, ...] = ("thesis", "improved", "sphere", "amodal")
+    """Which models."""
+    count: int | None = None
+    """Only the first images; all by default."""
+    categories: tuple[str, ...] = ("tomato_ripe",)
+    """Which tomatoes count; the thesis's model knows red ones only."""
+    min_visible: int = 100
+    """Tomatoes seen in fewer pixels are left out."""
+    min_total: int = 400
+    """Tomatoes whose whole silhouette has fewer pixels are left out: those of the rows behind."""
+    figure: str | None = None
+    """Draw every step on this image of the folder (steps.png, as Fig. 4-28) instead of judging."""

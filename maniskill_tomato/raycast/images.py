@@ -1,0 +1,51 @@
+"""Images by ray casting: what each pixel of a camera shows, without a renderer."""
+
+from dataclasses import dataclass
+from enum import IntEnum
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+from torch import Tensor
+
+BACKGROUND_DEPTH: Final = 4.0
+"""Depth of a pixel of `CastImages` that shows neither plant nor robot, in [m]: a greenhouse always has a wall."""
+
+ROBOT_LABEL: Final = 1
+"""Label of the robot in a `Picture`."""
+FIRST_ORGAN_LABEL: Final = 2
+"""Label of the plant's organ 0 in a `Picture`; organ k has this plus k."""
+
+
+class PixelLabel(IntEnum):
+    """What a pixel shows."""
+
+    NOTHING = 0
+    """The background."""
+    TARGET = 1
+    """The target fruit."""
+    PLANT = 2
+    """A leaf, a stem or another fruit."""
+    ROBOT = 3
+
+
+@dataclass(frozen=True, eq=False)
+class CastImages:
+    """What the cameras of B environments see, as a perfect segmenter that knows the target labels it."""
+
+    depth: Tensor
+    """Along the optical axis, in [m]; `BACKGROUND_DEPTH` for the background. Shape (B, H, W)."""
+    label: Tensor
+    """Values of `PixelLabel`, int8. Shape (B, H, W)."""
+
+
+@dataclass(frozen=True, eq=False)
+class Picture:
+    """What one camera sees, organ by organ and with shading; one ray through the middle of each pixel."""
+
+    depth: NDArray[np.float32]
+    """Along the optical axis, in [m], 0 where there is nothing. Shape (H, W)."""
+    labels: NDArray[np.int32]
+    """0 nothing, `ROBOT_LABEL`, or `FIRST_ORGAN_LABEL` plus the index in `Plant.organs`. Shape (H, W)."""
+    facing: NDArray[np.float32]
+    """Cosine of the angle between ray and surface, 1 where one looks straight at it. Shape (H, W)."""

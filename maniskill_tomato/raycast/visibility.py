@@ -1,0 +1,50 @@
+"""How much of a target fruit a camera sees: V_f = V / T (Eq. 4-4 of the thesis).
+
+T is the area of the target's whole silhouette in the image plane with nothing in front, also outside the
+image. V is the part of it inside the image that no leaf, stem, other fruit or robot link hides. The camera
+looks along the z axis of its optical frame, x points right and y down.
+
+The target counts as not visible (V = 0) where its bounding sphere lies behind the camera's near plane or
+holds the camera. It has no silhouette then, and T is that of such a sphere straight ahead.
+"""
+
+from dataclasses import dataclass
+
+from torch import Tensor
+
+
+@dataclass(frozen=True, eq=False)
+class Visibility:
+    """What the camera of each environment sees of its target."""
+
+    rows: Tensor
+    """The answers below, one row each, float32. Shape (8, B)."""
+
+    @property
+    def visible_fraction(self) -> Tensor:
+        """V_f = V / T (Eq. 4-4), in [0, 1]. Shape (B,)."""
+        return self.rows[0]
+
+    @property
+    def visible(self) -> Tensor:
+        """V: visible area of the target, in [px] of the configured camera. Shape (B,)."""
+        return self.rows[1]
+
+    @property
+    def total(self) -> Tensor:
+        """T: area of the target's whole silhouette, in [px] of the configured camera. Shape (B,)."""
+        return self.rows[2]
+
+    @property
+    def any_visible(self) -> Tensor:
+        """Whether the target or another ripe fruit of the plant is seen by any ray, bool. Shape (B,)."""
+        return self.rows[3] > 0.5
+
+    @property
+    def occluders(self) -> Tensor:
+        """The hidden part of T by what hides it: image edge, leaf or stem, other fruit, robot. Shape (B, 4).
+
+        Fractions of T: each row and the visible fraction add up to 1. What lies outside the image counts for
+        the edge alone, what a link hides for the robot alone, the rest for the organ nearest to the camera.
+        """
+        return self.rows[4:8].T

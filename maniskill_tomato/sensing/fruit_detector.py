@@ -1,0 +1,118 @@
+"""From a frame to the fruits in it: masks by a segmenter, V_f and place by an occlusion model."""
+
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from maniskill_tomato.errors import InvalidInputError
+from maniskill_tomato.segmentation.instances import Instances, mask_box
+from maniskill_tomato.segmentation.masks import BinaryMask
+from maniskill_tomato.segmentation.segmenter import Segmenter
+from maniskill_tomato.sensing.measurement import DetectedFruit, Measurement, Position
+from maniskill_tomato.sensing.posed_frame import PosedFrame
+from maniskill_tomato.sensing.visible_fraction.estimate import (
+    Estimate,
+    OcclusionModel,
+    TomatoView,
+    fruit_depth,
+)
+from maniskill_tomato.sensing.visible_fraction.sphere import SphereConfig, SphereModel
+
+FEWEST_PIXELS: Final = 12
+"""A fruit with fewer visible pixels is left out."""
+
+LEAST_SCORE: Final = 0.3
+"""A fruit with a lower score is left out. Low, because fruits that are mostly hidden get low scores."""
+
+USUAL_RADIUS: Final = 0.029
+"""Median radius of the tasks' tomatoes, in [m]."""
+
+RADIUS_SPREAD: Final = 0.14
+"""Standard deviation of the logarithm of their radius."""
+
+SURFACE_SHARE: Final = 0.7
+"""The centre of a fruit lies this share of a radius behind the median depth of its visible surface."""
+
+
+class FruitDetector:
+    """Measures frames; the same for simulated and real cameras."""
+
+    def __init__(self, segmenter: Segmenter | None, model: OcclusionModel | None = None) -> None:
+        """Keeps both parts.
+
+        Args:
+            segmenter: Finds fruits in colours and depth; None takes `PosedFrame.true_fruits`.
+            model: Estimates V_f and centre; by default `SphereModel` with the size of the tasks' tomatoes.
+        """
+        self._segmenter = segmenter
+        self._model = model or SphereModel(SphereConfig(radius_m=USUAL_RADIUS, radius_spread=RADIUS_SPREAD))
+
+    def measure(self, frame: PosedFrame) -> Measurement:
+        """The fruits of a frame.
+
+        Raises:
+            InvalidInputError: The frame lacks the colours or the true fruits that the segmentation needs.
+        """
+        found = self._segmented(frame)
+        kept = found.scores >= LEAST_SCORE
+        if len(found):
+            kept = kept & (np.count_nonzero(found.masks, axis=(1, 2)) >= FEWEST_PIXELS)
+        found = found.chosen(kept)
+        masks = tuple(np.ascontiguousarray(mask) for mask in found.masks)
+        depth = frame.depth_m.astype(np.float64)
+        rgb = np.zeros((*depth.shape, 3), np.uint8) if frame.rgb is None else frame.rgb
+        view = TomatoView(rgb=rgb, depth_m=depth, masks=masks, intrinsics=frame.intrinsics)
+        fruits = tuple(
+            _fruit(frame, view, mask, estimate, category, float(score))
+            for mask, estimate, category, score in zip(
+                masks, self._model(view), found.categories, found.scores, strict=True
+            )
+        )
+        return Measurement(frame=frame, fruits=fruits)
+
+    def _segmented(self, frame: PosedFrame) -> Instances:
+        if self._segmenter is None:
+            if frame.true_fruits is None:
+                raise InvalidInputError("perfect masks need a simulated camera; choose a segmenter")
+            return frame.true_fruits
+        if frame.rgb is None:
+            raise InvalidInputError("a segmenter needs a picture with colours")
+        return self._segmenter(frame.rgb, frame.depth_m)
+
+
+def _fruit(
+    frame: PosedFrame,
+    view: TomatoView,
+    mask: BinaryMask,
+    estimate: Estimate,
+    category: str,
+    score: float,
+) -> DetectedFruit:
+    left, top, right, bottom = mask_box(mask)
+    crop = mask[top:bottom, left:right].copy()
+    rows, columns = np.nonzero(crop)
+    pixel = np.array([left + columns.mean() + 0.5, top + rows.mean() + 0.5])
+    ray = frame.intrinsics.ray_directions(pixel)
+    rotation = frame.T_world_camera[:3, :3]
+    centre = _centre(estimate, view, mask, ray)
+    return DetectedFruit(
+        category=category,
+        score=score,
+        corner=(top, left),
+        crop=crop,
+        visible_fraction=estimate.visible_fraction,
+        centre_w=None if centre is None else rotation @ centre + frame.T_world_camera[:3, 3],
+        radius_m=estimate.radius_m,
+        direction_w=rotation @ (ray / np.linalg.norm(ray)),
+    )
+
+
+def _centre(
+    estimate: Estimate, view: TomatoView, mask: BinaryMask, ray: NDArray[np.float64]
+) -> Position | None:
+    """Centre in the optical frame, in [m]: the model's, or one behind the middle of the mask. Shape (3,)."""
+    if estimate.centre_optical is not None:
+        return np.array(estimate.centre_optical)
+    z = fruit_depth(view.depth_m, mask)
+    return ray * (z + SURFACE_SHARE * USUAL_RADIUS) if np.isfinite(z) else None

@@ -1,0 +1,40 @@
+"""A camera's picture with depth and the pose that it was taken from: all that sensing asks of a device."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from maniskill_tomato.errors import InvalidInputError
+from maniskill_tomato.robot.d435 import CameraIntrinsics
+from maniskill_tomato.segmentation.instances import Instances
+from maniskill_tomato.segmentation.masks import BinaryMask
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class PosedFrame:
+    """One picture of an RGB-D camera, real or simulated, with depth aligned to colour."""
+
+    depth_m: NDArray[np.float32]
+    """Along the optical axis, in [m]; 0 or not finite where there is no measurement. Shape (H, W)."""
+    intrinsics: CameraIntrinsics
+    """Of colours and depth."""
+    T_world_camera: NDArray[np.float64]
+    """Pose of the optical frame in the robot's base frame, translation in [m]. Shape (4, 4)."""
+    rgb: NDArray[np.uint8] | None = None
+    """Colours; None from a camera that has none, such as a ray-cast one. Shape (H, W, 3)."""
+    robot_mask: BinaryMask | None = None
+    """Where the picture shows the robot itself, if that is known. Shape (H, W)."""
+    true_fruits: Instances | None = None
+    """The fruits that a simulated camera knows to be in the picture, for perfect segmentation."""
+
+    def __post_init__(self) -> None:
+        size = (self.intrinsics.height, self.intrinsics.width)
+        for name, array, shape in (
+            ("depth_m", self.depth_m, size),
+            ("rgb", self.rgb, (*size, 3)),
+            ("robot_mask", self.robot_mask, size),
+            ("T_world_camera", self.T_world_camera, (4, 4)),
+        ):
+            if array is not None and array.shape != shape:
+                raise InvalidInputError(f"{name} must have shape {shape}, got {array.shape}")

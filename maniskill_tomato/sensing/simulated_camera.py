@@ -1,0 +1,143 @@
+"""The wrist cameras of N simulated environments: depth with the D435's faults, and masks or rendered colours."""
+
+from collections.abc import Callable
+from typing import Final, Literal
+
+import numpy as np
+from torch import Tensor
+
+from maniskill_tomato.raycast.images import PixelLabel
+from maniskill_tomato.raycast.scene import RayScene
+from maniskill_tomato.raycast.view_rays import DEPTH_MODE
+from maniskill_tomato.robot.d435 import CameraIntrinsics, color_intrinsics
+from maniskill_tomato.robot.depth_noise import DepthNoise, measure_depth
+from maniskill_tomato.segmentation.instances import Instances
+from maniskill_tomato.segmentation.segmenter import make_segmenter
+from maniskill_tomato.sensing.camera_perception import CameraPerception
+from maniskill_tomato.sensing.fruit_detector import FruitDetector
+from maniskill_tomato.sensing.measurement import Position
+from maniskill_tomato.sensing.posed_frame import PosedFrame
+from maniskill_tomato.sensing.visible_fraction.estimate import OcclusionModel, UInt8
+from maniskill_tomato.sensing.visible_fraction.improved import ImprovedModel
+from maniskill_tomato.sensing.visible_fraction.thesis import ThesisModel
+
+Perception = Literal["ground_truth", "occlusion_model", "thesis_model", "improved_model", "segmenter"]
+"""What reward, observation and the target's position come from.
+
+`occlusion_model`: `SphereModel` on a perfect mask and noisy depth. `thesis_model`, `improved_model`: those models on
+the same and rendered colours. `segmenter`: the light segmenter's masks in rendered colours, then `SphereModel`."""
+
+RENDERED: Final[tuple[Perception, ...]] = ("thesis_model", "improved_model", "segmenter")
+"""Those that need colours, and so a renderer."""
+
+IMAGE_SIZE: Final = (320, 240)
+"""Width and height of cast images, in [px]."""
+
+RENDERED_SIZE: Final = (640, 480)
+"""Width and height of rendered ones unless `sensor_configs` says otherwise, in [px]: the camera's own."""
+
+COARSE_POSITION: Final = 0.03
+"""Standard deviation of each coordinate of a target's position before it was first seen, in [m]: that of a map of the
+row made from further away."""
+
+
+class SimulatedCamera:
+    """Takes frames of N environments; the errors of each come from its own random numbers."""
+
+    def __init__(
+        self,
+        scene: RayScene,
+        *,
+        intrinsics: CameraIntrinsics | None = None,
+        noise: DepthNoise | None = None,
+        picture: Callable[[int], UInt8] | None = None,
+    ) -> None:
+        """Prepares the images.
+
+        Args:
+            scene: The environments' plants and links.
+            intrinsics: Of the images; `IMAGE_SIZE` of the colour camera if None.
+            noise: Faults of the depth, the defaults if None.
+            picture: Renders the colours of an environment by its index, shape (H, W, 3); if None there are none.
+        """
+        self._scene = scene
+        self._intrinsics = intrinsics or color_intrinsics(*IMAGE_SIZE)
+        self._noise = noise or DepthNoise()
+        self._picture = picture
+        self._generators = [np.random.default_rng(0) for _ in range(scene.num_envs)]
+
+    def seed(self, env_index: int, seed: int) -> None:
+        """Begins an environment's random numbers, from which all errors of an episode follow."""
+        self._generators[env_index] = np.random.default_rng(seed)
+
+    def coarse_position(self, env_index: int, target_position: Position) -> Position:
+        """Where a target that was not seen yet is believed to be, world frame, in [m]. Shape (3,)."""
+        return target_position + self._generators[env_index].normal(0.0, COARSE_POSITION, 3)
+
+    def take(
+        self,
+        T_world_camera: Tensor,
+        target: Tensor,
+        T_world_plant: Tensor,
+        links: Tensor,
+        mask: Tensor | None = None,
+    ) -> list[PosedFrame | None]:
+        """Takes a frame in each environment, or in some.
+
+        Args:
+            T_world_camera: Poses of the optical frames. Shape (N, 4, 4).
+            target: Indices of the targets in `Plant.fruits`; `PosedFrame.true_fruits` has the target alone. Shape (N,).
+            T_world_plant: Poses of the plants. Shape (N, 4, 4).
+            links: World poses of the links. Shape (N, 9, 4, 4).
+            mask: Which environments take one, all if None; the others get None. Shape (N,), bool.
+        """
+        images = self._scene.image(self._intrinsics, T_world_camera, target, T_world_plant, links)
+        frames: list[PosedFrame | None] = []
+        for k, generator in enumerate(self._generators):
+            if mask is not None and not bool(mask[k]):
+                frames.append(None)
+                continue
+            exact = images.depth[k].cpu().numpy().astype(np.float64)
+            depth = measure_depth(exact, self._intrinsics, self._noise, generator, stereo=DEPTH_MODE)
+            label = images.label[k].cpu().numpy()
+            frames.append(
+                PosedFrame(
+                    depth_m=depth.astype(np.float32),
+                    intrinsics=self._intrinsics,
+                    T_world_camera=T_world_camera[k].double().cpu().numpy(),
+                    rgb=None if self._picture is None else self._picture(k),
+                    robot_mask=label == int(PixelLabel.ROBOT),
+                    true_fruits=Instances.from_masks(label[None] == int(PixelLabel.TARGET)),
+                )
+            )
+        return frames
+
+
+def make_camera(
+    perception: Perception,
+    scene: RayScene,
+    intrinsics: CameraIntrinsics,
+    picture: Callable[[int], UInt8],
+) -> tuple[SimulatedCamera, CameraPerception] | None:
+    """The camera of a kind of perception and what measures its frames; None for ground truth.
+
+    Args:
+        perception: Which.
+        scene: The environments' plants and links.
+        intrinsics: Of rendered pictures.
+        picture: Renders them, by the index of an environment.
+    """
+    if perception == "ground_truth":
+        return None
+    segmenter = make_segmenter("light") if perception == "segmenter" else None
+    models: dict[Perception, OcclusionModel] = {
+        "thesis_model": ThesisModel(),
+        "improved_model": ImprovedModel(),
+    }
+    detector = FruitDetector(segmenter, models.get(perception))
+    if perception in RENDERED:
+        camera = SimulatedCamera(scene, intrinsics=intrinsics, picture=picture)
+    else:
+        camera = SimulatedCamera(scene)
+    known = perception != "segmenter"
+    return camera, CameraPerception(scene.num_envs, detector, identity_known=known, device=scene.device)

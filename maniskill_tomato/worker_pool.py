@@ -1,0 +1,97 @@
+"""Work shared among several processes that end with the one that started them, however that ends."""
+
+import contextlib
+import multiprocessing
+import multiprocessing.connection
+import os
+import signal
+import threading
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from typing import TypeVar
+
+from maniskill_tomato.errors import InvalidInputError
+
+Job = TypeVar("Job")
+Result = TypeVar("Result")
+
+ONE_THREAD = {"OMP_NUM_THREADS": "1", "OPENCV_FOR_THREADS_NUM": "1", "LP_NUM_THREADS": "1"}
+"""Variables that keep numerical libraries, OpenCV and Mesa's CPU renderer from taking all cores in each process."""
+
+
+def run_jobs(
+    function: Callable[[Job], Result],
+    jobs: Sequence[Job],
+    processes: int,
+    warm_up: Callable[[], None] | None = None,
+) -> Iterator[tuple[Job, Result]]:
+    """Calls a function with every job; yields each job with its result as it becomes known.
+
+    An exception of the function is raised here and ends the other processes, as does leaving the loop early.
+
+    Args:
+        function: A function of a module, since other processes must find it.
+        jobs: What it is called with; they are begun in this order.
+        processes: How many at a time; 1 stands for this process itself.
+        warm_up: Called once in each process before its first job.
+
+    Raises:
+        InvalidInputError: `processes` is less than 1.
+    """
+    if processes < 1:
+        raise InvalidInputError(f"the number of processes must be 1 or more, got {processes}")
+    if processes == 1 or not jobs:
+        if jobs and warm_up is not None:
+            warm_up()
+        for job in jobs:
+            yield job, function(job)
+        return
+    # A forked child would share Warp's and the simulator's state with this process.
+    context = multiprocessing.get_context("spawn")
+    others = set(multiprocessing.active_children())
+    pool = ProcessPoolExecutor(
+        min(processes, len(jobs)), mp_context=context, initializer=_start_worker, initargs=(warm_up,)
+    )
+    try:
+        with _environment(ONE_THREAD):
+            futures = {pool.submit(function, job): job for job in jobs}
+        for future in as_completed(futures):
+            yield futures[future], future.result()
+    except BaseException:
+        pool.shutdown(wait=False, cancel_futures=True)
+        for worker in set(multiprocessing.active_children()) - others:
+            worker.kill()
+        raise
+    finally:
+        pool.shutdown()
+
+
+def _start_worker(warm_up: Callable[[], None] | None) -> None:
+    import torch
+
+    # Ctrl-C in a terminal reaches every process of it; the first one decides.
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    threading.Thread(target=_end_with_parent, daemon=True).start()
+    torch.set_num_threads(1)
+    if warm_up is not None:
+        warm_up()
+
+
+def _end_with_parent() -> None:
+    """Waits for the other end of a pipe to close, which the system does even for a process that is killed."""
+    parent = multiprocessing.parent_process()
+    if parent is not None:
+        multiprocessing.connection.wait([parent.sentinel])
+        os._exit(1)
+
+
+@contextlib.contextmanager
+def _environment(variables: dict[str, str]) -> Iterator[None]:
+    """Environment variables for the processes that are started meanwhile, unless they have a value."""
+    new = {name: value for name, value in variables.items() if name not in os.environ}
+    os.environ.update(new)
+    try:
+        yield
+    finally:
+        for name in new:
+            del os.environ[name]
