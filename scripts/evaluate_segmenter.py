@@ -14,9 +14,10 @@ import tyro
 
 from maniskill_tomato.errors import TomatoError
 from maniskill_tomato.files import write_atomically
+from maniskill_tomato.segmentation.datasets.annotations import SMALLEST_SHARE
+from maniskill_tomato.segmentation.datasets.reading import read_place
 from maniskill_tomato.segmentation.metrics.detector_evaluation import evaluate_segmenter
 from maniskill_tomato.segmentation.segmenter import open_for_files
-from maniskill_tomato.segmentation.training.training_pictures import SMALLEST_SHARE, read_place
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -16,7 +16,7 @@ from tqdm import tqdm
 
 from maniskill_tomato.errors import InvalidInputError, TomatoError
 from maniskill_tomato.files import write_atomically
-from maniskill_tomato.segmentation.datasets.formats import read_annotated
+from maniskill_tomato.segmentation.datasets.reading import read_annotated
 from maniskill_tomato.sensing.visible_fraction.amodal import AmodalModel
 from maniskill_tomato.sensing.visible_fraction.estimate import OcclusionModel
 from maniskill_tomato.sensing.visible_fraction.figure import draw_steps

@@ -20,13 +20,13 @@ import tyro
 from maniskill_tomato.errors import InvalidInputError, TomatoError
 from maniskill_tomato.learning.interrupt import stop_on_signals
 from maniskill_tomato.segmentation.datasets.annotations import AnnotatedImage
+from maniskill_tomato.segmentation.datasets.reading import read_place
 from maniskill_tomato.segmentation.metrics.detection_plots import plot_losses
 from maniskill_tomato.segmentation.training.detector_presets import MASK_RCNN_PRESETS, YOLO_PRESET
 from maniskill_tomato.segmentation.training.light_config import LightTrainConfig
 from maniskill_tomato.segmentation.training.light_training import LightTraining
 from maniskill_tomato.segmentation.training.mask_rcnn_training import MaskRcnnTraining
 from maniskill_tomato.segmentation.training.resumable_training import CHECKPOINT, ResumableTraining
-from maniskill_tomato.segmentation.training.training_pictures import read_place
 from maniskill_tomato.segmentation.yolo import (
     read_history,
     stock_settings,
@@ -83,10 +83,10 @@ class Light(DataArgs):
 
 @dataclass(frozen=True, kw_only=True)
 class MaskRcnn(DataArgs):
-    """Mask R-CNN with the thesis's settings, or the light one."""
+    """Mask R-CNN with the thesis's settings, or small enough for a CPU."""
 
-    preset: Literal["light", "light-lite0", "strategy-1", "strategy-2", "strategy-3"] = "light"
-    """Settings: `light` and `light-lite0` for a CPU, or those of Tables 4-3, 4-4 and section 6-2."""
+    preset: Literal["light-lite0", "strategy-1", "strategy-2", "strategy-3"] = "light-lite0"
+    """Settings: `light-lite0` for a CPU, or those of Tables 4-3, 4-4 and section 6-2."""
     pretrained: bool = False
     """Start from ImageNet weights of the backbone: of `light-lite0` those of the extra `pretrained`, of the others
     torchvision's, which are downloaded."""

@@ -37,9 +37,9 @@ class Dataset:
         """Renders what is missing and says where it is."""
         from tqdm import tqdm
 
-        from maniskill_tomato.segmentation.datasets.formats import read_annotated
-        from maniskill_tomato.segmentation.synthesis.dataset import DatasetConfig, make_dataset
-        from maniskill_tomato.segmentation.synthesis.statistics import write_statistics
+        from maniskill_tomato.segmentation.datasets.reading import read_annotated
+        from maniskill_tomato.segmentation.synthesis.dataset_page import write_statistics
+        from maniskill_tomato.segmentation.synthesis.dataset_rendering import DatasetConfig, make_dataset
 
         config = DatasetConfig(
             count=self.count,

@@ -28,9 +28,10 @@ class Detect:
     def run(self) -> None:
         """Detects and says how many."""
         from maniskill_tomato.errors import InvalidInputError
-        from maniskill_tomato.segmentation.detect import detect, image_files
+        from maniskill_tomato.segmentation.datasets.picture_files import write_picture
+        from maniskill_tomato.segmentation.detection_list import detect, image_files
+        from maniskill_tomato.segmentation.drawing import draw_instances
         from maniskill_tomato.segmentation.instances import Image, Instances
-        from maniskill_tomato.segmentation.pictures import draw_instances, write_picture
         from maniskill_tomato.segmentation.segmenter import open_for_files
 
         if not 0 <= self.score_threshold <= 1:

@@ -31,7 +31,7 @@ from maniskill_tomato.segmentation.yolo import (
 )
 
 TINY = replace(
-    MASK_RCNN_PRESETS["light"],
+    MASK_RCNN_PRESETS["light-lite0"],
     epochs=2,
     steps_per_epoch=1,
     batch_size=1,

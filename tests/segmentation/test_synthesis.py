@@ -22,7 +22,7 @@ from maniskill_tomato.robot.d435 import (
     min_depth,
 )
 from maniskill_tomato.robot.depth_noise import DepthNoise, measure_depth
-from maniskill_tomato.segmentation.synthesis.dataset import DatasetConfig, _numbers, make_dataset
+from maniskill_tomato.segmentation.synthesis.dataset_rendering import DatasetConfig, _numbers, make_dataset
 from maniskill_tomato.segmentation.synthesis.silhouette import draw_silhouette
 
 CAMERA = color_intrinsics(320, 240)
@@ -149,8 +149,8 @@ def test_a_small_data_set_is_whole_continued_and_the_same_again(
     tmp_path: Path, load_script: Callable[[str], ModuleType]
 ) -> None:
     from maniskill_tomato.rendering.vulkan_probe import rendering_available
-    from maniskill_tomato.segmentation.datasets.formats import read_annotated
-    from maniskill_tomato.segmentation.synthesis.statistics import write_statistics
+    from maniskill_tomato.segmentation.datasets.reading import read_annotated
+    from maniskill_tomato.segmentation.synthesis.dataset_page import write_statistics
 
     if not rendering_available():
         pytest.skip("needs a Vulkan device")

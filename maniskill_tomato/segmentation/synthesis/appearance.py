@@ -17,7 +17,7 @@ Backdrop = Literal["foliage", "gutters", "bright"]
 
 
 @dataclass(frozen=True, kw_only=True)
-class SceneLook:
+class SceneAppearance:
     """One greenhouse, one moment of the day, one crop."""
 
     crop: PlantConfig
@@ -104,8 +104,8 @@ def draw_crop(rng: Generator) -> PlantConfig:
     return replace(base, leaf=leaf, truss=truss, fruit=fruit, fruits_per_truss=counts)
 
 
-def draw_look(rng: Generator, *, vary_crop: bool = True) -> SceneLook:
-    """Draws a scene's look.
+def draw_appearance(rng: Generator, *, vary_crop: bool = True) -> SceneAppearance:
+    """Draws the appearance of a scene.
 
     Args:
         rng: Its random numbers.
@@ -124,7 +124,7 @@ def draw_look(rng: Generator, *, vary_crop: bool = True) -> SceneLook:
     elif kind < 0.7:
         backdrop = "bright"
     wall = float(np.exp(rng.uniform(np.log(0.2), np.log(3.0))))
-    return SceneLook(
+    return SceneAppearance(
         crop=crop,
         leaf_density=float(rng.uniform(0.6, 1.9)) if vary_crop else 1.0,
         sun_direction=(

@@ -8,7 +8,7 @@ from typing import Any
 
 from maniskill_tomato.errors import InvalidInputError
 from maniskill_tomato.files import write_atomically
-from maniskill_tomato.segmentation.datasets.annotations import read_picture
+from maniskill_tomato.segmentation.datasets.picture_files import read_picture
 from maniskill_tomato.segmentation.instances import Image, Instances
 from maniskill_tomato.segmentation.masks import EncodedMask
 from maniskill_tomato.segmentation.segmenter import Segmenter

@@ -2,13 +2,10 @@
 
 import colorsys
 from collections.abc import Sequence
-from pathlib import Path
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
-from maniskill_tomato.files import write_atomically
 from maniskill_tomato.segmentation.instances import Image, Instances
 
 
@@ -50,14 +47,3 @@ def contact_sheet(images: Sequence[Image], columns: int = 4, tile: int = 320) ->
         top, left = number // columns * tile, number % columns * tile
         sheet[top : top + size[1], left : left + size[0]] = small
     return sheet
-
-
-def write_picture(path: Path, image: NDArray[np.uint8]) -> None:
-    """Writes an image as PNG or JPEG, as its name says, whole or not at all.
-
-    Raises:
-        CheckpointError: The file cannot be written.
-    """
-    suffix = path.suffix.lower() if path.suffix.lower() in (".jpg", ".jpeg", ".png") else ".png"
-    _, data = cv2.imencode(suffix, np.ascontiguousarray(image[..., ::-1]))
-    write_atomically(path, bytes(data))

@@ -1,10 +1,10 @@
-"""The task's own observation, from an arm's joints and a view of its camera."""
+"""The task's belief and observation from an arm's measured joints and what its camera sighted."""
 
 import numpy as np
 import torch
 
 from maniskill_tomato.deploy.interface import Float64
-from maniskill_tomato.deploy.perceive import View
+from maniskill_tomato.deploy.robot_perception import Sighting
 from maniskill_tomato.robot.kinematics import forward_kinematics, link_transforms
 from maniskill_tomato.robot.rotations import matrix_to_rpy
 from maniskill_tomato.sensing.belief import Belief
@@ -14,36 +14,27 @@ FIRST_RPY = (0.0, np.pi / 2, 0.0)
 """The angles that those of the first view are near to, in [rad], as in the task: along +x, upright."""
 
 
-class Observing:
-    """One target's views, one after the other, as `TomatoViewpoint-v1` takes them."""
+class RobotBelief:
+    """What is known of one target, view after view, as `TomatoViewpoint-v1` takes them."""
 
     def __init__(
-        self, T_flange_camera: Float64, max_moves: int, layout: ObservationLayout | None = None
+        self,
+        T_flange_camera: Float64,
+        max_moves: int,
+        layout: ObservationLayout | None = None,
     ) -> None:
-        """Begins without a target.
+        """Begins without a view.
 
         Args:
             T_flange_camera: The camera's optical frame in `link_ee`. Shape (4, 4).
             max_moves: Moves of an episode.
-            layout: What the vector holds.
+            layout: What the observation holds.
         """
         self._exact_mount = torch.as_tensor(np.array(T_flange_camera), dtype=torch.float64)
         self._mount = self._exact_mount.float()
         self._observer = ViewpointObserver(1, layout=layout, max_moves=max_moves)
         self._rpy = torch.tensor([FIRST_RPY])
-        self._target: Float64 | None = None
-
-    @property
-    def target_position(self) -> Float64 | None:
-        """World frame, in [m]; None before `begin`. Shape (3,)."""
-        return self._target
-
-    def begin(self, target_position: Float64) -> None:
-        """Forgets what was seen; from now on this is the target, in the world frame, in [m]. Shape (3,)."""
-        self._target = np.array(target_position, dtype=np.float64)
-        env_idx = torch.zeros(1, dtype=torch.int64)
-        self._observer.begin(env_idx, torch.as_tensor(self._target, dtype=torch.float32)[None])
-        self._rpy = torch.tensor([FIRST_RPY])
+        self._has_views = False
 
     def camera_pose(self, joint_positions: Float64) -> Float64:
         """Pose of the optical frame, in single precision as in the task. Shape (4, 4)."""
@@ -57,22 +48,26 @@ class Observing:
         position: Float64 = pose[0, :3, 3].numpy()
         return position
 
-    def observe(self, joint_positions: Float64, view: View, moves_left: int) -> Belief:
+    def observe(self, joint_positions: Float64, sighting: Sighting, moves_left: int) -> Belief:
         """Takes a view into the memory; once for every view.
 
         Args:
             joint_positions: When the picture was taken, in [rad]. Shape (7,).
-            view: What the picture told.
+            sighting: What the picture told.
             moves_left: Moves until the run ends.
         """
+        if not self._has_views:
+            target = torch.as_tensor(sighting.target_position, dtype=torch.float32)[None]
+            self._observer.begin(torch.zeros(1, dtype=torch.int64), target)
+            self._has_views = True
         T_world_flange, T_world_camera = self._poses(joint_positions)
         self._rpy = matrix_to_rpy(T_world_flange[:, :3, :3], self._rpy)
         viewpoint = torch.cat([T_world_flange[:, :3, 3], self._rpy], dim=-1)
         self._observer.observe(
             viewpoint,
             T_world_camera,
-            view.rays,
-            torch.tensor([view.visible_fraction], dtype=torch.float32),
+            sighting.rays,
+            torch.tensor([sighting.visible_fraction], dtype=torch.float32),
             torch.tensor([moves_left]),
         )
         return self._observer.belief

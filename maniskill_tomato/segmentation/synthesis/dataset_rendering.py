@@ -11,7 +11,6 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any, Final, Literal
 
-import cv2
 import numpy as np
 
 from maniskill_tomato.errors import InvalidInputError, RenderingUnavailableError
@@ -26,6 +25,7 @@ from maniskill_tomato.segmentation.datasets.annotations import (
     joined,
 )
 from maniskill_tomato.segmentation.datasets.coco import read_coco, write_coco
+from maniskill_tomato.segmentation.datasets.picture_files import write_picture
 from maniskill_tomato.segmentation.datasets.voc import write_voc
 from maniskill_tomato.worker_pool import run_jobs
 
@@ -192,26 +192,26 @@ def render_scene(config: DatasetConfig, out: Path, scene: int) -> int:
     """
     from maniskill_tomato.robot.depth_noise import DepthNoise, measure_depth
     from maniskill_tomato.segmentation.synthesis.annotate import annotate
-    from maniskill_tomato.segmentation.synthesis.camera import develop, draw_camera_look
-    from maniskill_tomato.segmentation.synthesis.look import draw_look
-    from maniskill_tomato.segmentation.synthesis.scene import GreenhouseScene, grow
-    from maniskill_tomato.segmentation.synthesis.views import draw_views
+    from maniskill_tomato.segmentation.synthesis.appearance import draw_appearance
+    from maniskill_tomato.segmentation.synthesis.greenhouse import GreenhouseScene, grow
+    from maniskill_tomato.segmentation.synthesis.photo import develop, draw_photo_settings
+    from maniskill_tomato.segmentation.synthesis.viewpoints import draw_views
 
     low, high = SEED_SPLITS[config.split]
     rng = np.random.default_rng([config.seed, low, scene])
-    look = draw_look(rng, vary_crop=config.vary_crop)
-    coarse, fine = grow(look, low + int(rng.integers(high - low)), (low, high))
+    appearance = draw_appearance(rng, vary_crop=config.vary_crop)
+    coarse, fine = grow(appearance, low + int(rng.integers(high - low)), (low, high))
     intrinsics = color_intrinsics(config.width, config.height)
     views = draw_views(coarse, VIEWS_PER_SCENE, intrinsics, rng)
-    built = GreenhouseScene(fine, look, intrinsics, rng, first_seed=low)
+    built = GreenhouseScene(fine, appearance, intrinsics, rng, first_seed=low)
     images = []
     for number, view in zip(_numbers(config, scene), views, strict=False):
         # Numbers of its own for each image: a larger count must not change the others.
         rng = np.random.default_rng([config.seed, low, scene, number])
-        sun = draw_look(rng)
-        built.relight(replace(look, sun=sun.sun, sun_direction=sun.sun_direction))
+        sun = draw_appearance(rng)
+        built.relight(replace(appearance, sun=sun.sun, sun_direction=sun.sun_direction))
         shot = built.shoot(view.T_plant_optical)
-        photo = develop(shot.light, shot.depth_m, draw_camera_look(rng), rng)
+        photo = develop(shot.light, shot.depth_m, draw_photo_settings(rng), rng)
         noise = DepthNoise(
             subpixel_rms=float(rng.uniform(0.03, 0.12)), hole_share=float(rng.uniform(0.0, 0.04))
         )
@@ -219,8 +219,8 @@ def render_scene(config: DatasetConfig, out: Path, scene: int) -> int:
         name = f"images/{number:06d}.jpg"
         depth_path = out / "depth" / f"{number:06d}.png"
         quality = int(rng.integers(max(config.quality - 14, 1), config.quality + 1))
-        write_atomically(out / name, _encoded(".jpg", photo[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, quality]))
-        write_atomically(depth_path, _encoded(".png", depth_mm, []))
+        write_picture(out / name, photo, quality)
+        write_picture(depth_path, depth_mm)
         images.append(
             AnnotatedImage(
                 path=out / name,
@@ -234,10 +234,3 @@ def render_scene(config: DatasetConfig, out: Path, scene: int) -> int:
         )
     write_coco(AnnotatedImages(images=tuple(images)), out / "scenes", name=f"{scene:06d}")
     return scene
-
-
-def _encoded(suffix: str, pixels: Any, options: list[int]) -> bytes:
-    ok, content = cv2.imencode(suffix, np.ascontiguousarray(pixels), options)
-    if not ok:
-        raise InvalidInputError(f"OpenCV cannot write {suffix} files")
-    return bytes(content.tobytes())

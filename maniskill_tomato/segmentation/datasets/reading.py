@@ -30,3 +30,15 @@ def read_annotated(path: Path | str, split: str | None = None) -> AnnotatedImage
         f"{path} holds neither a COCO file (*.json with images, annotations, categories) "
         "nor Pascal VOC annotations (*.xml)"
     )
+
+
+def read_place(place: str) -> AnnotatedImages:
+    """The annotated images of FOLDER, or of FOLDER:SPLIT for one list of it.
+
+    Raises:
+        InvalidInputError: There is nothing usable.
+    """
+    if Path(place).exists():
+        return read_annotated(place)
+    folder, _, split = place.rpartition(":")
+    return read_annotated(folder, split) if folder else read_annotated(place)

@@ -1,4 +1,4 @@
-"""A page about a data set: how many fruits, how hidden, how large, and what the images look like."""
+"""A page about a data set: how many fruits, how hidden, how large, and sample images."""
 
 from collections import Counter
 from pathlib import Path
@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from maniskill_tomato.files import write_atomically
 from maniskill_tomato.segmentation.datasets.annotations import AnnotatedImage, AnnotatedImages, Instance
+from maniskill_tomato.segmentation.datasets.picture_files import write_picture
 
 COLOURS: Final[dict[str, tuple[int, int, int]]] = {
     "tomato_ripe": (255, 70, 60),
@@ -29,9 +30,7 @@ def write_statistics(images: AnnotatedImages, folder: Path) -> Path:
     """
     _write_plot(images, folder / "statistics.png")
     sheet = contact_sheet(_spread(images.images, 24))
-    ok, content = cv2.imencode(".jpg", sheet[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, 88])
-    if ok:
-        write_atomically(folder / "contact_sheet.jpg", content.tobytes())
+    write_picture(folder / "contact_sheet.jpg", sheet, 88)
     page = folder / "statistics.md"
     write_atomically(page, _page(images).encode())
     return page

@@ -11,7 +11,7 @@ Float32 = NDArray[np.float32]
 
 
 @dataclass(frozen=True, kw_only=True)
-class CameraLook:
+class PhotoSettings:
     """How one photo is taken."""
 
     exposure: float
@@ -40,11 +40,11 @@ class CameraLook:
     """Weight of the unsharp mask that such cameras apply."""
 
 
-def draw_camera_look(rng: Generator) -> CameraLook:
+def draw_photo_settings(rng: Generator) -> PhotoSettings:
     """Draws the settings and faults of one photo."""
     warmth, tint = np.clip(rng.normal(0, 0.07), -0.14, 0.14), np.clip(rng.normal(0, 0.03), -0.05, 0.05)
     moving = rng.random() < 0.2
-    return CameraLook(
+    return PhotoSettings(
         exposure=float(np.exp(rng.normal(-0.08, 0.4))),
         white_balance=(float(np.exp(warmth)), float(np.exp(tint)), float(np.exp(-warmth))),
         defocus=float(rng.uniform(0.0, 4.5)),
@@ -61,14 +61,14 @@ def draw_camera_look(rng: Generator) -> CameraLook:
 
 
 def develop(
-    light: Float32, depth_m: NDArray[np.float64], look: CameraLook, rng: Generator
+    light: Float32, depth_m: NDArray[np.float64], settings: PhotoSettings, rng: Generator
 ) -> NDArray[np.uint8]:
     """Takes the photo.
 
     Args:
         light: Linear RGB. Shape (height, width, 3).
         depth_m: In [m]; infinite where nothing is. Shape (height, width).
-        look: Settings and faults.
+        settings: Settings and faults.
         rng: The noise.
 
     Returns:
@@ -76,40 +76,40 @@ def develop(
     """
     height, width = depth_m.shape
     scale = width / 640
-    picture = light * _occlusion(depth_m, scale, look.ambient_occlusion)[..., None]
-    picture = _defocused(picture, depth_m, look, scale)
-    if look.motion != (0.0, 0.0):
-        picture = _moved(picture, (look.motion[0] * scale, look.motion[1] * scale))
+    picture = light * _occlusion(depth_m, scale, settings.ambient_occlusion)[..., None]
+    picture = _defocused(picture, depth_m, settings, scale)
+    if settings.motion != (0.0, 0.0):
+        picture = _moved(picture, (settings.motion[0] * scale, settings.motion[1] * scale))
     # The metering weights the middle and gives up on what is much brighter.
     y, x = np.mgrid[:height, :width].astype(np.float32)
     aside = ((x / width - 0.5) ** 2 + (y / height - 0.5) ** 2).astype(np.float32)
     weight = np.exp(-aside / 0.15)
     metered = float((np.minimum(picture.mean(2), 1.0) * weight).sum() / weight.sum())
-    picture = picture * np.float32(0.19 / max(metered, 0.02) * look.exposure)
-    picture = picture * np.array(look.white_balance, dtype=np.float32)
-    picture = picture * (1 - look.vignette * 2 * aside)[..., None]
+    picture = picture * np.float32(0.19 / max(metered, 0.02) * settings.exposure)
+    picture = picture * np.array(settings.white_balance, dtype=np.float32)
+    picture = picture * (1 - settings.vignette * 2 * aside)[..., None]
     small = cv2.resize(np.minimum(picture, 3.0), None, fx=0.125, fy=0.125, interpolation=cv2.INTER_AREA)
     glow = cv2.resize(cv2.GaussianBlur(small, (0, 0), 2.5 * scale), (width, height))
-    picture = (1 - look.haze) * picture + look.haze * glow
-    shot = np.sqrt(np.clip(picture, 0, 1)) * look.noise + 0.25 * look.noise
+    picture = (1 - settings.haze) * picture + settings.haze * glow
+    shot = np.sqrt(np.clip(picture, 0, 1)) * settings.noise + 0.25 * settings.noise
     grain = rng.standard_normal(picture.shape, dtype=np.float32)
-    if look.noise > 0.012:
+    if settings.noise > 0.012:
         grain = 1.6 * cv2.GaussianBlur(grain, (0, 0), 0.8)
     picture = np.maximum(picture + shot * grain, 0)
-    return _toned(picture, look)
+    return _toned(picture, settings)
 
 
-def _toned(picture: Float32, look: CameraLook) -> NDArray[np.uint8]:
+def _toned(picture: Float32, settings: PhotoSettings) -> NDArray[np.uint8]:
     # A shoulder keeps some drawing in the lights, as cameras do, before they clip.
     picture = np.where(picture > 0.7, 0.7 + 0.3 * (1 - np.exp(-(picture - 0.7) / 0.3)), picture)
     display = np.sqrt(picture)  # Close to the sRGB curve, and quick.
     smooth = display * display * (3 - 2 * display)
-    display = (1 - look.contrast) * display + look.contrast * smooth
+    display = (1 - settings.contrast) * display + settings.contrast * smooth
     grey = display @ np.array([0.299, 0.587, 0.114], dtype=np.float32)
-    display = grey[..., None] + look.saturation * (display - grey[..., None])
-    if look.sharpening > 0:
+    display = grey[..., None] + settings.saturation * (display - grey[..., None])
+    if settings.sharpening > 0:
         soft = cv2.GaussianBlur(display.astype(np.float32), (0, 0), 1.2)
-        display = display + look.sharpening * (display - soft)
+        display = display + settings.sharpening * (display - soft)
     return np.asarray(np.clip(display * 255 + 0.5, 0, 255), dtype=np.uint8)
 
 
@@ -129,13 +129,17 @@ def _occlusion(depth_m: NDArray[np.float64], scale: float, strength: float) -> F
     return np.asarray(np.exp(-1.5 * strength * darkening), dtype=np.float32)
 
 
-def _defocused(picture: Float32, depth_m: NDArray[np.float64], look: CameraLook, scale: float) -> Float32:
+def _defocused(
+    picture: Float32, depth_m: NDArray[np.float64], settings: PhotoSettings, scale: float
+) -> Float32:
     """Mixes blurred copies of the picture by each pixel's distance from the plane in focus."""
-    if look.defocus * scale < 0.5:
+    if settings.defocus * scale < 0.5:
         return picture
     depth = np.minimum(depth_m, 6.0).astype(np.float32)
     radius = (
-        look.defocus * scale * np.minimum(np.abs(1 / depth - 1 / look.focus_m) / (1 / 0.3 - 1 / 0.8), 1.5)
+        settings.defocus
+        * scale
+        * np.minimum(np.abs(1 / depth - 1 / settings.focus_m) / (1 / 0.3 - 1 / 0.8), 1.5)
     )
     radius = cv2.GaussianBlur(radius.astype(np.float32), (0, 0), 1.5)
     levels = [0.0, 1.0, 2.0, 4.0, 7.0]

@@ -20,7 +20,7 @@ from maniskill_tomato.rendering.vulkan_probe import render_backend
 from maniskill_tomato.robot.d435 import CAMERA_FAR, CAMERA_NEAR, R_CAMERA_OPTICAL, CameraIntrinsics
 from maniskill_tomato.segmentation.datasets.annotations import BEHIND
 from maniskill_tomato.segmentation.synthesis import surroundings
-from maniskill_tomato.segmentation.synthesis.look import SceneLook, draw_crop
+from maniskill_tomato.segmentation.synthesis.appearance import SceneAppearance, draw_crop
 from maniskill_tomato.segmentation.synthesis.paint import PlantMaterials
 
 Float32 = NDArray[np.float32]
@@ -72,19 +72,19 @@ class Shot:
     """Index in the scene's things, -1 for everything else. Shape (height, width)."""
 
 
-def grow(look: SceneLook, seed: int, seeds: tuple[int, int]) -> tuple[Row, Row]:
+def grow(appearance: SceneAppearance, seed: int, seeds: tuple[int, int]) -> tuple[Row, Row]:
     """A row, in few triangles, and with the middle plant in fine ones, as cameras come near it.
 
     Args:
-        look: Its crop.
+        appearance: Its crop.
         seed: The middle plant's.
         seeds: Half-open range of its neighbours' seeds.
     """
     # The neighbours are kept by their configuration; a crop drawn anew would only fill that store.
-    coarse = generate_row(look.crop, seed, "training", look.leaf_density, seeds=seeds)  # type: ignore[arg-type]
-    middle = generate_plant(look.crop, seed, "picture", look.leaf_density)
+    coarse = generate_row(appearance.crop, seed, "training", appearance.leaf_density, seeds=seeds)  # type: ignore[arg-type]
+    middle = generate_plant(appearance.crop, seed, "picture", appearance.leaf_density)
     organs = [
-        better if look.fine_leaves or better.semantic_class != SemanticClass.LEAF else plain
+        better if appearance.fine_leaves or better.semantic_class != SemanticClass.LEAF else plain
         for plain, better in zip(coarse.organs, middle.organs, strict=False)
     ]
     return coarse, replace(coarse, organs=(*organs, *coarse.organs[len(organs) :]))
@@ -103,7 +103,7 @@ class GreenhouseScene:
     def __init__(
         self,
         row: Plant,
-        look: SceneLook,
+        appearance: SceneAppearance,
         intrinsics: CameraIntrinsics,
         rng: Generator,
         *,
@@ -113,23 +113,23 @@ class GreenhouseScene:
 
         Args:
             row: The plants in front.
-            look: How it looks.
+            appearance: How it looks.
             intrinsics: The camera.
-            rng: Places what the look leaves open.
+            rng: Places what the appearance leaves open.
             first_seed: The first seed of the split that the plants behind are taken from.
 
         Raises:
             RenderingUnavailableError: There is no Vulkan device.
         """
         self.row = row
-        self.look = look
+        self.appearance = appearance
         self._intrinsics = intrinsics
         sapien.render.set_camera_shader_dir("default")
         device = sapien.Device("cuda" if render_backend() == "gpu" else "cpu")
         self._scene = sapien.Scene([sapien.physx.PhysxCpuSystem(), sapien.render.RenderSystem(device)])
         self.things: list[Thing] = []
         self._thing_of_id: dict[int, int] = {}
-        self._materials = PlantMaterials(look, rng)
+        self._materials = PlantMaterials(appearance, rng)
         for organ in row.organs:
             category = CATEGORY[organ.semantic_class]
             fruit = category.startswith("tomato")
@@ -142,8 +142,8 @@ class GreenhouseScene:
             )
             self._name(thing, [self._add_parts(organ.parts, sapien.Pose())])
         self._add_rows_behind(rng, first_seed)
-        surroundings.add_surroundings(self._add, look, rng)
-        if look.robot:
+        surroundings.add_surroundings(self._add, appearance, rng)
+        if appearance.robot:
             links = surroundings.add_arm(self._scene, rng)
             self._name(Thing("robot", "robot", True), links)
         self._add_light()
@@ -179,14 +179,14 @@ class GreenhouseScene:
             thing=table[ids],
         )
 
-    def relight(self, look: SceneLook) -> None:
+    def relight(self, appearance: SceneAppearance) -> None:
         """Moves the sun and changes its strength, for another view of the same scene."""
         # SAPIEN's declared types want arrays of a fixed shape; it takes any three numbers.
         ahead: Any = np.array([1, 0, 0], np.float32)
-        sun: Any = np.array(look.sun_direction, np.float32)
+        sun: Any = np.array(appearance.sun_direction, np.float32)
         turn = sapien.math.shortest_rotation(ahead, sun)
         self._sun.pose = sapien.Pose(_SUN_CENTRE, turn)
-        self._sun.set_color(list(look.sun))
+        self._sun.set_color(list(appearance.sun))
 
     def _add(self, shapes: Sequence[sapien.render.RenderShape], pose: sapien.Pose) -> sapien.Entity:
         body = sapien.render.RenderBodyComponent()
@@ -207,16 +207,16 @@ class GreenhouseScene:
         self.things.append(thing)
 
     def _add_rows_behind(self, rng: Generator, first_seed: int) -> None:
-        look = self.look
-        rows = {"foliage": (1, 2), "gutters": (1,), "bright": ()}[look.backdrop]
+        appearance = self.appearance
+        rows = {"foliage": (1, 2), "gutters": (1,), "bright": ()}[appearance.backdrop]
         for k in rows:
             width = 3 if k == 1 else 2
             for j in range(-width, width + 1):
-                if look.backdrop == "gutters" and rng.random() < 0.35:
+                if appearance.backdrop == "gutters" and rng.random() < 0.35:
                     continue
                 plant = _distant_plant(int(rng.integers(DISTANT_PLANTS)), first_seed)
                 angle = float(rng.uniform(-0.6, 0.6) + (np.pi if rng.random() < 0.5 else 0.0))
-                place = [look.row_distance * k, ROW_SPACING * j + float(rng.normal(0, 0.05)), 0.0]
+                place = [appearance.row_distance * k, ROW_SPACING * j + float(rng.normal(0, 0.05)), 0.0]
                 pose = sapien.Pose(place, [np.cos(angle / 2), 0, 0, np.sin(angle / 2)])
                 green = [p for o in plant.organs if o.semantic_class <= SemanticClass.LEAF for p in o.parts]
                 self._add_parts(_merged(green), pose)
@@ -230,17 +230,17 @@ class GreenhouseScene:
                     self._name(thing, [self._add_parts(organ.parts, pose)])
 
     def _add_light(self) -> None:
-        look = self.look
-        self._scene.set_ambient_light([0.12 * look.sky] * 3)
+        appearance = self.appearance
+        self._scene.set_ambient_light([0.12 * appearance.sky] * 3)
         self._sun = self._scene.add_directional_light(
-            list(look.sun_direction),
-            list(look.sun),
+            list(appearance.sun_direction),
+            list(appearance.sun),
             shadow=True,
             position=_SUN_CENTRE,
             shadow_scale=1.4,
             shadow_map_size=2048,
         )
-        self._scene.set_environment_map(_sky(round(look.sky, 1)))
+        self._scene.set_environment_map(_sky(round(appearance.sky, 1)))
 
 
 @lru_cache(maxsize=16)
