@@ -12,8 +12,9 @@ from typing import Any
 import pytest
 import torch
 
-from maniskill_tomato import cli
-from maniskill_tomato.cli import main, merge_options, parse
+from maniskill_tomato.cli import main, parse
+from maniskill_tomato.cli.shared_options import merge_options
+from maniskill_tomato.cli.train_command import Train
 from maniskill_tomato.errors import InvalidInputError
 from maniskill_tomato.learning.rl.config_file import parse_seeds, read_run_file
 from maniskill_tomato.learning.rl.presets import get_preset
@@ -45,9 +46,9 @@ def write(path: Path, text: str) -> Path:
     return path
 
 
-def parsed(*arguments: str) -> cli.Train:
+def parsed(*arguments: str) -> Train:
     command = parse(["train", *arguments])
-    assert isinstance(command, cli.Train)
+    assert isinstance(command, Train)
     return command
 
 

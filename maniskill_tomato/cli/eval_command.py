@@ -2,9 +2,12 @@
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
-from maniskill_tomato.cli.options import EnvId, PlantOptions
+from maniskill_tomato.cli.arguments import Flat
+from maniskill_tomato.cli.early_checks import check_count, check_env_id, check_policy
+from maniskill_tomato.cli.shared_options import EnvId, PlantOptions
+from maniskill_tomato.policies.opening import open_policy, shipped_policy
 
 EpisodeList = Literal["validation", "held_out"]
 
@@ -33,7 +36,7 @@ class Eval:
     """Film the first episodes where this machine can render."""
     allow_other_task: bool = False
     """Accept a policy that was trained on another task."""
-    plants: PlantOptions = PlantOptions()
+    plants: Annotated[PlantOptions, Flat] = PlantOptions()
     """Another plant."""
     episode_list: EpisodeList | None = None
     """Episodes of a fixed list, TomatoViewpoint-v1 only: seed i is its i-th; by default held_out, unless options of
@@ -41,17 +44,18 @@ class Eval:
 
     def run(self) -> None:
         """Evaluates and says where the report is."""
+        check_env_id(self.env_id)
+        check_count("--episodes", self.episodes)
+        env_id = None if self.allow_other_task else self.env_id
+        name_or_file = self.policy or shipped_policy(self.env_id)
+        check_policy("--policy", name_or_file, env_id)
+
         from maniskill_tomato.experiments.evaluate import EvaluationConfig, evaluate
-        from maniskill_tomato.learning.rl.envs import check_env_id
         from maniskill_tomato.policies.adapters import origin
-        from maniskill_tomato.policies.opening import find_policy, open_policy, shipped_policy
         from maniskill_tomato.policies.protocol import Policy
 
-        check_env_id(self.env_id)
-        env_id = None if self.allow_other_task else self.env_id
-        found = find_policy(self.policy or shipped_policy(self.env_id), env_id)
-        path = found if isinstance(found, Path) else None
-        policy: Policy | str = str(found)
+        path = Path(name_or_file) if Path(name_or_file).is_file() else None
+        policy: Policy | str = str(name_or_file)
         if path is not None:
             policy = open_policy(path, env_id=env_id)
             print(f"policy  {origin(policy)}")

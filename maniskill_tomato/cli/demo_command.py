@@ -4,8 +4,10 @@ import dataclasses
 from dataclasses import dataclass
 from pathlib import Path
 
-from maniskill_tomato.cli.evaluate import summary
-from maniskill_tomato.cli.train import train
+from maniskill_tomato.cli.early_checks import check_count
+from maniskill_tomato.cli.eval_command import summary
+from maniskill_tomato.cli.train_command import train
+from maniskill_tomato.errors import InvalidInputError
 from maniskill_tomato.learning.rl.presets import PRESETS
 
 
@@ -25,7 +27,11 @@ class Demo:
     """Film the first episodes where this machine can render."""
 
     def run(self) -> None:
-        """Runs all three parts and names the results."""
+        """Runs both parts and names the results."""
+        check_count("--episodes", self.episodes)
+        if not self.minutes > 0:
+            raise InvalidInputError(f"--minutes must be above 0, got {self.minutes:g}")
+
         from maniskill_tomato.experiments.evaluate import EvaluationConfig, evaluate
         from maniskill_tomato.policies.opening import open_policy
 

@@ -6,6 +6,9 @@ from typing import Annotated
 
 import tyro
 
+from maniskill_tomato.cli.early_checks import check_file, check_segmenter
+from maniskill_tomato.errors import InvalidInputError
+
 
 @dataclass(frozen=True, kw_only=True)
 class Detect:
@@ -27,17 +30,18 @@ class Detect:
 
     def run(self) -> None:
         """Detects and says how many."""
-        from maniskill_tomato.errors import InvalidInputError
+        if not self.images.exists():
+            check_file("IMAGE_OR_FOLDER", self.images)
+        check_segmenter("--segmenter", self.segmenter, without=("ground_truth",))
+        if not 0 <= self.score_threshold <= 1:
+            raise InvalidInputError(f"--score-threshold must be between 0 and 1, got {self.score_threshold}")
+
         from maniskill_tomato.segmentation.datasets.picture_files import write_picture
         from maniskill_tomato.segmentation.detection_list import detect, image_files
         from maniskill_tomato.segmentation.drawing import draw_instances
         from maniskill_tomato.segmentation.instances import Image, Instances
         from maniskill_tomato.segmentation.segmenter import open_for_files
 
-        if not 0 <= self.score_threshold <= 1:
-            raise InvalidInputError(f"--score-threshold must be between 0 and 1, got {self.score_threshold}")
-        if self.segmenter == "ground_truth":
-            raise InvalidInputError("the segmenter ground_truth knows rendered views only, no image files")
         image_files(self.images)
         segmenter = open_for_files(self.segmenter, self.score_threshold, thorough=not self.quick)
 

@@ -3,6 +3,7 @@
 from dataclasses import dataclass
 from pathlib import Path
 
+from maniskill_tomato.cli.early_checks import check_file
 from maniskill_tomato.policies.opening import shipped_policy
 from maniskill_tomato.tasks import THESIS_IDS
 
@@ -18,6 +19,8 @@ class Export:
 
     def run(self) -> None:
         """Exports and says where the files are."""
+        check_file("--policy", self.policy)
+
         from maniskill_tomato.learning.rl.export import export_policy
 
         for path in [self.policy] if self.policy else [shipped_policy(env_id) for env_id in THESIS_IDS]:

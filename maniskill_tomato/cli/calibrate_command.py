@@ -8,6 +8,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING
 
+from maniskill_tomato.cli.early_checks import check_count, check_folder, check_profile
 from maniskill_tomato.errors import InvalidInputError
 
 if TYPE_CHECKING:
@@ -58,6 +59,8 @@ class DeployCalibrate:
 
     def run(self) -> None:
         """Takes or reads the views, calculates, and says where the file is."""
+        self._check()
+
         from maniskill_tomato.deploy.calibration.board_print import print_board
         from maniskill_tomato.deploy.calibration.calibration_file import write_calibration
         from maniskill_tomato.deploy.calibration.hand_eye import calibrate_hand_eye
@@ -69,8 +72,6 @@ class DeployCalibrate:
             print_board(self.print_board, board)
             print(f"board   {self.print_board}: print it at 100 % and measure a square")
             return
-        if (self.profile is None) == (self.views is None):
-            raise InvalidInputError("give either --profile (takes pictures) or --views (a folder of them)")
         folder = self.views or self.out / "views"
         if self.profile is not None and not self._take(self.profile, folder):
             return
@@ -87,6 +88,22 @@ class DeployCalibrate:
         )
         print(f"picture {picture}")
         print(f"file    {file}: name it in the profile's [calibration] as file = ...")
+
+    def _check(self) -> None:
+        """Accepts options that fit together, and files that are there."""
+        for flag, value in (("--count", self.count), ("--columns", self.columns), ("--rows", self.rows)):
+            check_count(flag, value)
+        if self.print_board is not None:
+            return
+        if (self.profile is None) == (self.views is None):
+            raise InvalidInputError("give either --profile (takes pictures) or --views (a folder of them)")
+        check_folder("--views", self.views)
+        if self.profile is not None:
+            check_profile("--profile", self.profile)
+        if self.confirm and self.unattended:
+            raise InvalidInputError("give --confirm or --unattended, not both")
+        if self.confirm and not sys.stdin.isatty():
+            raise InvalidInputError("--confirm asks before every move and needs a terminal")
 
     def _board(self) -> "CharucoBoard":
         from maniskill_tomato.deploy.calibration.board import CharucoBoard
@@ -108,10 +125,6 @@ class DeployCalibrate:
         from maniskill_tomato.deploy.stops import Stops
         from maniskill_tomato.deploy.workcell import make_workcell, prepare_folder
 
-        if self.confirm and self.unattended:
-            raise InvalidInputError("give --confirm or --unattended, not both")
-        if self.confirm and not sys.stdin.isatty():
-            raise InvalidInputError("--confirm asks before every move and needs a terminal")
         moves = self.confirm or self.unattended
         if moves and (folder / "views.json").exists():
             raise InvalidInputError(

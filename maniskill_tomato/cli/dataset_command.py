@@ -5,6 +5,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
+from maniskill_tomato.cli.early_checks import check_count, check_folder
+
 # OpenCV, SAPIEN and PyTorch take seconds to import; the command imports what it needs when it runs.
 
 
@@ -35,6 +37,11 @@ class Dataset:
 
     def run(self) -> None:
         """Renders what is missing and says where it is."""
+        check_folder("--real", self.real)
+        check_count("--jobs", self.jobs)
+        for flag, value in (("--count", self.count), ("--width", self.width), ("--height", self.height)):
+            check_count(flag, value)
+
         from tqdm import tqdm
 
         from maniskill_tomato.segmentation.datasets.reading import read_annotated

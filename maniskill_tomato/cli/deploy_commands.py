@@ -7,8 +7,10 @@ from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
-from maniskill_tomato.cli.calibrate import DeployCalibrate, end_by_signal
+from maniskill_tomato.cli.calibrate_command import end_by_signal
+from maniskill_tomato.cli.early_checks import check_file, check_policy, check_profile
 from maniskill_tomato.errors import InvalidInputError
+from maniskill_tomato.policies.layout import GENERAL_IDS
 
 if TYPE_CHECKING:
     from maniskill_tomato.deploy.loop_config import Proposal
@@ -45,6 +47,13 @@ class DeployRun:
 
     def run(self) -> None:
         """Runs, and says how it ended."""
+        check_profile("--profile", self.profile)
+        _check_policy(self.policy)
+        if self.confirm + self.unattended + self.dry_run > 1:
+            raise InvalidInputError("give one of --confirm, --unattended and --dry-run, not several")
+        if self.confirm and not sys.stdin.isatty():
+            raise InvalidInputError("--confirm asks before every move and needs a terminal")
+
         from maniskill_tomato.deploy.loop_config import Mode
         from maniskill_tomato.deploy.profile import load_profile
         from maniskill_tomato.deploy.run import RunConfig, run
@@ -56,10 +65,6 @@ class DeployRun:
             modes.append("unattended")
         if self.dry_run:
             modes.append("dry_run")
-        if len(modes) > 1:
-            raise InvalidInputError("give one of --confirm, --unattended and --dry-run, not several")
-        if self.confirm and not sys.stdin.isatty():
-            raise InvalidInputError("--confirm asks before every move and needs a terminal")
         config = RunConfig(
             profile=load_profile(self.profile),
             out=self.out,
@@ -97,6 +102,9 @@ class DeployCheck:
 
     def run(self) -> None:
         """Prints the findings."""
+        check_profile("--profile", self.profile)
+        _check_policy(self.policy)
+
         from maniskill_tomato.deploy.check import check, print_findings
         from maniskill_tomato.deploy.profile import load_profile
 
@@ -108,13 +116,16 @@ class DeployCheck:
 class DeployReplay:
     """Run a recording through today's code, and say where it decides otherwise (exit status 1)."""
 
-    recording: Annotated[Path, tyro.conf.Positional]
+    recording: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="RECORDING")]
     """The run.mcap of a run."""
     policy: str | None = None
     """Another policy than the recorded one."""
 
     def run(self) -> None:
         """Compares."""
+        check_file("RECORDING", self.recording)
+        _check_policy(self.policy)
+
         from maniskill_tomato.deploy.replay import each_difference, load_recording, replay
 
         recorded = load_recording(self.recording)
@@ -138,6 +149,9 @@ class DeployProfiles:
 
     def run(self) -> None:
         """Prints."""
+        if self.show is not None:
+            check_profile("--show", self.show)
+
         from maniskill_tomato.deploy.profile import load_profile
         from maniskill_tomato.deploy.profile_files import profile_names
 
@@ -148,21 +162,9 @@ class DeployProfiles:
             print(f"{name:<16}{load_profile(name).description}")
 
 
-@dataclass(frozen=True)
-class Deploy:
-    """The policy on hardware, or on its digital twin."""
-
-    command: tyro.conf.OmitSubcommandPrefixes[
-        Annotated[DeployRun, tyro.conf.subcommand("run")]
-        | Annotated[DeployCheck, tyro.conf.subcommand("check")]
-        | Annotated[DeployCalibrate, tyro.conf.subcommand("calibrate")]
-        | Annotated[DeployReplay, tyro.conf.subcommand("replay")]
-        | Annotated[DeployProfiles, tyro.conf.subcommand("profiles")]
-    ]
-
-    def run(self) -> None:
-        """Runs the chosen command."""
-        self.command.run()
+def _check_policy(policy: str | None) -> None:
+    if policy is not None:
+        check_policy("--policy", policy, GENERAL_IDS[0], on_robot=True)
 
 
 def _ask(proposal: "Proposal") -> bool:

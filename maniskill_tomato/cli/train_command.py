@@ -9,7 +9,8 @@ from typing import Annotated, Any
 import tyro
 
 from maniskill_tomato.cli.arguments import Flat
-from maniskill_tomato.cli.options import PlantOptions, merge_options
+from maniskill_tomato.cli.early_checks import check_count, check_env_id, check_file
+from maniskill_tomato.cli.shared_options import PlantOptions, merge_options
 from maniskill_tomato.errors import InvalidInputError, SeedsFailedError
 from maniskill_tomato.learning.rl.config_file import RunFile, parse_seeds, read_run_config, read_run_file
 from maniskill_tomato.learning.rl.presets import MAY_CHANGE, PRESETS, PresetName, TrainConfig, default_preset
@@ -23,7 +24,7 @@ class Train:
     env_id: Annotated[
         str | None,
         tyro.conf.Positional,
-        tyro.conf.arg(metavar="ENV_ID", help=f"One of {', '.join(TASK_IDS)}; the file or run may say it."),
+        tyro.conf.arg(metavar="ENV_ID", help=f"The task: {', '.join(TASK_IDS)}. The file or run may say it."),
     ] = None
     """Id of the task."""
     preset: PresetName = "td3"
@@ -50,6 +51,15 @@ class Train:
     config: Annotated[TrainConfig, Flat] = PRESETS["td3"]
     """The training configuration."""
 
+    @classmethod
+    def defaults(cls, argv: Sequence[str]) -> "Train":
+        """What holds without further options, by the files and the preset that the arguments name.
+
+        Raises:
+            InvalidInputError: A file or a run cannot be used.
+        """
+        return _default(argv)
+
     def run(self) -> None:
         """Trains and says where the policy is.
 
@@ -62,6 +72,10 @@ class Train:
             raise InvalidInputError(
                 f"give the task to train on, one of {', '.join(TASK_IDS)}, or --config FILE or --resume DIR"
             )
+        check_env_id(env_id)
+        check_count("--jobs", self.jobs)
+        if self.config.initial_policy is not None:
+            check_file("--initial-policy", Path(self.config.initial_policy))
         if self.resume is not None:
             self._check_resume(run_file)
         env_options = merge_options(run_file.env_options, self.plants.env_options())
@@ -120,10 +134,8 @@ class Train:
             )
 
     def _run_seeds(self, env_id: str, out: Path, seeds: tuple[int, ...], env_options: dict[str, Any]) -> None:
-        from maniskill_tomato.learning.rl.envs import check_env_id
         from maniskill_tomato.learning.rl.seeds import summary_table, train_seeds
 
-        check_env_id(env_id)
         results = train_seeds(
             env_id,
             self.config,
@@ -158,7 +170,7 @@ def train(
     return train_run(env_id, config, out, seed, env_options, overwrite=overwrite, resume=resume)
 
 
-def train_default(argv: Sequence[str]) -> Train:
+def _default(argv: Sequence[str]) -> Train:
     """What `train` does without further flags, from the files and the preset that the arguments name."""
     resumed, file = _asked(argv, "--resume"), _asked(argv, "--config")
     if resumed is not None:
