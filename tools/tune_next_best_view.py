@@ -47,7 +47,7 @@ def main(args: Args) -> None:
         for cost, gain, angle in itertools.product(args.move_cost, args.unknown_gain, args.similar_angle_deg)
     ]
     env: Any = make_env("TomatoViewpoint-v1", plant={"seed": "validation", "pool": None})
-    planners = [kind(env.unwrapped.device, config) for config in configs]
+    planners = [kind(config) for config in configs]
     found: list[list[ViewEpisode]] = [[] for _ in configs]
     for seed in range(args.first_seed, args.first_seed + args.episodes):
         for planner, episodes in zip(planners, found, strict=True):

@@ -33,7 +33,7 @@ class Demo:
             raise InvalidInputError(f"--minutes must be above 0, got {self.minutes:g}")
 
         from maniskill_tomato.experiments.evaluate import EvaluationConfig, evaluate
-        from maniskill_tomato.learning.rl.policy import load_policy
+        from maniskill_tomato.policies.opening import open_policy
 
         env_id = "TomatoViewpointGuided-v1"
         print(f"1/2 training on {env_id}, at most {self.minutes:g} minutes")
@@ -50,7 +50,7 @@ class Demo:
             title="Where to look: a policy that uncovers a hidden tomato",
             training_run=trained.run_dir,
         )
-        result = evaluate(evaluation, load_policy(trained.policy_path), trained.policy_path)
+        result = evaluate(evaluation, open_policy(trained.policy_path), trained.policy_path)
         print(summary(result.metrics))
         if result.left_out:
             print(result.left_out)
