@@ -20,7 +20,7 @@ import numpy as np
 import tyro
 
 import maniskill_tomato  # noqa: F401
-from maniskill_tomato.deploy.policies import TASK, default_policy, open_policy
+from maniskill_tomato.deploy.policies import TASK, default_policy
 from maniskill_tomato.deploy.profile import Profile, load_profile
 from maniskill_tomato.deploy.run import RunConfig, run
 from maniskill_tomato.errors import TomatoError
@@ -29,6 +29,7 @@ from maniskill_tomato.experiments.statistics import mcnemar_p, wilson_interval
 from maniskill_tomato.experiments.view_rollout import run_view_episode
 from maniskill_tomato.files import write_atomically
 from maniskill_tomato.learning.rl.envs import make_env
+from maniskill_tomato.policies.opening import open_policy
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -119,7 +120,7 @@ def main(argv: list[str] | None = None) -> None:
         profile = load_profile(args.profile)
         store = args.out / "episodes.json"
         done: list[dict[str, Any]] = json.loads(store.read_text()) if store.is_file() else []
-        policy = open_policy(args.policy or default_policy())
+        policy = open_policy(args.policy or default_policy(), env_id=TASK)
         env = make_env(TASK, **main_condition("held_out").env_options)
         for episode in range(args.seed, args.seed + args.episodes):
             if any(one["episode"] == episode for one in done):

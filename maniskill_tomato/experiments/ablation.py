@@ -22,11 +22,11 @@ from maniskill_tomato.experiments.rollout import run_episodes
 from maniskill_tomato.files import write_atomically
 from maniskill_tomato.learning.rl.envs import make_env
 from maniskill_tomato.learning.rl.history import TrainingCurves, load_history
-from maniskill_tomato.learning.rl.policy import load_policy
 from maniskill_tomato.learning.rl.presets import TrainConfig, get_preset
 from maniskill_tomato.learning.rl.run import make_training_env
 from maniskill_tomato.learning.rl.run_folder import clear_run
 from maniskill_tomato.learning.rl.trainer import Trainer
+from maniskill_tomato.policies.opening import open_policy
 from maniskill_tomato.tasks import THESIS_IDS
 
 logger = logging.getLogger(__name__)
@@ -199,7 +199,7 @@ def execute(run: AblationRun) -> dict[str, Any] | None:
     try:
         threshold = float(judge.unwrapped.task.full_visibility)  # type: ignore[attr-defined]
         begun = time.perf_counter()
-        episodes = run_episodes(judge, load_policy(trained.policy_path), run.episodes, EVALUATION_SEED)
+        episodes = run_episodes(judge, open_policy(trained.policy_path), run.episodes, EVALUATION_SEED)
         wall = time.perf_counter() - begun
     finally:
         judge.close()

@@ -8,10 +8,9 @@ from typing import Any
 import gymnasium as gym
 
 from maniskill_tomato.errors import InvalidInputError
-from maniskill_tomato.experiments.viewpoint_policy import open_viewpoint_policy
-from maniskill_tomato.policies.deep_move_to_see import DeepMoveToSee, load_move_network
-from maniskill_tomato.policies.protocol import Planner
-from maniskill_tomato.policies.registry import PLANNERS, make_planner
+from maniskill_tomato.policies.opening import find_policy, open_policy
+from maniskill_tomato.policies.protocol import Policy
+from maniskill_tomato.policies.registry import PLANNERS, SHIPPED_FILES, policy_names
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -21,41 +20,37 @@ class PolicySpec:
     label: str
     """Its name in tables and files."""
     planner: str | None = None
-    """One of `PLANNERS`; None for a trained policy."""
+    """One of `registry.policy_names`; None for a trained policy."""
     path: Path | None = None
     """File of a trained policy, or of the planner's network."""
 
     @classmethod
     def parse(cls, text: str) -> "PolicySpec":
-        """Reads `PLANNER`, `FILE`, `LABEL=FILE` or `deep_3dmts=FILE`.
+        """Reads `NAME`, `FILE` or `LABEL=FILE`; a label may be the name of a policy whose network the file replaces.
 
         Raises:
-            InvalidInputError: It is none of these.
+            PolicyError: There is no such policy.
+            InvalidInputError: The label is the name of another policy.
         """
         label, _, file = text.rpartition("=")
+        found = find_policy(file)
+        if isinstance(found, str):
+            if label:
+                raise InvalidInputError(f"{text!r} gives the policy {found} another name; write {found}")
+            return cls(label=found, planner=found)
         if not label:
-            label = file
-            if file in PLANNERS:
-                return cls(label=label, planner=label)
-        path = Path(file)
-        if not path.is_file():
-            raise InvalidInputError(
-                f"{text!r} is no policy: give the name of a planner ({', '.join(PLANNERS)}), the file of a trained "
-                "policy (.pt or .onnx), or LABEL=FILE"
-            )
-        planner = DeepMoveToSee.name if label == DeepMoveToSee.name else None
-        if planner is None and label in PLANNERS:
+            label = found.parent.name if found.stem == "policy" and found.parent.name else found.stem
+        planner = label if label in SHIPPED_FILES else None
+        if planner is None and label in policy_names():
             raise InvalidInputError(f"{label!r} is a planner's name; give the policy {file} another label")
-        if label == file:
-            label = path.parent.name if path.stem == "policy" and path.parent.name else path.stem
-        return cls(label=label, planner=planner, path=path.resolve())
+        return cls(label=label, planner=planner, path=found.resolve())
 
     def fingerprint(self) -> str:
         """Says whether stored episodes are of this policy: its planner, and the hash of its file."""
         content = b"" if self.path is None else self.path.read_bytes()
         return f"{self.planner or 'policy'}:{hashlib.sha256(content).hexdigest()[:16]}"
 
-    def make(self, env: gym.Env[Any, Any], contact_free: bool = False) -> Planner:
+    def make(self, env: gym.Env[Any, Any], contact_free: bool = False) -> Policy:
         """The policy for an environment.
 
         Args:
@@ -65,18 +60,13 @@ class PolicySpec:
         Raises:
             CheckpointError: Its file cannot be used.
         """
-        device = getattr(env.unwrapped, "device", "cpu")
-        if self.planner is not None and self.path is not None:
-            return DeepMoveToSee(load_move_network(self.path, device))
-        if self.path is not None:
-            spec: Any = env.unwrapped.spec
-            return open_viewpoint_policy(self.path, None if spec is None else spec.id)
-        assert self.planner is not None
-        return make_planner(
-            self.planner,
+        spec = env.unwrapped.spec
+        return open_policy(
+            str(self.planner if self.path is None else self.path),
+            env_id=None if spec is None else spec.id,
             ground_truth=getattr(env.unwrapped, "ground_truth", None),
             contact_free=contact_free,
-            device=device,
+            device=getattr(env.unwrapped, "device", "cpu"),
         )
 
 

@@ -7,26 +7,22 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, cast
 
+import gymnasium as gym
 import imageio.v2 as imageio
 import numpy as np
 
 from maniskill_tomato.errors import InvalidInputError
 from maniskill_tomato.experiments import plots
 from maniskill_tomato.experiments.comparison import Run
-from maniskill_tomato.experiments.exported import ExportedPolicy, describe_policy, open_policy
 from maniskill_tomato.experiments.metrics import make_metrics, write_metrics
 from maniskill_tomato.experiments.report import Picture, ReportInput, write_report
-from maniskill_tomato.experiments.rollout import ActingPolicy, Episode, run_episodes
-from maniskill_tomato.experiments.viewpoint_policy import acting_policy
+from maniskill_tomato.experiments.rollout import Episode, run_episodes
 from maniskill_tomato.learning.rl.envs import make_env
 from maniskill_tomato.learning.rl.history import load_history
-from maniskill_tomato.learning.rl.policy import Policy, RandomPolicy
-from maniskill_tomato.policies.baselines import RandomStep
-from maniskill_tomato.policies.learned import LearnedPolicy
-from maniskill_tomato.policies.protocol import Planner
-from maniskill_tomato.policies.view_quality import ViewQuality
+from maniskill_tomato.policies.adapters import as_policy, as_state_policy, describe
+from maniskill_tomato.policies.opening import RANDOM, open_policy
+from maniskill_tomato.policies.protocol import Policy, StatePolicy
 from maniskill_tomato.rendering import vulkan_probe
-from maniskill_tomato.tasks import GENERAL_IDS
 
 logger = logging.getLogger(__name__)
 
@@ -73,7 +69,7 @@ class EvaluationResult:
 
 
 def evaluate(
-    config: EvaluationConfig, policy: ActingPolicy | Planner | str, policy_path: Path | None = None
+    config: EvaluationConfig, policy: Policy | StatePolicy | str, policy_path: Path | None = None
 ) -> EvaluationResult:
     """Evaluates `policy` and writes metrics.json, trajectories.npz, plots, pictures, a film and report.html.
 
@@ -177,19 +173,19 @@ def write_trajectories(path: Path, episodes: Sequence[Episode]) -> None:
 
 
 def _run(
-    config: EvaluationConfig, policy: ActingPolicy | Planner | str
+    config: EvaluationConfig, policy: Policy | StatePolicy | str
 ) -> tuple[list[Episode], list[Episode] | None, float]:
     """The policy's episodes, the baseline's if wanted, and the task's threshold of V_f."""
     env = make_env(config.env_id, **config.env_options)
     try:
         threshold = float(cast(Any, env.unwrapped).task.full_visibility)
-        acting = acting_policy(policy, env)
-        episodes = run_episodes(env, acting, config.episodes, config.seed, config.show_progress)
+        episodes = run_episodes(
+            env, opened_in(env, policy, config), config.episodes, config.seed, config.show_progress
+        )
         baseline = None
         if config.baseline:
             logger.info("the same episodes with random actions, to compare")
-            general = config.env_id in GENERAL_IDS
-            random = acting_policy(RandomStep(config.seed) if general else RandomPolicy(config.seed), env)
+            random = opened_in(env, RANDOM, config)
             baseline = run_episodes(env, random, config.episodes, config.seed, config.show_progress)
     finally:
         env.close()
@@ -226,7 +222,7 @@ def _plot(
     return evaluation, [Picture(path=path, caption=caption)]
 
 
-def _film(config: EvaluationConfig, policy: ActingPolicy | Planner | str) -> tuple[Path, list[Picture]]:
+def _film(config: EvaluationConfig, policy: Policy | StatePolicy | str) -> tuple[Path, list[Picture]]:
     """Films the first episodes; returns the film and the first and last view of the first one."""
     from maniskill_tomato.experiments.video import film_episodes, make_film_options
 
@@ -236,7 +232,8 @@ def _film(config: EvaluationConfig, policy: ActingPolicy | Planner | str) -> tup
     env = make_env(config.env_id, **options)
     path = config.out / "video.mp4"
     try:
-        films = film_episodes(env, acting_policy(policy, env), [config.seed + i for i in range(count)], path)
+        acting = as_state_policy(opened_in(env, policy, config), env)
+        films = film_episodes(env, acting, [config.seed + i for i in range(count)], path)
     finally:
         env.close()
     first = films[0]
@@ -255,14 +252,23 @@ def _film(config: EvaluationConfig, policy: ActingPolicy | Planner | str) -> tup
     return path, pictures
 
 
-def _describe(policy: ActingPolicy | Planner | str, path: Path | None) -> dict[str, Any]:
+def opened_in(
+    env: gym.Env[Any, Any], policy: Policy | StatePolicy | str, config: EvaluationConfig
+) -> Policy | StatePolicy:
+    """A policy that can act in an environment; a name is opened with what the environment knows."""
+    if not isinstance(policy, str):
+        return policy
+    return open_policy(
+        policy,
+        env_id=config.env_id,
+        ground_truth=getattr(env.unwrapped, "ground_truth", None),
+        seed=config.seed,
+        device=getattr(env.unwrapped, "device", "cpu"),
+    )
+
+
+def _describe(policy: Policy | StatePolicy | str, path: Path | None) -> dict[str, Any]:
     """Where a policy comes from, for metrics.json."""
     if isinstance(policy, str):
         return {"path": None, "kind": policy}
-    if isinstance(policy, ViewQuality):
-        return {"path": None if path is None else str(path), "kind": policy.name, **policy.facts}
-    if isinstance(policy, LearnedPolicy):
-        policy = policy.policy
-    if not isinstance(policy, Policy | ExportedPolicy):
-        return {"path": None, "kind": type(policy).__name__}
-    return {"path": None if path is None else str(path), **describe_policy(policy)}
+    return {"path": None if path is None else str(path), **describe(as_policy(policy))}

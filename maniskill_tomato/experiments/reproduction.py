@@ -22,10 +22,10 @@ from maniskill_tomato.files import write_atomically
 from maniskill_tomato.learning.rl.agent import make_actor, make_normalizer
 from maniskill_tomato.learning.rl.envs import LearnerEnv, make_env, make_learner_env
 from maniskill_tomato.learning.rl.history import load_history
-from maniskill_tomato.learning.rl.policy import Policy, load_policy
 from maniskill_tomato.learning.rl.presets import TrainConfig
 from maniskill_tomato.learning.rl.run_folder import clear_run
 from maniskill_tomato.learning.rl.trainer import Trainer
+from maniskill_tomato.policies.trained_actor import TrainedActor, load_actor
 from maniskill_tomato.robot.inverse_kinematics import Reach
 
 logger = logging.getLogger(__name__)
@@ -110,7 +110,7 @@ class Reproduction:
         """
         training = self._train(seed)
         results: dict[str, Any] = {}
-        policy = load_policy(self.seed_folder(seed) / "training" / "policy.pt", env_id=self.experiment.env_id)
+        policy = load_actor(self.seed_folder(seed) / "training" / "policy.pt", env_id=self.experiment.env_id)
         for evaluation in evaluations:
             episodes = self._evaluate(seed, policy, evaluation)
             result = {k: v for k, v in summarise(episodes).items() if k != "per_episode"}
@@ -155,7 +155,7 @@ class Reproduction:
         write_atomically(path, content.encode())
         return figures
 
-    def _evaluate(self, seed: int, policy: Policy, evaluation: Evaluation) -> list[Episode]:
+    def _evaluate(self, seed: int, policy: TrainedActor, evaluation: Evaluation) -> list[Episode]:
         """The episodes of one evaluation, which are run unless enough of them are there already."""
         path = self.episodes_path(seed, evaluation)
         if path.is_file() and len(episodes := load_episodes(path)) >= self.evaluation_episodes:
@@ -175,7 +175,7 @@ class Reproduction:
         return self.seed_folder(seed) / f"episodes_{evaluation.name}.npz"
 
 
-def saturated_share(policy: Policy, episodes: Sequence[Episode]) -> float:
+def saturated_share(policy: TrainedActor, episodes: Sequence[Episode]) -> float:
     """Share of the actor's outputs, at the views that it acted from, that are `SATURATED` or more in size."""
     observations = np.concatenate(
         [np.hstack((e.viewpoints[:-1], np.tile(e.target, (e.steps, 1)))) for e in episodes]

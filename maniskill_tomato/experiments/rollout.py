@@ -3,7 +3,7 @@
 import sys
 from collections.abc import Container
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any
 
 import gymnasium as gym
 import numpy as np
@@ -13,16 +13,10 @@ from torch import Tensor
 from tqdm import tqdm
 
 from maniskill_tomato.errors import InvalidInputError
+from maniskill_tomato.policies.adapters import as_state_policy
+from maniskill_tomato.policies.protocol import Policy, StatePolicy
 
 Float64 = NDArray[np.float64]
-
-
-class ActingPolicy(Protocol):
-    """Anything that turns observations into actions."""
-
-    def act(self, observations: Tensor) -> Tensor:
-        """Actions for observations, a row per environment, both as the task has them."""
-        ...
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -69,7 +63,11 @@ class Episode:
 
 
 def run_episodes(
-    env: gym.Env[Any, Any], policy: ActingPolicy, episodes: int, seed: int, show_progress: bool = False
+    env: gym.Env[Any, Any],
+    policy: Policy | StatePolicy,
+    episodes: int,
+    seed: int,
+    show_progress: bool = False,
 ) -> list[Episode]:
     """Runs `episodes` episodes without exploration; episode i starts from the seed `seed + i`.
 
@@ -85,7 +83,9 @@ def run_episodes(
 
     Raises:
         InvalidInputError: `episodes` or `seed` is out of range.
+        PolicyError: The policy cannot act in this task.
     """
+    acting = as_state_policy(policy, env)
     if episodes < 1:
         raise InvalidInputError(f"episodes must be 1 or more, got {episodes}")
     if not 0 <= seed <= 2**31 - 1 - episodes:
@@ -98,7 +98,7 @@ def run_episodes(
     ) as bar:
         while len(done) < episodes:
             first = seed + len(done)
-            batch = _run_batch(env, policy, [first + i for i in range(num_envs)])
+            batch = _run_batch(env, acting, [first + i for i in range(num_envs)])
             new = batch[: episodes - len(done)]
             done += new
             bar.set_postfix_str(f"success {sum(e.success for e in done) / len(done):.0%}", refresh=False)
@@ -106,7 +106,7 @@ def run_episodes(
     return done
 
 
-def _run_batch(env: gym.Env[Any, Any], policy: ActingPolicy, seeds: list[int]) -> list[Episode]:
+def _run_batch(env: gym.Env[Any, Any], policy: StatePolicy, seeds: list[int]) -> list[Episode]:
     """One episode in each parallel environment; those that end early wait for the others."""
     observations, info = env.reset(seed=seeds[0] if len(seeds) == 1 else seeds)  # type: ignore[arg-type]
     running = torch.ones(len(seeds), dtype=torch.bool, device=observations.device)

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from maniskill_tomato.experiments.statistics import mean_interval, sign_flip_p
 from maniskill_tomato.policies.oracle import FARTHEST, SHOULDER, shell_points
-from maniskill_tomato.policies.protocol import Planner
+from maniskill_tomato.policies.protocol import Policy, reseed
 from maniskill_tomato.robot.iiwa14 import READY_QPOS
 from maniskill_tomato.robot.inverse_kinematics import Reach
 from maniskill_tomato.robot.look_at_move import MIN_DISTANCE, LookAtMover
@@ -57,7 +57,7 @@ class RowResult:
         return cls(**{**content, **lists})
 
 
-def search_row(env: gym.Env[Any, Any], policy: Planner, seed: int) -> RowResult:
+def search_row(env: gym.Env[Any, Any], policy: Policy, seed: int) -> RowResult:
     """One episode of `TomatoViewpointRow-v1`, without exploration.
 
     Args:
@@ -66,9 +66,7 @@ def search_row(env: gym.Env[Any, Any], policy: Planner, seed: int) -> RowResult:
         seed: Of the reset.
     """
     world: Any = env.unwrapped
-    reseed = getattr(policy, "reseed", None)
-    if reseed is not None:
-        reseed(seed)
+    reseed(policy, seed)
     env.reset(seed=seed)
     targets = tuple(world.open_targets(0))
     first = torch.zeros(1, dtype=torch.int64, device=world.device)

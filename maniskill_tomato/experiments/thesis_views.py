@@ -9,10 +9,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from maniskill_tomato.experiments.reproduction import EVALUATION_SEED, Reproduction, load_episodes
-from maniskill_tomato.experiments.rollout import ActingPolicy, Episode
+from maniskill_tomato.experiments.rollout import Episode
 from maniskill_tomato.experiments.video import make_film_options
 from maniskill_tomato.learning.rl.envs import make_env
-from maniskill_tomato.learning.rl.policy import load_policy
+from maniskill_tomato.policies.protocol import StatePolicy
+from maniskill_tomato.policies.trained_actor import load_actor
 from maniskill_tomato.rendering import vulkan_probe
 
 Image = NDArray[np.uint8]
@@ -32,7 +33,7 @@ def take_all(reproduction: Reproduction, seed: int, folder: Path) -> str | None:
         return LEFT_OUT.format(hint=vulkan_probe.NO_RENDERING_HINT.capitalize())
     folder.mkdir(parents=True, exist_ok=True)
     experiment = reproduction.experiment
-    policy = load_policy(reproduction.seed_folder(seed) / "training" / "policy.pt")
+    policy = load_actor(reproduction.seed_folder(seed) / "training" / "policy.pt")
     for evaluation in experiment.evaluations:
         episodes = load_episodes(reproduction.episodes_path(seed, evaluation))
         options: dict[str, Any] = {
@@ -54,9 +55,7 @@ def episode_to_show(episodes: list[Episode]) -> int:
     return next((e.seed for e in episodes if e.success), episodes[0].seed if episodes else EVALUATION_SEED)
 
 
-def first_and_last_view(
-    env: gym.Env[Any, Any], policy: ActingPolicy, seed: int
-) -> tuple[Image, Image, Image]:
+def first_and_last_view(env: gym.Env[Any, Any], policy: StatePolicy, seed: int) -> tuple[Image, Image, Image]:
     """What the wrist camera sees before and after an episode, and the scene from outside after it.
 
     Args:

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from maniskill_tomato.experiments.overlay import annotate
-from maniskill_tomato.experiments.rollout import ActingPolicy
+from maniskill_tomato.policies.protocol import StatePolicy
 
 logger = logging.getLogger(__name__)
 
@@ -62,7 +62,7 @@ def make_film_options() -> dict[str, Any]:
     }
 
 
-def film_episodes(env: gym.Env[Any, Any], policy: ActingPolicy, seeds: list[int], path: Path) -> list[Film]:
+def film_episodes(env: gym.Env[Any, Any], policy: StatePolicy, seeds: list[int], path: Path) -> list[Film]:
     """Films one episode after the other into one mp4 file.
 
     Args:
@@ -99,7 +99,7 @@ class _Recorder:
         self._title = title
         self._threshold = float(self._base.task.full_visibility)
 
-    def run(self, policy: ActingPolicy, seed: int) -> Iterator[Image]:
+    def run(self, policy: StatePolicy, seed: int) -> Iterator[Image]:
         """The frames of the episode that starts from `seed`."""
         self._seed = seed
         observations, info = self._env.reset(seed=seed)

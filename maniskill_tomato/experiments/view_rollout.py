@@ -11,7 +11,7 @@ from torch import Tensor
 
 from maniskill_tomato.errors import InvalidInputError
 from maniskill_tomato.experiments.view_episode import ViewEpisode
-from maniskill_tomato.policies.protocol import Policy
+from maniskill_tomato.policies.protocol import Policy, reseed
 from maniskill_tomato.robot.inverse_kinematics import Reach
 
 Reset = Callable[[gym.Env[Any, Any], int], Any]
@@ -49,9 +49,7 @@ def run_view_episode(
         raise InvalidInputError(
             f"episodes are run one at a time; make the environment with num_envs=1, not {world.num_envs}"
         )
-    reseed = getattr(policy, "reseed", None)
-    if reseed is not None:
-        reseed(episode)
+    reseed(policy, episode)
     _, info = reset(env, episode)
     policy.begin(world.belief, torch.zeros(1, dtype=torch.int64, device=world.device))
     views, moves = [_view(world, info)], []

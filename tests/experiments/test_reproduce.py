@@ -46,8 +46,8 @@ from maniskill_tomato.experiments.thesis_figures import (
 )
 from maniskill_tomato.experiments.thesis_views import episode_to_show
 from maniskill_tomato.learning.rl.agent import make_actor, make_normalizer
-from maniskill_tomato.learning.rl.policy import Policy
 from maniskill_tomato.learning.rl.presets import PRESETS
+from maniskill_tomato.policies.trained_actor import TrainedActor
 
 ROOT = Path(__file__).resolve().parents[2]
 GUIDED = EXPERIMENTS["guided"]
@@ -175,13 +175,13 @@ def test_saturated_share_counts_outputs_near_one() -> None:
         actor.output.weight.zero_()
         # tanh(3) = 0.995 is saturated, tanh(1.5) = 0.905 is not.
         actor.output.bias.copy_(torch.tensor([3.0, -3.0, 1.5, -1.5, 0.0, 0.0]))
-    policy = Policy(
+    policy = TrainedActor(
         actor=actor,
         normalizer=make_normalizer(config, 9),
         action_scale=torch.ones(6),
         action_low=-torch.ones(6),
         action_high=torch.ones(6),
-        config=config,
+        config=config.to_dict(),
         env_id=GUIDED.env_id,
         package_version="0",
         counters={},

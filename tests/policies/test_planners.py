@@ -10,9 +10,12 @@ import pytest
 import torch
 from torch import Tensor
 
+from maniskill_tomato.assets import asset_path
 from maniskill_tomato.errors import CheckpointError, InvalidInputError
 from maniskill_tomato.experiments.view_episode import ViewEpisode
 from maniskill_tomato.experiments.view_rollout import run_view_episode
+from maniskill_tomato.learning.imitation.move_to_see_training import MoveToSeeData, train_move_network
+from maniskill_tomato.learning.imitation.regression_config import RegressionConfig
 from maniskill_tomato.plants.generator import generate_plant
 from maniskill_tomato.plants.organs import Plant
 from maniskill_tomato.policies import baselines, moves
@@ -20,22 +23,20 @@ from maniskill_tomato.policies.baselines import FixedSweep, LookAtServoing, Rand
 from maniskill_tomato.policies.deep_move_to_see import (
     DeepMoveToSee,
     MoveNetwork,
-    MoveToSeeData,
-    RegressionConfig,
-    load_move_network,
+    load_deep_move_to_see,
     network_input,
-    save_move_network,
-    train_move_network,
+    save_deep_move_to_see,
 )
 from maniskill_tomato.policies.gradient_view import GradientView, expected_visible_share
 from maniskill_tomato.policies.greedy_truth import GreedyTruth, greedy_directions
 from maniskill_tomato.policies.move_to_see import MoveToSee, MoveToSeeOnMemory, camera_array, size_gradient
 from maniskill_tomato.policies.moves import Candidates
 from maniskill_tomato.policies.next_best_view import NextBestDirection, NextBestView, NextBestViewConfig
+from maniskill_tomato.policies.opening import open_policy
 from maniskill_tomato.policies.oracle import Oracle, OracleSearch
 from maniskill_tomato.policies.protocol import Planner
 from maniskill_tomato.policies.reach import CameraReach
-from maniskill_tomato.policies.registry import PLANNERS, make_planner
+from maniskill_tomato.policies.registry import PLANNERS, PRIVILEGED
 from maniskill_tomato.raycast.scene import RayScene
 from maniskill_tomato.raycast.view_rays import ray_pattern
 from maniskill_tomato.robot.d435 import color_intrinsics
@@ -539,8 +540,8 @@ def test_the_network_learns_the_moves_and_keeps_them_on_disk(world: FreeWorld, t
     mean_only = float((data.moves - data.moves.mean(dim=0)).square().mean())
     assert told[-1][0] < 0.8 * mean_only
 
-    save_move_network(network, tmp_path / "network.pt")
-    again = DeepMoveToSee(load_move_network(tmp_path / "network.pt"))
+    save_deep_move_to_see(tmp_path / "network.pt", DeepMoveToSee(network))
+    again = open_policy(tmp_path / "network.pt", env_id="TomatoViewpoint-v1")
     world.reset(seed=30)
     torch.testing.assert_close(again.act(world.belief), DeepMoveToSee(network).act(world.belief))
     assert float(again.act(world.belief).norm()) <= 1.0 + 1e-6
@@ -548,33 +549,29 @@ def test_the_network_learns_the_moves_and_keeps_them_on_disk(world: FreeWorld, t
 
 def test_a_file_that_is_no_network_is_refused(tmp_path: Any) -> None:
     (tmp_path / "x.pt").write_bytes(b"nothing")
-    with pytest.raises(CheckpointError, match="Deep 3D Move To See"):
-        load_move_network(tmp_path / "x.pt")
+    with pytest.raises(CheckpointError, match="not a readable checkpoint"):
+        load_deep_move_to_see(tmp_path / "x.pt")
+    with pytest.raises(CheckpointError, match=r"no network of deep_3dmts; .*train-deep-3dmts"):
+        load_deep_move_to_see(asset_path("policies/TomatoViewpoint-v1.pt"))
     few = MoveToSeeData(torch.zeros(5, 4, 16, 16), torch.ones(5), torch.zeros(5, 3))
     with pytest.raises(InvalidInputError, match="too few"):
         train_move_network(few)
     assert MoveNetwork()(torch.zeros(2, 4, 16, 16), torch.ones(2)).shape == (2, 3)
 
 
-# -------------------------------------------------------------- registry
+# -------------------------------------------------------------- by name
 
 
 @pytest.mark.parametrize("name", PLANNERS)
-def test_every_planner_is_made_by_name_and_gives_moves(world: FreeWorld, name: str) -> None:
+def test_every_planner_is_opened_by_name_and_gives_moves(world: FreeWorld, name: str) -> None:
     world.reset(seed=4)
-    planner = make_planner(name, ground_truth=world)
+    planner = open_policy(name, env_id="TomatoViewpoint-v1", ground_truth=world)
     assert planner.name == name
+    assert planner.needs_truth == (name in PRIVILEGED)
     planner.begin(world.belief, torch.tensor([0]))
     move = planner.act(world.belief)
     assert move.shape == (1, 3)
     assert bool(torch.isfinite(move).all()) and float(move.norm()) <= 1.0 + 1e-5
-
-
-def test_names_and_the_truth_are_checked() -> None:
-    with pytest.raises(InvalidInputError, match="the planner must be one of"):
-        make_planner("best")
-    with pytest.raises(InvalidInputError, match="knows the truth"):
-        make_planner("oracle")
 
 
 def test_a_view_that_was_taken_is_not_taken_again(world: FreeWorld) -> None:

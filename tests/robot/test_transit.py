@@ -20,8 +20,8 @@ from maniskill_tomato.experiments.row_benchmark import (
     rows_table,
     search_row,
 )
-from maniskill_tomato.experiments.viewpoint_policy import BeliefPolicy
-from maniskill_tomato.policies.registry import make_planner
+from maniskill_tomato.policies.adapters import BeliefFollower
+from maniskill_tomato.policies.opening import open_policy
 from maniskill_tomato.robot.iiwa14 import JOINT_UPPER, READY_QPOS
 from maniskill_tomato.robot.inverse_kinematics import Reach
 from maniskill_tomato.robot.kinematics import forward_kinematics
@@ -142,7 +142,7 @@ def test_the_arm_does_not_meet_itself_on_a_transit(planner: TransitPlanner) -> N
 
 def test_a_refused_move_of_a_row_becomes_a_transit_that_is_counted(row: Any) -> None:
     base = row.unwrapped
-    policy = BeliefPolicy(make_planner("nbv"), row)
+    policy = BeliefFollower(open_policy("nbv"), row)
     met = 0
     for seed in (4, 6):
         obs, info = row.reset(seed=seed)
@@ -206,7 +206,7 @@ def test_transits_can_be_left_out_and_bad_ones_are_refused() -> None:
 
 
 def test_what_a_policy_sees_in_a_row_is_seeable(row: Any) -> None:
-    result = search_row(row, make_planner("nbv"), 2)
+    result = search_row(row, open_policy("nbv"), 2)
     assert len(result.seen) >= 2 and set(result.seen) <= set(result.targets)
     row.reset(seed=2)
     assert row.unwrapped.open_targets(0) == list(result.targets)

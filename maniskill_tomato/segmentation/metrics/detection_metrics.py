@@ -6,7 +6,6 @@ neither as found nor as missed, and a detection of which the threshold's share l
 COCO treats crowds.
 """
 
-from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Literal
 
@@ -14,16 +13,20 @@ import numpy as np
 from numpy.typing import NDArray
 
 from maniskill_tomato.errors import InvalidInputError
-from maniskill_tomato.segmentation.datasets.annotations import BEHIND, AnnotatedImage
+from maniskill_tomato.segmentation.datasets.annotations import (
+    BEHIND,
+    SMALLEST_SHARE,
+    AnnotatedImage,
+    ignored_fruit,
+)
 from maniskill_tomato.segmentation.instances import Instances
-from maniskill_tomato.segmentation.training.training_pictures import SMALLEST_SHARE, ignored_fruit
 
 Overlap = Literal["box", "mask"]
 
 
 @dataclass(frozen=True, kw_only=True)
 class ImageTruth:
-    """The fruits that really are in an image."""
+    """The annotated fruits of an image."""
 
     boxes: NDArray[np.float64]
     """Left, top, right, bottom in [px]. Shape (N, 4)."""
@@ -32,7 +35,7 @@ class ImageTruth:
     masks: NDArray[np.bool_] | None = None
     """Visible pixels; None where only boxes are annotated. Shape (N, H, W)."""
     least_side: float = 0.0
-    """Fruits of a narrower box were set aside, or not even annotated, in [px]."""
+    """Width of a box below which fruits are ignored or not even annotated, in [px]."""
 
 
 def image_truth(
@@ -69,7 +72,7 @@ def image_truth(
 
 
 def without_narrow(found: Instances, truth: ImageTruth, threshold: float = 0.5) -> Instances:
-    """The detections but those too narrow to be asked for which overlap no fruit that counts.
+    """The detections without those that are too narrow and overlap no fruit that counts.
 
     A renderer's image shows fruits too small to be annotated at all. COCO treats detections outside a range of areas in
     the same way.
@@ -86,7 +89,7 @@ def without_narrow(found: Instances, truth: ImageTruth, threshold: float = 0.5) 
 
 @dataclass(frozen=True, kw_only=True)
 class PrecisionRecall:
-    """How precision and recall go as the score threshold falls."""
+    """Precision and recall as the score threshold falls."""
 
     scores: NDArray[np.float64]
     """Scores of the counted detections, falling. Shape (D,)."""
@@ -225,8 +228,3 @@ def _ratios(
     shared: NDArray[np.float64], area_a: NDArray[np.float64], area_b: NDArray[np.float64]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     return shared / np.maximum(area_a + area_b - shared, 1e-9), shared / np.maximum(area_a, 1e-9)
-
-
-def mean_average_precision(curves: Sequence[PrecisionRecall]) -> float:
-    """The mean of the average precisions, for instance over thresholds 0.5 to 0.95."""
-    return float(np.mean([curve.average_precision for curve in curves]))
