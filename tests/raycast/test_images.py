@@ -1,4 +1,4 @@
-"""Cast depth images against the pattern of rays and the visibility caster, which know nothing of pixels."""
+"""Cast depth images against the pattern of rays and the visible fraction, which know nothing of pixels."""
 
 import numpy as np
 import pytest
@@ -6,10 +6,9 @@ import torch
 
 from maniskill_tomato.errors import InvalidInputError
 from maniskill_tomato.plants.generator import generate_plant
-from maniskill_tomato.raycast.cast_image import ImageCaster
-from maniskill_tomato.raycast.caster import VisibilityCaster
 from maniskill_tomato.raycast.images import BACKGROUND_DEPTH, PixelLabel
-from maniskill_tomato.raycast.view_rays import RayLabel, ViewRayCaster
+from maniskill_tomato.raycast.scene import RayScene
+from maniskill_tomato.raycast.view_rays import RayLabel
 from maniskill_tomato.robot.d435 import CameraIntrinsics
 from maniskill_tomato.sensing.view_pattern import sample_view
 
@@ -25,21 +24,19 @@ def camera_towards(point: np.ndarray, distance: float) -> torch.Tensor:
 
 def test_a_cast_image_shows_what_the_rays_say() -> None:
     plant = generate_plant("full", 3)
-    caster = VisibilityCaster(plants=[plant], intrinsics=INTRINSICS, rays_per_side=24)
-    images = ImageCaster(caster, INTRINSICS)
-    rays = ViewRayCaster(caster)
+    scene = RayScene([plant], INTRINSICS, rays_per_side=24)
     stand, agreeing, seen_some = torch.eye(4)[None], [], 0
     for k in range(6):
         centre = torch.from_numpy(plant.fruits[k].centre)[None]
         camera, target = camera_towards(plant.fruits[k].centre, 0.35), torch.tensor([k])
-        image = images.cast(camera, target, stand)
-        visible = caster.cast(camera, target, stand)
+        image = scene.image(INTRINSICS, camera, target, stand)
+        visible = scene.visibility(camera, target, stand)
         pixels = int((image.label == int(PixelLabel.TARGET)).sum())
         seen_some += pixels > 0
         assert pixels == pytest.approx(float(visible.visible[0]), abs=0.06 * float(visible.total[0]) + 3)
         mask = image.label[0] == int(PixelLabel.TARGET)
         read = sample_view(image.depth[0], mask, INTRINSICS, camera[0], centre[0])
-        cast = rays.cast(camera, target, centre, stand)
+        cast = scene.view_rays(camera, target, centre, stand)
         both = (read.label != RayLabel.OUTSIDE) & (cast.label != RayLabel.OUTSIDE)
         agreeing.append((read.label == cast.label)[both].float().mean())
         near = both & (read.label == cast.label) & (read.label != RayLabel.FREE)
@@ -51,17 +48,15 @@ def test_a_cast_image_shows_what_the_rays_say() -> None:
 
 def test_where_nothing_stands_the_background_is_seen() -> None:
     plant = generate_plant("one_tomato", 0)
-    caster = VisibilityCaster(plants=[plant], intrinsics=INTRINSICS)
+    scene = RayScene([plant], INTRINSICS)
     away = camera_towards(np.array([-2.0, 0.0, 0.5]), 0.5)
     away[0, :3, :3] = away[0, :3, :3] @ torch.diag(torch.tensor([-1.0, 1.0, -1.0]))
-    image = ImageCaster(caster, INTRINSICS).cast(away, torch.tensor([0]), torch.eye(4)[None])
+    image = scene.image(INTRINSICS, away, torch.tensor([0]), torch.eye(4)[None])
     assert bool((image.label == int(PixelLabel.NOTHING)).all())
     assert float(image.depth.min()) == BACKGROUND_DEPTH
 
 
 def test_wrong_shapes_are_refused() -> None:
-    caster = VisibilityCaster(plants=[generate_plant("one_tomato", 0)], intrinsics=INTRINSICS)
+    scene = RayScene([generate_plant("one_tomato", 0)], INTRINSICS)
     with pytest.raises(InvalidInputError, match="target_fruit"):
-        ImageCaster(caster, INTRINSICS).cast(
-            torch.eye(4)[None], torch.zeros(2, dtype=torch.int64), torch.eye(4)[None]
-        )
+        scene.image(INTRINSICS, torch.eye(4)[None], torch.zeros(2, dtype=torch.int64), torch.eye(4)[None])
