@@ -118,7 +118,7 @@ class WarpScene:
         """See `RayScene.visible_fraction_from`."""
         if self._many_views is None:
             self._many_views = _Views(VIEWS_AT_ONCE, self._links.count, self._device)
-        views, count = self._many_views, len(T_w_camera)
+        views, count = self._many_views, T_w_camera.shape[0]
         recorded = self._recorded(self._record_visibility, views)
         views.environments.fill_(env_index)
         answers = torch.empty(count, device=self._device)
@@ -184,13 +184,10 @@ class WarpScene:
         """See `RayLibrary.clearance`."""
         paths, samples = T_w_links.shape[:2]
         recorded = self._recorded(self._record_clearance, paths, samples, farthest)
-        environments, plants, links = recorded.inputs
+        environments, plants, links, every = recorded.inputs
         links.copy_(T_w_links)
         plants.copy_(T_w_plant)
-        if env_idx is None:
-            torch.arange(paths, out=environments)
-        else:
-            environments.copy_(env_idx)
+        environments.copy_(every if env_idx is None else env_idx)
         recorded.outputs[0].fill_(farthest)
         recorded.launch()
         return recorded.outputs[0].clone()
@@ -318,6 +315,7 @@ class WarpScene:
 
     def _record_clearance(self, paths: int, samples: int, farthest: float) -> "_Recorded":
         environments = self._zeros(paths, dtype=torch.int32)
+        every = torch.arange(paths, dtype=torch.int32, device=self._device)
         plants, links = self._zeros(paths, 4, 4), self._zeros(paths, samples, len(LINK_NAMES), 4, 4)
         clearance = self._zeros(paths)
         sphere_links, spheres = (torch.tensor(table, device=self._device) for table in sphere_table())
@@ -333,7 +331,7 @@ class WarpScene:
         ]
         threads = (paths, samples, len(spheres))
         launch = RecordedLaunch(self._device, (clearance_kernels.sphere_clearance, threads, arguments))
-        return _Recorded(launch, inputs=(environments, plants, links), outputs=(clearance,))
+        return _Recorded(launch, inputs=(environments, plants, links, every), outputs=(clearance,))
 
     def _finish_work(self) -> None:
         """Waits for what is under way on a GPU, in Warp's stream and in torch's."""
@@ -429,7 +427,7 @@ class _Views:
             T_w_plant: Shape (K, 4, 4), or (4, 4) for all.
             T_w_links: Shape (K, 9, 4, 4), or (9, 4, 4) for one; None for no robot.
         """
-        count = len(T_w_camera) if T_w_camera.dim() == 3 else 1
+        count = T_w_camera.shape[0] if T_w_camera.dim() == 3 else 1
         whole = count == self.count
         (self._camera_poses if whole else self._camera_poses[:count]).copy_(T_w_camera)
         self._plant_poses.copy_(T_w_plant)
