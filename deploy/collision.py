@@ -32,6 +32,34 @@ class Contact:
     """At which of the joint positions."""
 
 
+def arm_spec(table_height: float, obstacles: tuple[Box, ...], T_flange_camera: Float64) -> Any:
+    """The arm with its collision shapes, the table and what stands about, not compiled yet.
+
+    Args:
+        table_height: Height of the surface that the arm stands on, in [m].
+        obstacles: Boxes, geoms `obstacle N`.
+        T_flange_camera: The camera's optical frame in `link_ee`, which its body goes with. Shape (4, 4).
+    """
+    spec = mj.MjSpec.from_file(urdf_path())
+    pose = camera_link_pose(T_flange_camera)
+    camera = spec.body(CAMERA_LINK_NAME)
+    camera.pos = pose[:3, 3]
+    mj.mju_mat2Quat(camera.quat, np.ascontiguousarray(pose[:3, :3]).ravel())
+    world = spec.worldbody
+    world.add_geom(
+        name=TABLE, type=mj.mjtGeom.mjGEOM_PLANE, size=[2.0, 2.0, 0.1], pos=[0.0, 0.0, table_height]
+    )
+    for k, box in enumerate(obstacles):
+        low, high = np.array(box.low), np.array(box.high)
+        world.add_geom(
+            name=f"{OBSTACLE} {k}",
+            type=mj.mjtGeom.mjGEOM_BOX,
+            size=((high - low) / 2).tolist(),
+            pos=((high + low) / 2).tolist(),
+        )
+    return spec
+
+
 class CollisionChecker:
     """Holds joint positions against collision shapes. Neighbouring links overlap and are left out."""
 
@@ -55,23 +83,7 @@ class CollisionChecker:
             obstacle_clearance: By so much, in [m].
             T_flange_camera: The camera's optical frame in `link_ee`, which its body goes with. Shape (4, 4).
         """
-        spec = mj.MjSpec.from_file(urdf_path())
-        pose = camera_link_pose(T_flange_camera)
-        camera = spec.body(CAMERA_LINK_NAME)
-        camera.pos = pose[:3, 3]
-        mj.mju_mat2Quat(camera.quat, np.ascontiguousarray(pose[:3, :3]).ravel())
-        world = spec.worldbody
-        world.add_geom(
-            name=TABLE, type=mj.mjtGeom.mjGEOM_PLANE, size=[2.0, 2.0, 0.1], pos=[0.0, 0.0, table_height]
-        )
-        for k, box in enumerate(obstacles):
-            low, high = np.array(box.low), np.array(box.high)
-            world.add_geom(
-                name=f"{OBSTACLE} {k}",
-                type=mj.mjtGeom.mjGEOM_BOX,
-                size=((high - low) / 2).tolist(),
-                pos=((high + low) / 2).tolist(),
-            )
+        spec = arm_spec(table_height, obstacles, T_flange_camera)
         self._model: Any = spec.compile()
         self._data: Any = mj.MjData(self._model)
         self._model.geom_margin[:] = max(table_clearance, self_clearance, obstacle_clearance)

@@ -14,8 +14,6 @@ Deviations:
 """
 
 import io
-from collections.abc import Callable
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, cast
 
@@ -34,42 +32,6 @@ DEPTH_SCALE = 0.3
 """Distance in front of the target that counts as one, in [m]."""
 
 FORMAT = 1
-
-
-@dataclass(frozen=True, eq=False)
-class MoveToSeeData:
-    """Views and the moves that 3D Move To See made from them."""
-
-    pictures: Tensor
-    """As `view_picture` gives them. Shape (N, 4, 16, 16)."""
-    distance: Tensor
-    """Camera to target, in [m]. Shape (N,)."""
-    moves: Tensor
-    """(right, up, forward) as shares of a full move. Shape (N, 3)."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class RegressionConfig:
-    """How the network is trained."""
-
-    epochs: int = 15
-    """Passes over the data; theirs: 50."""
-    batch_size: int = 64
-    """As theirs."""
-    learning_rate: float = 1e-3
-    """Of Adam; theirs fine-tune by SGD with momentum at 1e-5."""
-    validation_share: float = 0.1
-    """Share of the data, its last part, by whose loss the epoch is chosen."""
-    seed: int = 0
-
-    def __post_init__(self) -> None:
-        for name in ("epochs", "batch_size"):
-            if getattr(self, name) < 1:
-                raise InvalidInputError(f"{name} must be at least 1, got {getattr(self, name)}")
-        if not 0.0 < self.validation_share < 1.0:
-            raise InvalidInputError(f"validation_share must lie in (0, 1), got {self.validation_share}")
-        if not self.learning_rate > 0.0:
-            raise InvalidInputError(f"learning_rate must be positive, got {self.learning_rate}")
 
 
 class MoveNetwork(nn.Module):
@@ -117,51 +79,6 @@ def view_picture(rays: ViewRays, distance: Tensor) -> Tensor:
     return torch.stack(channels, dim=1).view(-1, CHANNELS, RAYS_PER_SIDE, RAYS_PER_SIDE)
 
 
-def train_move_network(
-    data: MoveToSeeData,
-    config: RegressionConfig | None = None,
-    report: Callable[[int, float, float], None] = lambda epoch, loss, validation: None,
-) -> MoveNetwork:
-    """Fits the network to the moves by their squared error, and keeps the epoch with the lowest validation loss.
-
-    Args:
-        data: From `scripts/train_deep_move_to_see.py`, in the order of the episodes.
-        config: How to train.
-        report: Told the epoch, its mean loss and the validation loss.
-
-    Raises:
-        InvalidInputError: There are too few views.
-    """
-    config = config or RegressionConfig()
-    count = len(data.moves)
-    held_back = int(count * config.validation_share)
-    if held_back < 1 or count - held_back < config.batch_size:
-        raise InvalidInputError(f"{count} views are too few for batches of {config.batch_size}")
-    generator = torch.Generator().manual_seed(config.seed)
-    with torch.random.fork_rng(devices=[]):
-        torch.manual_seed(config.seed)
-        network = MoveNetwork()
-    optimizer = torch.optim.Adam(network.parameters(), lr=config.learning_rate)
-    last = count - held_back
-    best, weights = float("inf"), network.state_dict()
-    for epoch in range(config.epochs):
-        losses = []
-        for rows in torch.split(torch.randperm(last, generator=generator), config.batch_size):
-            loss = _loss(network, data, rows)
-            optimizer.zero_grad()
-            loss.backward()  # type: ignore[no-untyped-call]
-            optimizer.step()
-            losses.append(float(loss.detach()))
-        with torch.no_grad():
-            validation = float(_loss(network, data, torch.arange(last, count)))
-        if validation < best:
-            best = validation
-            weights = {name: value.clone() for name, value in network.state_dict().items()}
-        report(epoch, sum(losses) / len(losses), validation)
-    network.load_state_dict(weights)
-    return network.eval().requires_grad_(False)
-
-
 def save_move_network(network: MoveNetwork, path: Path) -> None:
     """Writes the weights in one step."""
     buffer = io.BytesIO()
@@ -185,7 +102,7 @@ def load_move_network(path: Path, device: str | torch.device = "cpu") -> MoveNet
         raise
     except Exception as error:
         raise CheckpointError(
-            f"{path} is no network of Deep 3D Move To See: {error}; train one with scripts/train_deep_move_to_see.py"
+            f"{path} is no network of Deep 3D Move To See: {error}; train one with `maniskill-tomato train-deep-3dmts`"
         ) from error
     return network.eval().requires_grad_(False)
 
@@ -211,7 +128,7 @@ class DeepMoveToSee(Planner):
             path = asset_path("policies/deep_3dmts.pt")
         except FileNotFoundError as error:
             raise InvalidInputError(
-                "no network of deep_3dmts ships with this version; train one with scripts/train_deep_move_to_see.py "
+                "no network of deep_3dmts ships with this version; train one with `maniskill-tomato train-deep-3dmts` "
                 "and give its file as deep_3dmts=FILE"
             ) from error
         return cls(load_move_network(path, device))
@@ -228,8 +145,3 @@ def network_input(belief: Belief) -> tuple[Tensor, Tensor]:
     """Picture and distance of the present views. Shapes (B, 4, 16, 16) and (B,)."""
     distance = (belief.target_position - belief.camera_position).norm(dim=-1)
     return view_picture(belief.rays, distance), distance
-
-
-def _loss(network: MoveNetwork, data: MoveToSeeData, rows: Tensor) -> Tensor:
-    moves = network(data.pictures[rows], data.distance[rows])
-    return nn.functional.mse_loss(moves, data.moves[rows])

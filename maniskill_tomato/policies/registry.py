@@ -13,6 +13,8 @@ from maniskill_tomato.policies.lattice_oracle import LatticeOracle
 from maniskill_tomato.policies.move_to_see import MoveToSee, MoveToSeeOnMemory
 from maniskill_tomato.policies.next_best_view import NextBestDirection, NextBestView
 from maniskill_tomato.policies.oracle import Oracle, OracleSearch
+from maniskill_tomato.policies.planner_names import PLANNERS as PLANNERS
+from maniskill_tomato.policies.planner_names import PRIVILEGED as PRIVILEGED
 from maniskill_tomato.policies.protocol import GroundTruth, Planner
 from maniskill_tomato.policies.view_quality import ViewQuality
 
@@ -58,12 +60,6 @@ _MAKERS: dict[str, Callable[[_Setting], Planner]] = {
     LatticeOracle.name: lambda s: LatticeOracle(s.truth),
     Oracle.name: lambda s: Oracle(OracleSearch(s.truth, s.device, contact_free=s.contact_free)),
 }
-
-PLANNERS = tuple(_MAKERS)
-"""All names."""
-
-PRIVILEGED = (MoveToSee.name, GreedyTruth.name, LatticeOracle.name, Oracle.name)
-"""Those that know the truth."""
 
 
 def make_planner(

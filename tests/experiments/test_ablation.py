@@ -55,7 +55,7 @@ def test_a_run_is_done_once_and_kept(tmp_path: Path) -> None:
     (run,) = plan("td3", variants, [GUIDED], [3], tmp_path, episodes=2, total_timesteps=60)
     result = execute(run)
     assert result is not None and result["training_steps"] == 60 and result["updates"] == 0
-    assert 0.0 < result["training_cpu_seconds"] < 60.0 and 0.0 <= result["success_rate"] <= 1.0
+    assert result["training_cpu_seconds"] > 0.0 and 0.0 <= result["success_rate"] <= 1.0
     written = (run.folder / "policy.pt").stat().st_mtime_ns
     assert list(execute_all([run], jobs=1)) == [(run, json.loads((run.folder / "result.json").read_text()))]
     assert execute(run) == result and (run.folder / "policy.pt").stat().st_mtime_ns == written

@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from maniskill_tomato.cli import parse
-from maniskill_tomato.cli.benchmark import Benchmark
+from maniskill_tomato.cli.benchmark_command import Benchmark
 from maniskill_tomato.errors import InvalidInputError
 from maniskill_tomato.experiments import benchmark
 from maniskill_tomato.experiments.benchmark import BenchmarkConfig, run_benchmark

@@ -13,6 +13,8 @@ from torch import Tensor
 from maniskill_tomato.errors import CheckpointError, InvalidInputError
 from maniskill_tomato.experiments.view_episode import ViewEpisode
 from maniskill_tomato.experiments.view_rollout import run_view_episode
+from maniskill_tomato.learning.imitation.move_to_see_training import MoveToSeeData, train_move_network
+from maniskill_tomato.learning.imitation.regression_config import RegressionConfig
 from maniskill_tomato.plants.generator import generate_plant
 from maniskill_tomato.plants.organs import Plant
 from maniskill_tomato.policies import baselines, moves
@@ -20,12 +22,9 @@ from maniskill_tomato.policies.baselines import FixedSweep, LookAtServoing, Rand
 from maniskill_tomato.policies.deep_move_to_see import (
     DeepMoveToSee,
     MoveNetwork,
-    MoveToSeeData,
-    RegressionConfig,
     load_move_network,
     network_input,
     save_move_network,
-    train_move_network,
 )
 from maniskill_tomato.policies.gradient_view import GradientView, expected_visible_share
 from maniskill_tomato.policies.greedy_truth import GreedyTruth, greedy_directions
