@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from maniskill_tomato.cli.early_checks import check_count, check_policies
 from maniskill_tomato.errors import InvalidInputError
 
 # PyTorch and ManiSkill take seconds to import; the command imports what it needs when it runs.
@@ -25,7 +26,7 @@ class Benchmark:
     episodes: int = 500
     """How many episodes of the list."""
     episode_list: str = "held_out"
-    """Which fixed list: held_out to report, validation to choose, or a file of `scripts/certify_episodes.py`."""
+    """Which fixed list: held_out to report, validation to choose, or a file of `tools/certify_episodes.py`."""
     seed: int = 0
     """The first of them."""
     out: Path = Path("runs/benchmark")
@@ -46,6 +47,9 @@ class Benchmark:
 
     def run(self) -> None:
         """Runs what is missing and says where the results are."""
+        check_policies("--policies", self.policies)
+        check_count("--jobs", self.jobs)
+
         from maniskill_tomato.experiments.benchmark import BenchmarkConfig, run_benchmark
         from maniskill_tomato.experiments.benchmark_conditions import SWEEPS, main_condition, sweep_conditions
         from maniskill_tomato.experiments.benchmark_pictures import draw_view_grid

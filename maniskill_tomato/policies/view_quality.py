@@ -74,8 +74,8 @@ class ViewQuality(Planner):
             path = asset_path("policies/TomatoViewpoint-v1.pt")
         except FileNotFoundError as error:
             raise InvalidInputError(
-                "no view-quality policy ships with this version; train one with scripts/train_view_quality.py and give "
-                "its file"
+                "no view-quality policy ships with this version; train one with `maniskill-tomato train-view-quality` "
+                "and give its file"
             ) from error
         return load_view_quality(path, device)
 
@@ -119,7 +119,7 @@ def load_view_quality(path: Path, device: str | torch.device = "cpu") -> ViewQua
         return ViewQuality(network, ViewQualityConfig(**data["config"]), dict(data["facts"])), network
 
     return load_network(
-        path, FORMAT, device, build, "view-quality policy; scripts/train_view_quality.py makes one"
+        path, FORMAT, device, build, "view-quality policy; `maniskill-tomato train-view-quality` makes one"
     )
 
 

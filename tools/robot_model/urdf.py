@@ -11,15 +11,6 @@ from maniskill_tomato.robot import d435, iiwa14
 
 Vector = tuple[float, float, float]
 
-CAMERA_LINK_NAME: Final = "camera_link"
-"""The D435's housing."""
-
-COLOR_FRAME_NAME: Final = "camera_color_frame"
-"""Where the colour camera is, x forward, y left, z up."""
-
-DEPTH_FRAME_NAME: Final = "camera_depth_frame"
-"""Where the depth camera (the left infrared imager) is, x forward, y left, z up."""
-
 BRACKET_MASS: Final = 0.030
 """Mass of the printed camera bracket on the flange, in [kg] (a guess: 25 cm^3 of plastic)."""
 
@@ -141,7 +132,7 @@ COLLISION_SHAPES: Final[dict[str, tuple[Primitive, ...]]] = {
         _tube(0.0, 0.007, 0.034),
         Primitive(kind="box", center=(0.0, 0.0, 0.0145), size=(0.024, 0.068, 0.021)),
     ),
-    CAMERA_LINK_NAME: (Primitive(kind="box", center=d435.BODY_CENTER, size=d435.BODY_SIZE),),
+    d435.CAMERA_LINK_NAME: (Primitive(kind="box", center=d435.BODY_CENTER, size=d435.BODY_SIZE),),
 }
 """Collision shapes of each link. Neighbours overlap, which no simulator checks; they hold the visible shells
 to 17 mm."""
@@ -242,14 +233,14 @@ def _box_inertial(mass: float, center: Vector, size: Vector) -> Inertial:
 
 def _camera() -> list[str]:
     lines = _link(
-        CAMERA_LINK_NAME,
+        d435.CAMERA_LINK_NAME,
         _box_inertial(d435.BODY_MASS, d435.BODY_CENTER, d435.BODY_SIZE),
-        f"meshes/{CAMERA_LINK_NAME}.glb",
+        f"meshes/{d435.CAMERA_LINK_NAME}.glb",
     )
-    lines += _fixed_joint(iiwa14.EE_LINK_NAME, CAMERA_LINK_NAME, d435.T_flange_camera)
+    lines += _fixed_joint(iiwa14.EE_LINK_NAME, d435.CAMERA_LINK_NAME, d435.T_flange_camera)
     # RealSense's URDF roots the camera in its tripod thread; ours hangs on the flange, so that is a leaf.
     lines += _link("camera_bottom_screw_frame")
-    lines += _fixed_joint(CAMERA_LINK_NAME, "camera_bottom_screw_frame", d435.T_camera_screw)
+    lines += _fixed_joint(d435.CAMERA_LINK_NAME, "camera_bottom_screw_frame", d435.T_camera_screw)
     for name, transform in (
         ("depth", d435.T_camera_infra1),
         ("infra1", d435.T_camera_infra1),
@@ -258,7 +249,7 @@ def _camera() -> list[str]:
     ):
         frame, optical = f"camera_{name}_frame", f"camera_{name}_optical_frame"
         lines += _link(frame)
-        lines += _fixed_joint(CAMERA_LINK_NAME, frame, transform)
+        lines += _fixed_joint(d435.CAMERA_LINK_NAME, frame, transform)
         lines += _link(optical)
         lines += _fixed_joint(frame, optical, d435.T_frame_optical)
     return lines
@@ -268,7 +259,7 @@ def urdf_text() -> str:
     """The URDF; mesh files are named relative to it, in `meshes/`, one for each link that one sees."""
     lines = [
         '<?xml version="1.0"?>',
-        "<!-- Written by scripts/build_robot.py. -->",
+        "<!-- Written by tools/build_robot.py. -->",
         '<robot name="iiwa14_d435">',
         "  <mujoco>",
         '    <compiler fusestatic="false" discardvisual="true" strippath="false"/>',

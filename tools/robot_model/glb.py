@@ -5,7 +5,7 @@ import struct
 from collections.abc import Sequence
 from typing import Any
 
-from maniskill_tomato.robot.meshes import MATERIALS, Part
+from robot_model.meshes import MATERIALS, Part
 
 _ARRAY_BUFFER, _ELEMENT_BUFFER = 34962, 34963
 _FLOAT, _UNSIGNED_SHORT = 5126, 5123

@@ -14,7 +14,8 @@ import numpy as np
 import numpy.typing as npt
 
 from maniskill_tomato.errors import InvalidInputError
-from maniskill_tomato.robot import d435, iiwa14, solids
+from maniskill_tomato.robot import d435, iiwa14
+from robot_model import solids
 
 FloatArray = npt.NDArray[np.float64]
 
