@@ -14,7 +14,7 @@ from typing import Any
 import tyro
 
 from maniskill_tomato.errors import TomatoError
-from maniskill_tomato.experiments.benchmark_policies import PolicySpec
+from maniskill_tomato.experiments.policy_runs import PolicySpec, open_for
 from maniskill_tomato.learning.imitation.demonstrations import record_demonstrations
 from maniskill_tomato.learning.rl.envs import make_env
 
@@ -38,7 +38,7 @@ class Args:
 def main(args: Args) -> None:
     """Records, and says what."""
     env: Any = make_env("TomatoViewpoint-v1")
-    planner = PolicySpec.parse(args.planner).make(env, args.contact_free)
+    planner = open_for(PolicySpec.parse(args.planner), env, args.contact_free)
     seeds = range(args.first_seed, args.first_seed + args.episodes)
     result = record_demonstrations(env, planner, seeds, args.out)
     print(f"{result.path}: {result.recorded} of {result.tried} episodes, {result.moves} moves")

@@ -33,13 +33,11 @@ from tqdm import tqdm
 
 import maniskill_tomato
 from maniskill_tomato.errors import TomatoError
-from maniskill_tomato.experiments.evaluate import write_trajectories
-from maniskill_tomato.experiments.metrics import make_metrics, write_metrics
-from maniskill_tomato.experiments.rollout import run_episodes
+from maniskill_tomato.experiments.evaluation import evaluate_run
+from maniskill_tomato.experiments.training_runs import load_run
 from maniskill_tomato.files import write_atomically
 from maniskill_tomato.learning.interrupt import stop_on_signals
 from maniskill_tomato.learning.rl.checkpoint import save_checkpoint
-from maniskill_tomato.learning.rl.envs import make_env
 from maniskill_tomato.learning.rl.export import DenseActor, export_actor
 from maniskill_tomato.learning.rl.gymnasium_env import Array, make_gymnasium_env, normalize_observation
 from maniskill_tomato.learning.rl.history import TrainingHistory
@@ -249,39 +247,6 @@ def dense_actor(
     )
 
 
-def evaluate(env_id: str, policy: PPOPolicy, run_dir: Path, episodes: int, seed: int, progress: bool) -> None:
-    """Writes eval/metrics.json and eval/trajectories.npz of a run and prints one line."""
-    counters = torch.load(run_dir / "ppo.pt", weights_only=True)["counters"]
-    start = time.perf_counter()
-    env = make_env(env_id)
-    try:
-        threshold = float(env.unwrapped.task.full_visibility)  # type: ignore[attr-defined]
-        done = run_episodes(env, policy, episodes, seed, progress)
-    finally:
-        env.close()
-    description = {
-        "path": str(run_dir / "ppo.pt"),
-        "kind": "PPO",
-        "trained_on": env_id,
-        **{f"training_{k}": round(v, 1) if k == "seconds" else v for k, v in counters.items()},
-        "package_version": maniskill_tomato.__version__,
-    }
-    metrics = make_metrics(
-        env_id,
-        done,
-        seed=seed,
-        success_threshold=threshold,
-        policy=description,
-        wall_seconds=time.perf_counter() - start,
-    )
-    write_metrics(run_dir / "eval" / "metrics.json", metrics)
-    write_trajectories(run_dir / "eval" / "trajectories.npz", done)
-    print(
-        f"{run_dir}: success {metrics['success_rate']:.0%} of {episodes}, {metrics['mean_steps']:.1f} steps, "
-        f"trained {counters['steps']} steps in {counters['seconds']:.0f} s"
-    )
-
-
 @dataclass(frozen=True, kw_only=True)
 class Args:
     """Train PPO with one or more seeds, one after the other, and evaluate each."""
@@ -312,7 +277,10 @@ def main(args: Args) -> None:
         if policy is None:
             print(f"stopped; {run_dir} holds what was learned so far")
             return
-        evaluate(args.env_id, policy, run_dir, args.episodes, args.eval_seed, args.progress)
+        metrics = evaluate_run(load_run(run_dir), args.episodes, args.eval_seed).metrics
+        print(
+            f"{run_dir}: success {metrics['success_rate']:.0%} of {args.episodes}, {metrics['mean_steps']:.1f} steps"
+        )
 
 
 if __name__ == "__main__":

@@ -41,36 +41,28 @@ class Eval:
 
     def run(self) -> None:
         """Evaluates and says where the report is."""
-        from maniskill_tomato.experiments.evaluate import EvaluationConfig, evaluate
+        from maniskill_tomato.experiments.configs import EvaluationConfig
+        from maniskill_tomato.experiments.evaluation import evaluate
         from maniskill_tomato.learning.rl.envs import check_env_id
-        from maniskill_tomato.policies.adapters import origin
-        from maniskill_tomato.policies.opening import find_policy, open_policy, shipped_policy
-        from maniskill_tomato.policies.protocol import Policy
 
         check_env_id(self.env_id)
-        env_id = None if self.allow_other_task else self.env_id
-        found = find_policy(self.policy or shipped_policy(self.env_id), env_id)
-        path = found if isinstance(found, Path) else None
-        policy: Policy | str = str(found)
-        if path is not None:
-            policy = open_policy(path, env_id=env_id)
-            print(f"policy  {origin(policy)}")
         env_options = self.plants.env_options()
         if self.episode_list is not None or (self.env_id == LISTED_ID and not env_options):
             env_options["episodes"] = self.episode_list or "held_out"
-        run_dir = path.parent if path is not None and (path.parent / "history.npz").is_file() else None
         config = EvaluationConfig(
             env_id=self.env_id,
+            policy=self.policy,
             episodes=self.episodes,
             seed=self.seed,
             out=self.out,
+            allow_other_task=self.allow_other_task,
             env_options=env_options,
             baseline=self.baseline,
             video=self.video,
             title="Where to look: evaluation",
-            training_run=run_dir,
         )
-        result = evaluate(config, policy, path)
+        result = evaluate(config)
+        print(f"policy  {result.origin}")
         print(summary(result.metrics))
         if result.left_out:
             print(result.left_out)
