@@ -11,9 +11,9 @@ import numpy as np
 from maniskill_tomato.deploy.capture import Capture
 from maniskill_tomato.deploy.errors import DeployError, RecordingError
 from maniskill_tomato.deploy.interface import JointMove
-from maniskill_tomato.deploy.observing import Observing
 from maniskill_tomato.deploy.policies import TASK, decide, default_policy
 from maniskill_tomato.deploy.profile import Profile
+from maniskill_tomato.deploy.robot_belief import RobotBelief
 from maniskill_tomato.deploy.workcell import make_workcell
 from maniskill_tomato.errors import TomatoError
 from maniskill_tomato.files import write_atomically
@@ -111,27 +111,24 @@ def _look(workcell: Any, profile: Profile, joints: Any, opened: Any, out: Path |
         except TomatoError as error:
             raise RecordingError(f"cannot write {path}: {error.__cause__ or error}") from error
         yield Finding(what="saved", good=True, detail=str(path))
-    observing = Observing(profile.T_flange_camera, profile.loop.max_moves)
-    T_world_camera = observing.camera_pose(joints)
-    target = workcell.target_position()
-    if target is None:
-        target = workcell.perception.find_target(frame, T_world_camera)
-    if target is None:
+    perception = workcell.perception
+    robot_belief = RobotBelief(profile.T_flange_camera, profile.loop.max_moves)
+    perception.begin(workcell.target_position())
+    view = perception.look(frame, robot_belief.camera_pose(joints))
+    if view is None:
         yield Finding(
             what="target", good=False, detail="no ripe fruit in the picture; point the camera at one"
         )
         return
-    view = workcell.perception.look(frame, T_world_camera, target)
     yield Finding(
         what="target",
         good=True,
-        detail=f"at {np.round(target, 3).tolist()} m, V_f {view.visible_fraction:.2f}, {view.fruits_seen} ripe fruits "
-        "in the picture",
+        detail=f"at {np.round(view.target_position, 3).tolist()} m, V_f {view.visible_fraction:.2f}, "
+        f"{view.fruits_seen} ripe fruits in the picture",
     )
     if opened is None:
         return
-    observing.begin(target)
-    belief = observing.observe(joints, view, profile.loop.max_moves)
+    belief = robot_belief.observe(joints, view, profile.loop.max_moves)
     try:
         import torch
 

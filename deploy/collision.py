@@ -8,9 +8,8 @@ import numpy as np
 
 from maniskill_tomato.deploy.interface import Float64
 from maniskill_tomato.deploy.safety_config import Box
-from maniskill_tomato.robot.d435 import T_flange_camera_color_optical, camera_link_pose
+from maniskill_tomato.robot.d435 import CAMERA_LINK_NAME, T_flange_camera_color_optical, camera_link_pose
 from maniskill_tomato.robot.description import urdf_path
-from maniskill_tomato.robot.urdf import CAMERA_LINK_NAME
 
 mj: Any = mujoco
 
@@ -30,6 +29,34 @@ class Contact:
     """Between their collision shapes, in [m], negative if they overlap."""
     sample: int
     """At which of the joint positions."""
+
+
+def arm_spec(table_height: float, obstacles: tuple[Box, ...], T_flange_camera: Float64) -> Any:
+    """The arm with its collision shapes, the table and what stands about, not compiled yet.
+
+    Args:
+        table_height: Height of the surface that the arm stands on, in [m].
+        obstacles: Boxes, geoms `obstacle N`.
+        T_flange_camera: The camera's optical frame in `link_ee`, which its body goes with. Shape (4, 4).
+    """
+    spec = mj.MjSpec.from_file(urdf_path())
+    pose = camera_link_pose(T_flange_camera)
+    camera = spec.body(CAMERA_LINK_NAME)
+    camera.pos = pose[:3, 3]
+    mj.mju_mat2Quat(camera.quat, np.ascontiguousarray(pose[:3, :3]).ravel())
+    world = spec.worldbody
+    world.add_geom(
+        name=TABLE, type=mj.mjtGeom.mjGEOM_PLANE, size=[2.0, 2.0, 0.1], pos=[0.0, 0.0, table_height]
+    )
+    for k, box in enumerate(obstacles):
+        low, high = np.array(box.low), np.array(box.high)
+        world.add_geom(
+            name=f"{OBSTACLE} {k}",
+            type=mj.mjtGeom.mjGEOM_BOX,
+            size=((high - low) / 2).tolist(),
+            pos=((high + low) / 2).tolist(),
+        )
+    return spec
 
 
 class CollisionChecker:
@@ -55,23 +82,7 @@ class CollisionChecker:
             obstacle_clearance: By so much, in [m].
             T_flange_camera: The camera's optical frame in `link_ee`, which its body goes with. Shape (4, 4).
         """
-        spec = mj.MjSpec.from_file(urdf_path())
-        pose = camera_link_pose(T_flange_camera)
-        camera = spec.body(CAMERA_LINK_NAME)
-        camera.pos = pose[:3, 3]
-        mj.mju_mat2Quat(camera.quat, np.ascontiguousarray(pose[:3, :3]).ravel())
-        world = spec.worldbody
-        world.add_geom(
-            name=TABLE, type=mj.mjtGeom.mjGEOM_PLANE, size=[2.0, 2.0, 0.1], pos=[0.0, 0.0, table_height]
-        )
-        for k, box in enumerate(obstacles):
-            low, high = np.array(box.low), np.array(box.high)
-            world.add_geom(
-                name=f"{OBSTACLE} {k}",
-                type=mj.mjtGeom.mjGEOM_BOX,
-                size=((high - low) / 2).tolist(),
-                pos=((high + low) / 2).tolist(),
-            )
+        spec = arm_spec(table_height, obstacles, T_flange_camera)
         self._model: Any = spec.compile()
         self._data: Any = mj.MjData(self._model)
         self._model.geom_margin[:] = max(table_clearance, self_clearance, obstacle_clearance)

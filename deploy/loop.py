@@ -30,10 +30,10 @@ from maniskill_tomato.deploy.guarded_arm import GuardedArm
 from maniskill_tomato.deploy.interface import Camera, Float64, Frame, JointMove
 from maniskill_tomato.deploy.loop_config import LoopConfig, Mode, Proposal
 from maniskill_tomato.deploy.move_choice import MoveChooser, MoveRequest
-from maniskill_tomato.deploy.observing import Observing
-from maniskill_tomato.deploy.perceive import Perception
 from maniskill_tomato.deploy.plant_points import PlantPoints
 from maniskill_tomato.deploy.policies import decide
+from maniskill_tomato.deploy.robot_belief import RobotBelief
+from maniskill_tomato.deploy.robot_perception import Perception
 from maniskill_tomato.deploy.safety import Refusal
 from maniskill_tomato.deploy.stage_times import StageTimes
 from maniskill_tomato.deploy.steps import Recorder, RunResult, Step
@@ -84,7 +84,7 @@ class Loop:
             arm: The only way to the arm.
             camera: Told when the arm stands at a new viewpoint.
             capture: Takes the camera's pictures.
-            perception: Turns them into views.
+            perception: Turns them into sightings of the target.
             policy: Decides.
             T_flange_camera: The camera's optical frame in `link_ee`. Shape (4, 4).
             clock: The devices' clock.
@@ -100,8 +100,8 @@ class Loop:
         self._perception, self._policy = perception, policy
         self._clock, self._config, self._stops = clock, config, stops
         self._recorder, self._mode, self._confirm = recorder, mode, confirm
-        self._target = target_position
-        self._observing = Observing(T_flange_camera, config.max_moves)
+        perception.begin(target_position)
+        self._robot_belief = RobotBelief(T_flange_camera, config.max_moves)
         self._chooser = MoveChooser(arm.safety, T_flange_camera)
         self._points = PlantPoints(T_flange_camera)
         self._fractions: list[float] = []
@@ -188,27 +188,17 @@ class Loop:
         self._act(step, frame)
 
     def _look(self, frame: Frame, joints: Float64) -> Step:
-        T_world_camera = self._observing.camera_pose(joints)
-        first = self._observing.target_position is None
+        T_world_camera = self._robot_belief.camera_pose(joints)
         with self._times.timed("perceive"):
-            if first:
-                target = self._target
-                if target is None:
-                    target = self._perception.find_target(frame, T_world_camera)
-                if target is None:
-                    raise _End(
-                        "no_target", "the first picture shows no ripe fruit; start where one is in view"
-                    )
-                self._target = np.array(target, dtype=np.float64)
-                self._observing.begin(self._target)
-            assert self._target is not None
-            view = self._perception.look(frame, T_world_camera, self._target)
+            view = self._perception.look(frame, T_world_camera)
+        if view is None:
+            raise _End("no_target", "the first picture shows no ripe fruit; start where one is in view")
         with self._times.timed("observe"):
             moves_left = self._config.max_moves - self._moves
-            self._belief = self._observing.observe(joints, view, moves_left)
+            self._belief = self._robot_belief.observe(joints, view, moves_left)
         with self._times.timed("plant points"):
             self._points.add(frame, T_world_camera, joints)
-        if first:
+        if not self._fractions:
             self._policy.begin(self._belief, torch.zeros(1, dtype=torch.int64))
         self._fractions.append(view.visible_fraction)
         self._true_fraction = None if frame.truth is None else frame.truth.visible_fraction
@@ -218,17 +208,17 @@ class Loop:
             view=view,
             joint_positions=joints,
             T_world_camera=T_world_camera,
-            target_position=self._target,
+            target_position=view.target_position,
             moves_left=moves_left,
         )
 
     def _act(self, step: Step, frame: Frame) -> None:
         """Solves the move, has it checked and carried out, or counts it as refused."""
-        assert step.action is not None and self._target is not None
+        assert step.action is not None
         request = MoveRequest(
             joint_positions=step.joint_positions,
-            camera_position=self._observing.camera_position(step.joint_positions),
-            target_position=self._target,
+            camera_position=self._robot_belief.camera_position(step.joint_positions),
+            target_position=step.target_position,
             action=step.action,
         )
         points = self._points.points_w
@@ -250,7 +240,7 @@ class Loop:
         except RefusedError as error:
             self._refuse(step, str(error))
             return
-        self._follow(step, sent)
+        self._follow(step, sent, chosen.then)
 
     def _go_back(self, step: Step) -> None:
         """Without depth nobody knows what is near, a leaf over the lens for one: back to where there was some."""
@@ -268,9 +258,27 @@ class Loop:
             ) from error
         self._follow(step, sent)
 
-    def _follow(self, step: Step, sent: JointMove) -> None:
-        """Waits until the arm stands and has settled, looking for stops all the while."""
+    def _follow(self, step: Step, sent: JointMove, then: tuple[JointMove, ...] = ()) -> None:
+        """Waits for the end of the move, then sends the rest of a way round.
+
+        Where the rest is refused, the next look is from where the arm stands.
+        """
         self._refused_in_a_row = 0
+        self._arrive(step, sent)
+        for move in then:
+            if self._mode == "confirm":
+                self._ask(replace(step, commanded=sent.joint_positions), move, None)
+            try:
+                sent = self._arm.command(move, step.frame.stamp, self._points.points_w)
+            except RefusedError as error:
+                step = replace(step, detail=f"the rest of the way was refused: {error}")
+                break
+            self._arrive(step, sent)
+        self._settled_at = self._clock.now()
+        self._record(replace(step, commanded=sent.joint_positions, outcome="moved"))
+
+    def _arrive(self, step: Step, sent: JointMove) -> None:
+        """Waits until the arm stands and has settled, looking for stops all the while."""
         with self._times.timed("move"):
             try:
                 while not self._arm.wait(WAIT_SLICE):
@@ -284,13 +292,11 @@ class Loop:
                 )
                 self._record(broken)
                 raise error
-        self._settled_at = self._clock.now()
-        self._record(replace(step, commanded=sent.joint_positions, outcome="moved"))
 
     def _ask(self, step: Step, move: JointMove, refusal: Refusal | None) -> None:
         """Shows the move; goes on only if a person wants it."""
         state = self._arm.read()
-        after = self._observing.camera_pose(move.joint_positions)
+        after = self._robot_belief.camera_pose(move.joint_positions)
         proposal = Proposal(
             number=self._moves - 1,
             visible_fraction=step.view.visible_fraction,

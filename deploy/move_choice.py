@@ -8,9 +8,10 @@ from typing import Final
 import numpy as np
 import torch
 
+from maniskill_tomato.deploy.detour import DetourPlanner
 from maniskill_tomato.deploy.interface import ArmState, Float64, JointMove
 from maniskill_tomato.deploy.postures import Postures
-from maniskill_tomato.deploy.safety import Refusal, Safety
+from maniskill_tomato.deploy.safety import COLLISIONS, Refusal, Safety
 from maniskill_tomato.robot.inverse_kinematics import Reach
 from maniskill_tomato.robot.look_at_move import LookAtMover, moved_position
 
@@ -42,10 +43,12 @@ class Choice:
     """The safe move, or if there is none the task's own; None where the arm cannot reach that either."""
     refusal: Refusal | None
     """Why `safety` refuses the task's own; None if `move` may go out or there is none."""
+    then: tuple[JointMove, ...] = ()
+    """What follows `move` on a way round an obstacle; each is checked again before it goes out."""
 
 
 class MoveChooser:
-    """The task's own posture where it is safe, else another one of the same or a shorter move."""
+    """The task's own posture where it is safe, else another one of the same or a shorter move, else a way round."""
 
     def __init__(self, safety: Safety, T_flange_camera: Float64) -> None:
         """Prepares the kinematics.
@@ -57,6 +60,7 @@ class MoveChooser:
         self._safety = safety
         self._mover = LookAtMover(T_flange_camera=np.array(T_flange_camera, dtype=np.float64))
         self._postures = Postures(T_flange_camera, safety.config.joint_margin)
+        self._detours = DetourPlanner(safety, T_flange_camera)
 
     def own_goal(self, request: MoveRequest) -> Float64 | None:
         """Joint positions of the task's own move, in [rad], shape (7,); None if out of reach."""
@@ -80,7 +84,7 @@ class MoveChooser:
         frame_stamp: float,
         points_w: Float64,
     ) -> Choice:
-        """Holds the task's own posture and then others against `safety`.
+        """Holds the task's own posture, then others against `safety`, then looks for a way round to its own.
 
         Args:
             request: Where to.
@@ -115,4 +119,9 @@ class MoveChooser:
             if self._safety.check(move, state, now, frame_stamp, points_w) is None:
                 _logger.info("the move is made in another posture, because %s", refusal or "out of reach")
                 return Choice(move=move, refusal=None)
+        if own is not None and refusal is not None and refusal.reason in COLLISIONS:
+            way = self._detours.plan(state, own.joint_positions, now, frame_stamp, points_w)
+            if way is not None:
+                _logger.info("the move is made in %d parts, because %s", len(way), refusal)
+                return Choice(move=way[0], refusal=None, then=tuple(way[1:]))
         return Choice(move=own, refusal=refusal)

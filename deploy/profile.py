@@ -12,11 +12,10 @@ import numpy as np
 from maniskill_tomato.deploy.capture import CaptureConfig
 from maniskill_tomato.deploy.errors import ProfileError
 from maniskill_tomato.deploy.fields import parse_table
-from maniskill_tomato.deploy.fruits import TruthFinder
 from maniskill_tomato.deploy.interface import Float64
 from maniskill_tomato.deploy.loop_config import LoopConfig
-from maniskill_tomato.deploy.perceive import Sight
 from maniskill_tomato.deploy.profile_files import profile_names, profile_path
+from maniskill_tomato.deploy.robot_perception import TRUE_MASKS, Sight
 from maniskill_tomato.deploy.safety_config import SafetyConfig
 from maniskill_tomato.errors import InvalidInputError
 from maniskill_tomato.robot.d435 import T_flange_camera_color_optical
@@ -46,14 +45,15 @@ class PerceptionConfig:
     """What turns pictures into views."""
 
     segmenter: str = "light"
-    """`ground_truth` (simulated cameras only), or a segmenter of `maniskill_tomato.perception`, or its weights."""
+    """`ground_truth` (perfect masks, simulated cameras only), a segmenter of `maniskill_tomato.segmentation`, or its
+    weights."""
     sight: Sight = "images"
     """`images`: masks and depth, as on a robot; `rays`: the twin's exact rays, as in the simulated task."""
 
     def __post_init__(self) -> None:
-        if self.sight == "rays" and self.segmenter != TruthFinder.name:
+        if self.sight == "rays" and self.segmenter != TRUE_MASKS:
             raise InvalidInputError(
-                f"sight = 'rays' goes with segmenter = '{TruthFinder.name}' only, got {self.segmenter!r}"
+                f"sight = 'rays' goes with segmenter = '{TRUE_MASKS}' only, got {self.segmenter!r}"
             )
 
 

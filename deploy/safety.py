@@ -9,7 +9,7 @@ flange, then collisions along the straight line in joint space, which is what a 
 
 import math
 from dataclasses import dataclass
-from typing import Literal
+from typing import Final, Literal
 
 import numpy as np
 import torch
@@ -40,6 +40,9 @@ Reason = Literal[
     "obstacle",
     "plant",
 ]
+
+COLLISIONS: Final[tuple[Reason, ...]] = ("self_collision", "table", "obstacle", "plant")
+"""Those that another way to the same posture may avoid."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -111,6 +114,21 @@ class Safety:
             return refusal
         path = joint_path(state.joint_positions, move.joint_positions, self.config.path_step)
         return self._way(path) or self._contacts(path) or self._plant(path, points_w)
+
+    def stands_in_collision(self, joint_positions: Float64, points_w: Float64 | None) -> bool:
+        """Whether a posture touches something wherever the arm comes from.
+
+        Args:
+            joint_positions: In [rad]. Shape (7,).
+            points_w: What was seen of the plant, base frame, in [m]; None for no such check. Shape (P, 3).
+        """
+        c = self.config
+        if self._collisions.nearest(joint_positions[None]) is not None:
+            return True
+        if c.plant_clearance is None or points_w is None or len(points_w) < c.plant_points_needed:
+            return False
+        near = sphere_distances(joint_positions[None], points_w, self._T_flange_camera) < c.plant_clearance
+        return int(near.sum()) >= c.plant_points_needed
 
     def _numbers(
         self, move: JointMove, state: ArmState, now: float, frame_stamp: float | None

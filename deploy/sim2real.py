@@ -24,9 +24,9 @@ from torch import Tensor
 
 from maniskill_tomato.deploy.errors import PerceptionError, ProfileError, RefusedError
 from maniskill_tomato.deploy.interface import Float64
-from maniskill_tomato.deploy.observing import Observing
-from maniskill_tomato.deploy.perceive import View
 from maniskill_tomato.deploy.real_agent import IiwaRealAgent
+from maniskill_tomato.deploy.robot_belief import RobotBelief
+from maniskill_tomato.deploy.robot_perception import Sighting
 from maniskill_tomato.robot.inverse_kinematics import Reach
 from maniskill_tomato.tasks.maniskill.look_at_controller import LookAtController
 from maniskill_tomato.tasks.maniskill.viewpoint_controller import ViewpointController
@@ -63,9 +63,8 @@ class TomatoSim2RealEnv(Sim2RealEnv):  # type: ignore[misc]
             raise ProfileError(
                 f"control_mode must be pd_viewpoint or pd_look_at on hardware, got {base.agent.control_mode!r}"
             )
-        self._observing: Observing | None = None
-        self._view: View | None = None
-        self._target: Float64 | None = None
+        self._robot_belief: RobotBelief | None = None
+        self._view: Sighting | None = None
         self._fraction_before = 0.0
         self._refused = False
         self._moves = 0
@@ -85,9 +84,9 @@ class TomatoSim2RealEnv(Sim2RealEnv):  # type: ignore[misc]
         Raises:
             PerceptionError: Before the first reset.
         """
-        if self._target is None:
+        if self._view is None:
             raise PerceptionError("no target is known before reset()")
-        return self._target
+        return self._view.target_position
 
     def begin(self) -> None:
         """Looks for the target and begins an episode from where the arm stands.
@@ -97,19 +96,11 @@ class TomatoSim2RealEnv(Sim2RealEnv):  # type: ignore[misc]
             DeployError: A device fails.
         """
         workcell = self.agent.workcell
-        frame, joints = self.agent.look()
-        T_world_camera = self.agent.camera_pose(joints)
-        target = workcell.target_position()
-        if target is None:
-            target = workcell.perception.find_target(frame, T_world_camera)
-        if target is None:
-            raise PerceptionError("the first picture shows no ripe fruit; start where one is in view")
-        self._target = target
+        workcell.perception.begin(workcell.target_position())
         self._moves, self._refused, self._fraction_before = 0, False, 0.0
         layout = getattr(self.base_sim_env, "layout", None)
         if layout is not None:
-            self._observing = Observing(workcell.profile.T_flange_camera, self._max_moves, layout)
-            self._observing.begin(target)
+            self._robot_belief = RobotBelief(workcell.profile.T_flange_camera, self._max_moves, layout)
         self._reach = torch.full((1,), int(Reach.REACHABLE), dtype=torch.int64)
         self._take_view()
         assert self._view is not None
@@ -191,7 +182,7 @@ class TomatoSim2RealEnv(Sim2RealEnv):  # type: ignore[misc]
 
     def _get_obs_extra(self, info: Mapping[str, Any]) -> dict[str, Tensor]:
         base: Any = self.base_sim_env
-        if self._observing is not None:
+        if self._robot_belief is not None:
             vector = self._vector
             return {name: vector[:, part].clone() for name, part in base.layout.slices.items()}
         viewpoint: Tensor = base._viewpoint
@@ -210,13 +201,14 @@ class TomatoSim2RealEnv(Sim2RealEnv):  # type: ignore[misc]
     def _take_view(self) -> None:
         """Looks, once for every place where the arm stands."""
         frame, joints = self.agent.look()
-        self._view = self.agent.workcell.perception.look(
-            frame, self.agent.camera_pose(joints), self.target_position
-        )
+        view = self.agent.workcell.perception.look(frame, self.agent.camera_pose(joints))
+        if view is None:
+            raise PerceptionError("the first picture shows no ripe fruit; start where one is in view")
+        self._view = view
         self._follow_the_arm()
-        if self._observing is not None:
+        if self._robot_belief is not None:
             left = max(0, self._max_moves - self._moves)
-            self._vector = self._observing.observe(joints, self._view, left).observation
+            self._vector = self._robot_belief.observe(joints, view, left).observation
 
     def _follow_the_arm(self) -> None:
         """Puts the simulated arm where the real one stands."""

@@ -4,7 +4,7 @@ from dataclasses import asdict, dataclass, field
 from typing import Any, Protocol
 
 from maniskill_tomato.deploy.interface import Float64, Frame
-from maniskill_tomato.deploy.perceive import View
+from maniskill_tomato.deploy.robot_perception import Sighting
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -14,7 +14,7 @@ class Step:
     number: int
     """Counts the looks from 0."""
     frame: Frame
-    view: View
+    view: Sighting
     joint_positions: Float64
     """When the picture was taken, in [rad]. Shape (7,)."""
     T_world_camera: Float64

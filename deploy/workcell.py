@@ -11,13 +11,12 @@ from maniskill_tomato.deploy.capture import Capture
 from maniskill_tomato.deploy.clock import CheckedClock, Clock, MonotonicClock, SimulatedClock
 from maniskill_tomato.deploy.drivers import DriverContext, make_arm, make_camera
 from maniskill_tomato.deploy.errors import ProfileError, RecordingError
-from maniskill_tomato.deploy.fruits import open_finder
 from maniskill_tomato.deploy.guarded_arm import GuardedArm
 from maniskill_tomato.deploy.interface import Arm, Camera, Float64
 from maniskill_tomato.deploy.loop import Loop
 from maniskill_tomato.deploy.loop_config import Mode, Proposal
-from maniskill_tomato.deploy.perceive import ImagePerception, Perception, TruthPerception
 from maniskill_tomato.deploy.profile import Profile
+from maniskill_tomato.deploy.robot_perception import Perception, open_perception
 from maniskill_tomato.deploy.safety import Safety
 from maniskill_tomato.deploy.steps import Recorder
 from maniskill_tomato.deploy.stops import Stops
@@ -87,17 +86,6 @@ class Workcell:
         )
 
 
-def make_perception(profile: Profile) -> Perception:
-    """What the profile's `[perception]` asks for.
-
-    Raises:
-        ProfileError: It cannot be opened.
-    """
-    if profile.perception.sight == "rays":
-        return TruthPerception()
-    return ImagePerception(open_finder(profile.perception.segmenter))
-
-
 def make_workcell(profile: Profile, seed: int = 0, clock: Clock | None = None) -> Workcell:
     """Makes the devices of a profile without touching any.
 
@@ -125,7 +113,7 @@ def make_workcell(profile: Profile, seed: int = 0, clock: Clock | None = None) -
         arm=arm,
         camera=camera,
         guarded_arm=GuardedArm(arm, Safety(profile.safety, profile.T_flange_camera), checked),
-        perception=make_perception(profile),
+        perception=open_perception(profile.perception.sight, profile.perception.segmenter),
     )
 
 

@@ -42,6 +42,10 @@ class CheckpointError(TomatoError):
         self.newer_format = newer_format
 
 
+class NotWrittenError(CheckpointError):
+    """A file cannot be written: the disk is full, or the folder is not ours."""
+
+
 class TrainingDivergedError(TomatoError):
     """A loss or a weight is no longer a finite number."""
 

@@ -11,14 +11,14 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     import torch
 
-from maniskill_tomato.errors import CheckpointError
+from maniskill_tomato.errors import CheckpointError, NotWrittenError
 
 
 def write_atomically(path: Path, content: bytes) -> None:
     """Replaces the file `path` by one with `content` in a single step.
 
     Raises:
-        CheckpointError: The file cannot be written.
+        NotWrittenError: The file cannot be written.
     """
     temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
     try:
@@ -32,7 +32,7 @@ def write_atomically(path: Path, content: bytes) -> None:
     except OSError as error:
         with contextlib.suppress(OSError):
             temporary.unlink(missing_ok=True)
-        raise CheckpointError(
+        raise NotWrittenError(
             f"cannot write {path}: {error.strerror or error}; what was there before is kept. Free some space "
             "or choose another --out; a run goes on with --resume"
         ) from error

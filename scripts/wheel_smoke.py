@@ -16,7 +16,7 @@ N_STEPS = 3
 TASK_IDS = ("TomatoViewpointGuided-v1", "TomatoViewpointSparse-v1")
 INFO_KEYS = ("success", "visible_fraction", "target_id")
 FILES = ("py.typed", "assets/iiwa14/iiwa14.urdf")
-FOREIGN_NAMES = ("tasks", "assets", "deploy", "scripts", "tests")
+FOREIGN_NAMES = ("tasks", "assets", "deploy", "scripts", "tests", "tools")
 
 
 class SmokeFailure(Exception):

@@ -55,7 +55,7 @@ def folders_with_code() -> set[str]:
 
 def run_python(code: str, *options: str, cwd: Path) -> subprocess.CompletedProcess[str]:
     return subprocess.run(
-        [sys.executable, *options, "-c", code], capture_output=True, text=True, cwd=cwd, timeout=120
+        [sys.executable, *options, "-c", code], capture_output=True, text=True, cwd=cwd, timeout=300
     )
 
 

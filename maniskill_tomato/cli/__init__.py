@@ -1,100 +1,115 @@
-"""The command `maniskill-tomato`: train, evaluate, compare, demonstrate, export, deploy.
+"""The command `maniskill-tomato`; `maniskill-tomato --help` lists what it does.
 
 Examples:
-    maniskill-tomato train TomatoViewpointGuided-v1
-    maniskill-tomato train TomatoViewpointSparse-v1 --preset thesis-sparse --seeds 0..4 --jobs 2
-    maniskill-tomato train --resume runs/guided
-    maniskill-tomato eval TomatoViewpointGuided-v1 --policy runs/demo/training/policy.pt --episodes 100
-    maniskill-tomato benchmark --policies nbv,oracle,runs/general/policy.pt --episodes 500
     maniskill-tomato demo
-    maniskill-tomato export --policy runs/demo/training/policy.pt --out exported
+    maniskill-tomato train TomatoViewpointGuided-v1
+    maniskill-tomato eval TomatoViewpointGuided-v1 --policy runs/demo/training/policy.pt --episodes 100
     maniskill-tomato deploy run --profile mock --out runs/deploy
-    maniskill-tomato dataset --count 1000 --split train --out runs/dataset
-    maniskill-tomato detect photos --out detections.json
 """
 
 import logging
 import os
 import sys
+import traceback
 from collections.abc import Sequence
-from typing import Annotated, Any
+from typing import Any
 
-import tyro
+from maniskill_tomato.cli.command_table import COMMANDS, FAMILIES, PROGRAM, command_list, family_list, unknown
+from maniskill_tomato.errors import (
+    InvalidInputError,
+    NotWrittenError,
+    SeedsFailedError,
+    TomatoError,
+    TrainingDivergedError,
+)
 
-from maniskill_tomato.cli.benchmark import Benchmark
-from maniskill_tomato.cli.dataset import Dataset
-from maniskill_tomato.cli.demo import Demo
-from maniskill_tomato.cli.deploy import Deploy
-from maniskill_tomato.cli.detect import Detect
-from maniskill_tomato.cli.evaluate import Eval
-from maniskill_tomato.cli.export import Export
-from maniskill_tomato.cli.options import PlantOptions, merge_options
-from maniskill_tomato.cli.train import Train, train_default
-from maniskill_tomato.errors import TomatoError
+HELP = ("-h", "--help", "help")
 
-__all__ = [
-    "Benchmark",
-    "Dataset",
-    "Demo",
-    "Deploy",
-    "Detect",
-    "Eval",
-    "Export",
-    "PlantOptions",
-    "Train",
-    "main",
-    "merge_options",
-    "parse",
-]
+FAILED = 1
+"""Exit status of a command that failed on its way."""
 
-Command = Train | Eval | Benchmark | Demo | Export | Dataset | Detect | Deploy
+USAGE = 2
+"""Exit status of a command that cannot be done as asked."""
 
-# PyTorch and ManiSkill take seconds to import, so that every command imports what it needs when it runs.
+INTERRUPTED = 130
+"""Exit status after Ctrl-C, as of a shell."""
 
-
-def parse(argv: Sequence[str]) -> Command:
-    """The command that the arguments describe.
-
-    The options of `train` default to those of the run that it continues or of its `--config` file, and these to
-    those of its `--preset`.
-
-    Raises:
-        InvalidInputError: The file or the run cannot be used.
-    """
-    default = train_default(argv) if "train" in argv[:1] else Train()
-    commands: Any = (
-        Annotated[Train, tyro.conf.subcommand("train", default=default)]
-        | Annotated[Eval, tyro.conf.subcommand("eval")]
-        | Annotated[Benchmark, tyro.conf.subcommand("benchmark")]
-        | Annotated[Demo, tyro.conf.subcommand("demo")]
-        | Annotated[Export, tyro.conf.subcommand("export")]
-        | Annotated[Dataset, tyro.conf.subcommand("dataset")]
-        | Annotated[Detect, tyro.conf.subcommand("detect")]
-        | Annotated[Deploy, tyro.conf.subcommand("deploy")]
-    )
-    command: Command = tyro.cli(
-        commands,
-        prog="maniskill-tomato",
-        description="Active perception for tomato harvesting: train, evaluate, compare, demonstrate, export, deploy.",
-        args=list(argv),
-        config=(tyro.conf.OmitArgPrefixes,),
-    )
-    return command
+READER_GONE = 141
+"""Exit status when whoever reads the output, such as `head`, has gone."""
 
 
 def main(argv: Sequence[str] | None = None) -> None:
-    """Runs the command; errors made on purpose end with one line and exit status 2."""
+    """Runs the command; every error ends with words and an exit status."""
     logging.basicConfig(level=logging.WARNING, format="%(message)s", stream=sys.stderr)
     logging.getLogger("maniskill_tomato").setLevel(logging.INFO)
     try:
-        parse(sys.argv[1:] if argv is None else argv).run()
+        run(list(sys.argv[1:] if argv is None else argv))
     except TomatoError as error:
-        print(f"error: {error}", file=sys.stderr)
-        raise SystemExit(2) from None
+        _end(str(error), _status(error))
     except KeyboardInterrupt:
         print("stopped", file=sys.stderr)
-        raise SystemExit(130) from None
+        raise SystemExit(INTERRUPTED) from None
     except BrokenPipeError:
-        # Whoever read the output, such as `head`, has gone; what is still buffered must not fail at exit.
+        # What is still buffered must not fail at exit.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        raise SystemExit(141) from None
+        raise SystemExit(READER_GONE) from None
+    except OSError as error:
+        where = f": {error.filename}" if error.filename else ""
+        _end(f"{error.strerror or error}{where}", FAILED)
+    except Exception:
+        traceback.print_exc()
+        _end("this is a fault of maniskill-tomato; please report it with the lines above", FAILED)
+
+
+def run(argv: list[str]) -> None:
+    """Runs the command, or prints the list of commands or the version.
+
+    Raises:
+        TomatoError: It cannot be run, or failed.
+        SystemExit: Its arguments cannot be read, or help was asked for.
+    """
+    if not argv or argv[0] in HELP:
+        print(command_list())
+    elif argv[0] == "--version":
+        from maniskill_tomato import __version__
+
+        print(f"{PROGRAM} {__version__}")
+    elif argv[0] in FAMILIES and (len(argv) == 1 or argv[1] in HELP):
+        print(family_list(argv[0]))
+    else:
+        command = parse(argv)
+        try:
+            command.run()
+        except InvalidInputError as error:
+            from maniskill_tomato.cli.arguments import with_flags
+
+            raise InvalidInputError(with_flags(str(error), type(command))) from error
+
+
+def parse(argv: Sequence[str]) -> Any:
+    """The command that the arguments describe: a dataclass with a method `run`.
+
+    Raises:
+        InvalidInputError: There is no such command, or a value cannot be used.
+        SystemExit: Its arguments cannot be read, or help was asked for.
+    """
+    words = 2 if argv[0] in FAMILIES else 1
+    name, rest = " ".join(argv[:words]), argv[words:]
+    if name not in COMMANDS:
+        raise InvalidInputError(unknown(argv[words - 1], argv[0] if words == 2 else ""))
+    kind = COMMANDS[name].load()
+
+    from maniskill_tomato.cli.arguments import parse_arguments
+
+    default = kind.defaults(rest) if hasattr(kind, "defaults") else None
+    return parse_arguments(kind, rest, f"{PROGRAM} {name}", default)
+
+
+def _status(error: TomatoError) -> int:
+    """It failed on its way, or what was asked for cannot be done."""
+    return FAILED if isinstance(error, (NotWrittenError, SeedsFailedError, TrainingDivergedError)) else USAGE
+
+
+def _end(message: str, status: int) -> None:
+    print(f"error: {message}", file=sys.stderr)
+    raise SystemExit(status) from None

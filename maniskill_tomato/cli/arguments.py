@@ -6,7 +6,6 @@ import, so that every command imports what it needs when it runs, after its argu
 
 import ast
 import dataclasses
-import functools
 import inspect
 import re
 import shutil
@@ -108,10 +107,10 @@ def _flags(kind: type, prefix: str = "") -> Iterator[tuple[type, str, str]]:
 
 
 def _wrapped(text: str) -> str:
-    """Paragraphs that fit the terminal."""
+    """Paragraphs that fit the terminal, indented: lines that begin with a letter tyro would join."""
     width = min(shutil.get_terminal_size().columns, 80)
     paragraphs = (" ".join(paragraph.split()) for paragraph in text.split("\n\n"))
-    return "\n\n".join(textwrap.fill(paragraph, width) for paragraph in paragraphs)
+    return "\n".join(textwrap.indent(textwrap.fill(text, width - 2), "  ") for text in paragraphs)
 
 
 @_REGISTRY.primitive_rule
@@ -239,8 +238,7 @@ def _documented(info: StructTypeInfo) -> StructConstructorSpec | None:
     return StructConstructorSpec(instantiate=make, fields=tuple(fields))
 
 
-@functools.cache
-def field_texts(kind: type) -> dict[str, str]:
+def field_texts(kind: type[Any]) -> dict[str, str]:
     """The sentences under the fields of a dataclass and its bases, on one line each."""
     texts: dict[str, str] = {}
     for base in reversed(kind.__mro__):

@@ -14,7 +14,7 @@ from maniskill_tomato.experiments.episode_record import EpisodeRecord
 from maniskill_tomato.experiments.result_store import ResultStore, fingerprint
 from maniskill_tomato.experiments.rollout import run_episode
 from maniskill_tomato.learning.rl.envs import make_env
-from maniskill_tomato.policies.opening import open_policy
+from maniskill_tomato.policies.opening import find_policy, open_policy
 from maniskill_tomato.policies.protocol import Policy
 from maniskill_tomato.policies.registry import policy_names
 from maniskill_tomato.worker_pool import run_jobs
@@ -42,20 +42,14 @@ class PolicySpec:
         """Reads `NAME`, `FILE` or `LABEL=FILE`.
 
         Raises:
-            InvalidInputError: It is none of these.
+            PolicyError: There is no such name and no such file.
         """
         label, _, source = text.rpartition("=")
-        names = policy_names()
-        if not label and source in names:
-            return cls(label=source, source=source)
-        path = Path(source)
-        if not path.is_file():
-            raise InvalidInputError(
-                f"{text!r} is no policy: give the name of a planner ({', '.join(names)}), the file of a trained "
-                "policy (.pt or .onnx), or LABEL=FILE"
-            )
-        label = label or (path.parent.name if path.stem == "policy" and path.parent.name else path.stem)
-        return cls(label=label, source=str(path.resolve()))
+        found = find_policy(source)
+        if isinstance(found, str):
+            return cls(label=label or found, source=found)
+        by_file = found.parent.name if found.stem == "policy" and found.parent.name else found.stem
+        return cls(label=label or by_file, source=str(found.resolve()))
 
     @property
     def fingerprint(self) -> str:
@@ -68,7 +62,8 @@ def parse_policies(text: str) -> list[PolicySpec]:
     """Reads a list with commas.
 
     Raises:
-        InvalidInputError: It is empty, one of them cannot be used, or two have the same label.
+        InvalidInputError: It is empty, or two have the same label.
+        PolicyError: There is no such policy.
     """
     specs = [PolicySpec.parse(part.strip()) for part in text.split(",") if part.strip()]
     if not specs:

@@ -116,5 +116,5 @@ def load_deep_move_to_see(path: Path, device: str | torch.device = "cpu") -> Dee
         return DeepMoveToSee(network), network
 
     return load_network(
-        path, FORMAT, device, build, "network of deep_3dmts; scripts/train_deep_move_to_see.py makes one"
+        path, FORMAT, device, build, "network of deep_3dmts; `maniskill-tomato train-deep-3dmts` makes one"
     )

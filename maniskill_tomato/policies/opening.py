@@ -1,11 +1,10 @@
 """The one way to a policy: by its name or from its file."""
 
-import difflib
 from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
-from maniskill_tomato.errors import PolicyError, TomatoError
+from maniskill_tomato.errors import PolicyError, TomatoError, did_you_mean
 from maniskill_tomato.policies.layout import GENERAL_IDS, has_belief
 from maniskill_tomato.policies.registry import (
     PRIVILEGED,
@@ -47,10 +46,11 @@ def find_policy(name_or_file: str | Path, env_id: str | None = None) -> str | Pa
         return text
     path = Path(text)
     if not path.is_file():
-        near = difflib.get_close_matches(text, (*names, RANDOM), n=1)
-        hint = f"; did you mean {near[0]!r}?" if near else ""
+        known = (RANDOM, *names) if env_id is None or has_belief(env_id) else (RANDOM,)
+        beside = [p.name for p in path.parent.iterdir()] if path.parent.is_dir() else []
         raise PolicyError(
-            f"no policy at {text!r}; give a .pt or .onnx file, or one of {', '.join((RANDOM, *names))}{hint}"
+            f"no policy at {text!r}; give a .pt or .onnx file, or one of {', '.join(known)}"
+            f"{did_you_mean(text, known) or did_you_mean(path.name, beside)}"
         )
     return path
 
@@ -114,7 +114,7 @@ def shipped_policy(env_id: str) -> Path:
         return _asset(f"policies/{GENERAL_IDS[0] if has_belief(env_id) else env_id}.pt")
     except PolicyError:
         how = (
-            "give --policy a planner's name such as nbv, or train one with scripts/train_view_quality.py"
+            "give --policy a planner's name such as nbv, or train one with `maniskill-tomato train-view-quality`"
             if has_belief(env_id)
             else f"train one with `maniskill-tomato train {env_id}`"
         )

@@ -23,6 +23,15 @@ Calibration = Literal["nominal", "measured"]
 Stream = Literal["color", "depth"]
 """The two pictures a D435 takes, each with its own imager, field of view and place."""
 
+CAMERA_LINK_NAME: Final = "camera_link"
+"""The D435's housing in the URDF."""
+
+COLOR_FRAME_NAME: Final = "camera_color_frame"
+"""The URDF's frame of the colour camera, x forward, y left, z up."""
+
+DEPTH_FRAME_NAME: Final = "camera_depth_frame"
+"""The URDF's frame of the depth camera, the left infrared imager, x forward, y left, z up."""
+
 
 @dataclass(frozen=True, kw_only=True)
 class CameraIntrinsics:

@@ -1,25 +1,24 @@
-"""The robot's description files: the URDF, and the triangles of every link as SAPIEN renders them."""
+"""The robot's description files: the URDF, and the triangles of every link as SAPIEN renders them.
 
-import logging
+`tools/build_robot.py` wrote them.
+"""
+
 from functools import lru_cache
-from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
 import numpy.typing as npt
 
 from maniskill_tomato.assets import asset_path
-from maniskill_tomato.robot import d435, glb, iiwa14, meshes, urdf
+from maniskill_tomato.robot import d435, iiwa14
 
 URDF_NAME: Final = "iiwa14/iiwa14.urdf"
 """The URDF, relative to the package's assets."""
 
-VISIBLE_LINK_NAMES: Final = (*iiwa14.LINK_NAMES, urdf.CAMERA_LINK_NAME)
+VISIBLE_LINK_NAMES: Final = (*iiwa14.LINK_NAMES, d435.CAMERA_LINK_NAME)
 """The links that have a mesh."""
 
 LinkMesh = tuple[npt.NDArray[np.float32], npt.NDArray[np.int32]]
-
-_logger = logging.getLogger(__name__)
 
 
 def urdf_path() -> str:
@@ -51,7 +50,7 @@ def _load(name: str) -> LinkMesh:
 def _link_meshes() -> dict[str, LinkMesh]:
     result = {name: _load(name) for name in iiwa14.LINK_NAMES}
     flange_vertices, flange_faces = result[iiwa14.EE_LINK_NAME]
-    camera_vertices, camera_faces = _load(urdf.CAMERA_LINK_NAME)
+    camera_vertices, camera_faces = _load(d435.CAMERA_LINK_NAME)
     rotation, offset = d435.T_flange_camera[:3, :3], d435.T_flange_camera[:3, 3]
     placed = (camera_vertices @ rotation.T + offset).astype(np.float32)
     result[iiwa14.EE_LINK_NAME] = (
@@ -73,20 +72,3 @@ def link_meshes() -> dict[str, LinkMesh]:
         FileNotFoundError: The package was installed without its assets.
     """
     return {name: (vertices.copy(), faces.copy()) for name, (vertices, faces) in _link_meshes().items()}
-
-
-def build(folder: Path) -> list[Path]:
-    """Writes the URDF and its meshes into `folder`; the same files on every run.
-
-    Returns:
-        The files written.
-    """
-    (folder / "meshes").mkdir(parents=True, exist_ok=True)
-    written = [folder / "iiwa14.urdf"]
-    written[0].write_text(urdf.urdf_text(), encoding="utf-8")
-    for name in VISIBLE_LINK_NAMES:
-        path = folder / "meshes" / f"{name}.glb"
-        path.write_bytes(glb.to_glb(meshes.link_parts(name)))
-        written.append(path)
-        _logger.info("%s: %d bytes", path, path.stat().st_size)
-    return written

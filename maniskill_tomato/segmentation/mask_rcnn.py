@@ -5,33 +5,35 @@ in its own way, and pads with the mean colour's zero; without pretrained weights
 trained, since frozen statistics of random weights mean nothing.
 """
 
+from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor, nn
-from torchvision.models import mobilenet_v3_large
 from torchvision.models.detection import MaskRCNN
 from torchvision.models.detection.anchor_utils import AnchorGenerator
-from torchvision.models.detection.backbone_utils import BackboneWithFPN, resnet_fpn_backbone
+from torchvision.models.detection.backbone_utils import resnet_fpn_backbone
 from torchvision.models.detection.faster_rcnn import FastRCNNPredictor
 from torchvision.models.detection.mask_rcnn import MaskRCNNHeads, MaskRCNNPredictor
 from torchvision.ops import MultiScaleRoIAlign
 from torchvision.ops.feature_pyramid_network import FeaturePyramidNetwork, LastLevelMaxPool
 from torchvision.ops.misc import FrozenBatchNorm2d
 
-from maniskill_tomato.errors import MissingWeightsError
+from maniskill_tomato.errors import CheckpointError, InvalidInputError, MissingWeightsError
 from maniskill_tomato.segmentation.efficientnet_lite import FEATURE_WIDTHS, EfficientNetLite0
 from maniskill_tomato.segmentation.fruit_network_config import FIXED_BLOCKS
-from maniskill_tomato.segmentation.training.detector_presets import MaskRcnnConfig
+from maniskill_tomato.segmentation.instances import Image, Instances
+from maniskill_tomato.segmentation.segmenter import check_image
+from maniskill_tomato.segmentation.training.detector_presets import ClassicAugmentation, MaskRcnnConfig
+from maniskill_tomato.segmentation.weights import load_weights
 
 ASPECT_RATIOS = (0.5, 1.0, 2.0)
 """Height over width of the anchors; the implementation that the thesis built on has these."""
 
 LIGHT_WIDTH = 96
 """Channels of the light pyramid."""
-
-MOBILENET_LAYERS = {"2": "0", "4": "1", "7": "2", "13": "3"}
-"""Blocks of MobileNetV3 (large) whose output has strides 4, 8, 16 and 32."""
 
 
 class Lite0Pyramid(nn.Module):
@@ -90,8 +92,7 @@ def build_mask_rcnn(config: MaskRcnnConfig, pretrained: bool = False) -> MaskRCN
             f"the ImageNet weights of {config.backbone} cannot be downloaded ({error}); "
             "train from random weights, or put them into torchvision's cache"
         ) from error
-    lite0 = config.backbone == "efficientnet_lite0"
-    light = lite0 or config.backbone == "mobilenet"
+    light = config.backbone == "efficientnet_lite0"
     width = LIGHT_WIDTH if light else 256
     representation = 256 if light else 1024
     classes = len(config.categories) + 1
@@ -100,8 +101,8 @@ def build_mask_rcnn(config: MaskRcnnConfig, pretrained: bool = False) -> MaskRCN
         backbone,
         min_size=config.shortest_side,
         max_size=config.longest_side,
-        image_mean=[0.0] * 3 if lite0 else None,
-        image_std=[1 / 255] * 3 if lite0 else None,
+        image_mean=[0.0] * 3 if light else None,
+        image_std=[1 / 255] * 3 if light else None,
         # A square of the longest side, so that several pictures fit one batch.
         size_divisible=config.longest_side if config.longest_side % 32 == 0 else 32,
         rpn_anchor_generator=AnchorGenerator(
@@ -130,28 +131,81 @@ def _backbone(config: MaskRcnnConfig, pretrained: bool) -> nn.Module:
             pyramid.body.load_imagenet()
             pyramid.body.keep_fixed(FIXED_BLOCKS)
         return pyramid
-    weights: Any = "IMAGENET1K_V1" if pretrained else None
-    if config.backbone != "mobilenet":
-        residual: nn.Module = resnet_fpn_backbone(
-            backbone_name=config.backbone,
-            weights=weights,
-            norm_layer=FrozenBatchNorm2d if pretrained else nn.BatchNorm2d,
-            trainable_layers=5,
-        )
-        return residual
-    features = mobilenet_v3_large(weights=weights).features
-    with torch.no_grad():
-        channels, x = {}, torch.zeros(1, 3, 64, 64)
-        for name, block in features.eval().named_children():
-            x = block(x)
-            channels[name] = x.shape[1]
-    features.train()
-    mobile: nn.Module = BackboneWithFPN(
-        features,
-        MOBILENET_LAYERS,
-        [channels[name] for name in MOBILENET_LAYERS],
-        LIGHT_WIDTH,
-        extra_blocks=LastLevelMaxPool(),
-        norm_layer=nn.BatchNorm2d,
+    residual: nn.Module = resnet_fpn_backbone(
+        backbone_name=config.backbone,
+        weights="IMAGENET1K_V1" if pretrained else None,
+        norm_layer=FrozenBatchNorm2d if pretrained else nn.BatchNorm2d,
+        trainable_layers=5,
     )
-    return mobile
+    return residual
+
+
+class MaskRcnnSegmenter:
+    """A `Segmenter` over torchvision's Mask R-CNN; colours only, depth is not used."""
+
+    def __init__(
+        self, network: MaskRCNN, categories: tuple[str, ...], score_threshold: float | None = None
+    ) -> None:
+        """Takes a trained network.
+
+        Args:
+            network: It is set to evaluation mode.
+            categories: Names of its classes without the background.
+            score_threshold: Detections below are left out; by default the network's own.
+
+        Raises:
+            InvalidInputError: The threshold is not between 0 and 1.
+        """
+        if score_threshold is not None:
+            if not 0 <= score_threshold <= 1:
+                raise InvalidInputError(f"score_threshold must be between 0 and 1, got {score_threshold}")
+            heads: Any = network.roi_heads
+            heads.score_thresh = score_threshold
+        self.network = network.eval().requires_grad_(False)
+        self.categories = categories
+
+    def __call__(self, image: Image, depth_m: NDArray[np.float32] | None = None) -> Instances:
+        """The fruits in an image; see `Segmenter`. Its other classes, such as the robot, are left out."""
+        check_image(image, depth_m)
+        height, width = image.shape[:2]
+        x = torch.from_numpy(np.ascontiguousarray(image)).permute(2, 0, 1).float() / 255
+        with torch.inference_mode():
+            (found,) = self.network([x])
+        names = [self.categories[k - 1] for k in found["labels"].tolist()]
+        fruit = torch.tensor([name.startswith("tomato") for name in names], dtype=torch.bool)
+        boxes, masks = found["boxes"][fruit], found["masks"][fruit, 0] >= 0.5
+        whole = ((boxes[:, 2:] - boxes[:, :2]) >= 1).all(1)
+        return Instances(
+            boxes=boxes[whole].numpy(),
+            scores=found["scores"][fruit][whole].numpy(),
+            categories=tuple(
+                n for n, w in zip((n for n in names if n.startswith("tomato")), whole, strict=True) if w
+            ),
+            masks=masks[whole].numpy().reshape(-1, height, width),
+        )
+
+
+def open_mask_rcnn(
+    weights: Path | str | None = None, score_threshold: float | None = None
+) -> MaskRcnnSegmenter:
+    """Opens the weights in a file; none ship.
+
+    Raises:
+        CheckpointError: No file is given, or it is missing, damaged or of something else.
+    """
+    if weights is None:
+        raise CheckpointError(
+            "no Mask R-CNN weights ship; train some with `python scripts/train_segmenter.py mask-rcnn` and give "
+            "their file as the segmenter"
+        )
+    data = load_weights(Path(weights), "mask_rcnn")
+    try:
+        augmentation = ClassicAugmentation(**data["config"]["augmentation"])
+        config = MaskRcnnConfig(**{**data["config"], "augmentation": augmentation})
+        network = build_mask_rcnn(config)
+        network.load_state_dict(data["state"])
+    except (TypeError, KeyError, RuntimeError) as error:
+        raise CheckpointError(
+            f"{weights} does not fit this version's network ({str(error).splitlines()[0]})"
+        ) from error
+    return MaskRcnnSegmenter(network, config.categories, score_threshold)

@@ -18,7 +18,7 @@ SEGMENTERS = {
     "light": "maniskill_tomato.segmentation.light_segmenter:open_light",
     "colour": "maniskill_tomato.segmentation.colour_segmenter:open_colour",
     "ground_truth": "maniskill_tomato.segmentation.ground_truth_segmenter:open_ground_truth",
-    "mask_rcnn": "maniskill_tomato.segmentation.mask_rcnn_segmenter:open_mask_rcnn",
+    "mask_rcnn": "maniskill_tomato.segmentation.mask_rcnn:open_mask_rcnn",
     "yolo": "maniskill_tomato.segmentation.yolo:open_yolo",
 }
 """Name of each kind of segmenter, and the function that opens it."""
@@ -59,8 +59,10 @@ def make_segmenter(name_or_path: str | Path = DEFAULT_SEGMENTER, **options: Any)
         path = Path(name)
         if not path.suffix and not path.exists():
             raise InvalidInputError.choice("segmenter", name, [*SEGMENTERS, "FILE.pt"])
+        from maniskill_tomato.segmentation.weights import read_kind
+
         options["weights"] = path
-        name = weights_kind(path)
+        name = read_kind(path)
         if name not in SEGMENTERS:
             raise CheckpointError(f"{path} is for a segmenter {name!r}, which this version does not know")
     module, function = SEGMENTERS[name].split(":")
@@ -87,22 +89,13 @@ def open_for_files(name: str, score_threshold: float, thorough: bool) -> Segment
         MissingPackageError: The segmenter needs a package that is not installed.
     """
     options: dict[str, Any] = {} if name == "colour" else {"score_threshold": score_threshold}
-    if thorough and (name == "light" or (Path(name).is_file() and weights_kind(Path(name)) == "light")):
+    if thorough:
         from maniskill_tomato.segmentation.light_segmenter import THOROUGH
+        from maniskill_tomato.segmentation.weights import read_kind
 
-        options |= THOROUGH
+        if name == "light" or (Path(name).is_file() and read_kind(Path(name)) == "light"):
+            options |= THOROUGH
     return make_segmenter(name, **options)
-
-
-def weights_kind(path: Path) -> str:
-    """Which segmenter a file of weights is for: what it says, or `yolo` for a file that Ultralytics wrote.
-
-    Raises:
-        CheckpointError: The file is missing or damaged.
-    """
-    from maniskill_tomato.segmentation.weights import read_kind
-
-    return read_kind(path)
 
 
 def check_image(image: Image, depth_m: NDArray[np.float32] | None = None) -> None:

@@ -65,16 +65,7 @@ def load_weights(path: Path, kind: str) -> dict[str, Any]:
     Raises:
         CheckpointError: The file is missing, damaged, of another segmenter, or not one of ours.
     """
-    if not Path(path).is_file():
-        raise CheckpointError(
-            f"no weights at {path}; train some with scripts/train_segmenter.py, or leave --segmenter out to use "
-            "those that ship"
-        )
-    data = read_tensors(path)
-    if not isinstance(data, dict) or "segmenter" not in data or "state" not in data:
-        raise CheckpointError(
-            f"{path} holds no segmenter's weights; scripts/train_segmenter.py writes such files"
-        )
+    data = _read(path)
     if data["segmenter"] != kind:
         raise CheckpointError(f"{path} holds weights of the segmenter {data['segmenter']!r}, not of {kind!r}")
     if not isinstance(data["format"], int) or data["format"] > FORMAT:
@@ -95,14 +86,19 @@ def read_kind(path: Path) -> str:
     """
     if path.is_file() and path.name.lower().startswith("yolo"):
         return "yolo"
+    return str(_read(path)["segmenter"])
+
+
+def _read(path: Path) -> dict[str, Any]:
+    """The content of a file that `save_weights` wrote."""
     if not path.is_file():
         raise CheckpointError(
             f"no weights at {path}; train some with scripts/train_segmenter.py, or leave --segmenter out to use "
             "those that ship"
         )
     data = read_tensors(path)
-    if not isinstance(data, dict) or not isinstance(data.get("segmenter"), str):
+    if not isinstance(data, dict) or not isinstance(data.get("segmenter"), str) or "state" not in data:
         raise CheckpointError(
             f"{path} holds no segmenter's weights; scripts/train_segmenter.py writes such files"
         )
-    return str(data["segmenter"])
+    return data

@@ -10,17 +10,16 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from maniskill_tomato.errors import CheckpointError, InvalidInputError, MissingPackageError
 from maniskill_tomato.files import write_atomically
-from maniskill_tomato.segmentation.datasets.annotations import AnnotatedImage
+from maniskill_tomato.segmentation.datasets.annotations import AnnotatedImage, ignored_fruit
+from maniskill_tomato.segmentation.datasets.picture_files import write_picture
 from maniskill_tomato.segmentation.instances import TOMATO, Image, Instances, box_ellipse
 from maniskill_tomato.segmentation.segmenter import check_image
 from maniskill_tomato.segmentation.training.detector_presets import YOLO_PRESET, YoloConfig
-from maniskill_tomato.segmentation.training.training_pictures import ignored_fruit
 
 
 class YoloSegmenter:
@@ -122,8 +121,7 @@ def write_yolo_data(
     for split, images in (("train", training), ("val", validation)):
         for number, image in enumerate(images):
             stem = f"{number:06d}"
-            _, data = cv2.imencode(".png", np.ascontiguousarray(image.load()[..., ::-1]))
-            write_atomically(folder / "images" / split / f"{stem}.png", bytes(data))
+            write_picture(folder / "images" / split / f"{stem}.png", image.load())
             write_atomically(folder / "labels" / split / f"{stem}.txt", yolo_labels(image).encode())
     # Relative to this file's own folder, where Ultralytics looks first.
     text = f"path: {folder.resolve()}\ntrain: images/train\nval: images/val\nnames:\n  0: {TOMATO}\n"

@@ -117,6 +117,10 @@ class CameraPerception:
         """Index of the target among the fruits of the last view; None if it does not show it."""
         return self._fruit[env_index]
 
+    def position_w(self, env_index: int) -> Position:
+        """Where an environment's target is believed to be, world frame, in [m]. Shape (3,), float64."""
+        return self._trackers[env_index].position_w
+
     @property
     def is_located(self) -> Tensor:
         """Whether the camera has measured where the targets are. Shape (N,), bool."""

@@ -7,8 +7,10 @@ import numpy as np
 
 from maniskill_tomato.sensing.measurement import DetectedFruit, Measurement, Position
 
-LOCATED_GATE: Final = 0.05
-"""A fruit farther than this from where the target was seen is another one, in [m]."""
+LOCATED_GATE: Final = 0.035
+"""A fruit farther than this from where the target was seen is another one, in [m]. Of 1,061 fruits that two views of
+validation plants show, none was mistaken for another; 7 % were missed, mostly slivers. At 50 mm 0.8 % are mistaken, and
+where the target is not found a neighbour passes for it in 9 % of the views instead of none."""
 
 COARSE_GATE: Final = 0.08
 """The same while the target's position is known from afar only, in [m]."""

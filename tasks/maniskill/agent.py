@@ -16,7 +16,7 @@ from mani_skill.agents.registration import register_agent
 from mani_skill.sensors.camera import CameraConfig
 
 from maniskill_tomato.errors import InvalidInputError
-from maniskill_tomato.robot import d435, iiwa14, urdf
+from maniskill_tomato.robot import d435, iiwa14
 from maniskill_tomato.robot.description import urdf_path
 from maniskill_tomato.robot.iiwa14 import READY_QPOS as READY_QPOS
 from maniskill_tomato.robot.iiwa14 import REST_QPOS as REST_QPOS
@@ -137,7 +137,7 @@ class Iiwa14D435(BaseAgent):  # type: ignore[misc]
     def _after_init(self) -> None:
         links = self.robot.links_map
         self.ee_link = links[iiwa14.EE_LINK_NAME]
-        self.color_frame = links[urdf.COLOR_FRAME_NAME]
+        self.color_frame = links[d435.COLOR_FRAME_NAME]
 
     @property
     def _controller_configs(self) -> dict[str, Any]:
@@ -178,7 +178,7 @@ class Iiwa14D435(BaseAgent):  # type: ignore[misc]
 
     @property
     def _sensor_configs(self) -> list[Any]:
-        return [self._camera("d435", "color", urdf.COLOR_FRAME_NAME)]
+        return [self._camera("d435", "color", d435.COLOR_FRAME_NAME)]
 
     def _camera(self, uid: str, stream: d435.Stream, frame: str) -> D435CameraConfig:
         pose: Any = sapien.Pose()
@@ -206,4 +206,4 @@ class Iiwa14D435RawDepth(Iiwa14D435):
 
     @property
     def _sensor_configs(self) -> list[Any]:
-        return [*super()._sensor_configs, self._camera("d435_depth", "depth", urdf.DEPTH_FRAME_NAME)]
+        return [*super()._sensor_configs, self._camera("d435_depth", "depth", d435.DEPTH_FRAME_NAME)]

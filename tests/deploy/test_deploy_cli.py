@@ -118,10 +118,10 @@ def test_a_fault_has_its_own_exit_status(tmp_path: Path, capsys: pytest.CaptureF
         (["run", "--seed", "-1"], "the seed must be 0 or more"),
         (["run", "--out", "/dev/null/x"], "cannot use the folder"),
         (["calibrate", "--profile", "mock", "--out", "/dev/null/x"], "cannot use the folder"),
-        (["calibrate", "--views", "missing"], "no views.json in missing"),
+        (["calibrate", "--views", "missing"], "--views: there is no folder missing"),
         (["profiles", "--show", "missing"], "no profile 'missing'"),
-        (["replay", "/dev/null"], "no recording at /dev/null"),
-        (["replay", "missing.mcap"], "no recording at missing.mcap"),
+        (["replay", "/dev/null"], "RECORDING: there is no file /dev/null"),
+        (["replay", "missing.mcap"], "RECORDING: there is no file missing.mcap"),
     ],
 )
 def test_what_cannot_begin_is_one_line_and_exit_status_2(
@@ -165,5 +165,5 @@ def test_check_looks_at_everything_and_moves_nothing(
 
 def test_the_defaults_of_the_command_are_the_mock_profile() -> None:
     command = parse(["deploy", "run"])
-    assert getattr(command, "command").profile == "mock"  # noqa: B009
-    assert os.fspath(getattr(command, "command").out) == "runs/deploy"  # noqa: B009
+    assert command.profile == "mock"
+    assert os.fspath(command.out) == "runs/deploy"

@@ -1,6 +1,5 @@
 """The whole loop with the iiwa's driver over a real socket: the loopback controller's arm carries the twin's camera."""
 
-import time
 from collections.abc import Sequence
 from typing import Any
 
@@ -16,8 +15,8 @@ from maniskill_tomato.deploy.loop import Loop
 from maniskill_tomato.deploy.loop_config import LoopConfig
 from maniskill_tomato.deploy.mock.episode import load_episode
 from maniskill_tomato.deploy.mock.options import twin_options, twin_world
-from maniskill_tomato.deploy.perceive import TruthPerception
 from maniskill_tomato.deploy.policies import TASK
+from maniskill_tomato.deploy.robot_perception import TruthPerception
 from maniskill_tomato.deploy.safety import Safety
 from maniskill_tomato.deploy.safety_config import SafetyConfig
 from maniskill_tomato.deploy.steps import RunResult
@@ -52,7 +51,7 @@ class CarriedBy:
 
 
 def run(
-    faults: Sequence[Fault] = (), moves: int = 2, speedup: float = 5.0
+    faults: Sequence[Fault] = (), moves: int = 2, speedup: float = 5.0, reply_timeout_s: float = 30.0
 ) -> tuple[RunResult, LoopbackController]:
     clock = MonotonicClock()
     context = DriverContext(clock=clock, seed=SEED)
@@ -62,12 +61,13 @@ def run(
     ) as controller:
         host, port = controller.address
         options: dict[str, Any] = {"host": host, "port": port, "flange_xyz": [0.0, 0.0, 0.026]}
+        options["reply_timeout_s"] = reply_timeout_s
         world: Any = twin_world(twin_options(TWIN), context)
         world.arm = CarriedBy(controller)
         camera = make_camera("mock", TWIN, context)
         with make_arm("sunrise", options, context) as arm, camera, Stops() as stops:
             result = Loop(
-                arm=GuardedArm(arm, Safety(SafetyConfig()), clock),
+                arm=GuardedArm(arm, Safety(SafetyConfig(max_state_age=10.0, max_frame_age=60.0)), clock),
                 camera=camera,
                 capture=Capture(camera, CaptureConfig(max_age=5.0), clock),
                 perception=TruthPerception(),
@@ -114,15 +114,13 @@ def test_the_loop_moves_the_arm_over_the_socket_through_safety_and_guarded_moves
     ],
 )
 def test_a_fault_of_the_controller_ends_the_run_with_its_reason(fault: Fault, reason: str, word: str) -> None:
-    began = time.monotonic()
-    result, controller = run([fault], moves=3)
+    result, controller = run([fault], moves=3, reply_timeout_s=2.0 if reason == "timeout" else 30.0)
     assert result.is_fault and result.reason == reason and word in result.detail, result.detail
     if reason != "fault":
         # What is said about the arm agrees with whether a move was sent that nobody saw the end of.
         assert ("emergency stop" in result.detail) == ("may still be under way" in result.end_state)
     before = len([line for line in controller.received if line.startswith("doPTP")])
     assert before <= 2
-    assert time.monotonic() - began < 120.0
 
 
 @pytest.mark.parametrize(
@@ -138,7 +136,8 @@ def test_a_fault_of_the_controller_ends_the_run_with_its_reason(fault: Fault, re
 def test_after_a_connection_lost_in_a_move_nobody_claims_that_the_arm_stands(kind: Any, reason: str) -> None:
     """The seventh reading of the joints falls into the first move."""
     fault = Fault(kind=kind, command="getJointsPositions", count=7, seconds=4.0)
-    result, controller = run([fault], moves=3, speedup=0.5)
+    timeout = 2.0 if reason == "timeout" else 30.0
+    result, controller = run([fault], moves=3, speedup=0.5, reply_timeout_s=timeout)
     assert (result.is_fault, result.reason) == (True, reason), result.detail
     assert "The arm may be in a move, which goes on" in result.detail and "emergency stop" in result.detail
     assert (

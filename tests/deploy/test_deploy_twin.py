@@ -1,5 +1,6 @@
 """The digital twin against the simulated task, and what it shows of itself."""
 
+from dataclasses import replace
 from typing import Any
 
 import cv2
@@ -10,23 +11,22 @@ import torch
 
 from maniskill_tomato.deploy.clock import SimulatedClock
 from maniskill_tomato.deploy.drivers import DriverContext, make_arm, make_camera
-from maniskill_tomato.deploy.errors import NotConnectedError, ProfileError
-from maniskill_tomato.deploy.fruits import Fruit, TruthFinder, locate, silhouette_area
+from maniskill_tomato.deploy.errors import NotConnectedError, PerceptionError, ProfileError
 from maniskill_tomato.deploy.interface import JointMove
 from maniskill_tomato.deploy.mock.dynamics import ArmDynamics
 from maniskill_tomato.deploy.mock.episode import load_episode
-from maniskill_tomato.deploy.observing import Observing
-from maniskill_tomato.deploy.perceive import ImagePerception, TruthPerception
+from maniskill_tomato.deploy.robot_belief import RobotBelief
+from maniskill_tomato.deploy.robot_perception import TRUE_MASKS, ImagePerception, TruthPerception
 from maniskill_tomato.raycast.images import FIRST_ORGAN_LABEL, ROBOT_LABEL
 from maniskill_tomato.raycast.view_rays import DEPTH_MODE, RayLabel
 from maniskill_tomato.robot.d435 import (
     T_flange_camera_color_optical,
-    color_intrinsics,
     depth_noise_std,
     min_depth,
 )
 from maniskill_tomato.robot.iiwa14 import READY_QPOS, VELOCITY_LIMITS
 from maniskill_tomato.robot.look_at_move import LookAtMover
+from maniskill_tomato.segmentation.instances import Instances
 
 SIZE = {"width": 424, "height": 240}
 EPISODE = 4
@@ -59,25 +59,26 @@ def env() -> Any:
 def test_the_loops_observations_are_those_of_the_environment(env: Any) -> None:
     """Same episode, same actions: the observation vectors differ by less than 1e-6 in every entry."""
     arm, camera = devices(depth_noise=0.0)
-    observing = Observing(T_flange_camera_color_optical, 20)
+    robot_belief = RobotBelief(T_flange_camera_color_optical, 20)
     mover, perception = LookAtMover(), TruthPerception()
     expected, info = env.reset(seed=EPISODE)
     joints = arm.read().joint_positions
     np.testing.assert_allclose(joints, env.unwrapped.agent.robot.get_qpos()[0].numpy(), atol=1e-7)
     target = load_episode("held_out", EPISODE).target_position.double().numpy()
-    observing.begin(target)
+    perception.begin(target)
     actions = [(0.4, 0.3, 0.2), (0.5, -0.2, 0.6), (-0.3, 0.6, 0.3), (0.9, 0.1, -0.2), (0.1, 0.2, 0.7)]
     for k in range(len(actions) + 1):
         frame = camera.read()
         joints = arm.read().joint_positions
-        view = perception.look(frame, observing.camera_pose(joints), target)
-        belief = observing.observe(joints, view, 20 - k)
+        view = perception.look(frame, robot_belief.camera_pose(joints))
+        assert view is not None
+        belief = robot_belief.observe(joints, view, 20 - k)
         assert float((belief.observation - expected).abs().max()) <= 1e-6, k
         assert view.visible_fraction == pytest.approx(float(info["visible_fraction"][0]), abs=1e-6)
         if k == len(actions):
             break
         expected, _, _, _, info = env.step(torch.tensor([actions[k]]))
-        position = torch.as_tensor(observing.camera_position(joints)[None])
+        position = torch.as_tensor(robot_belief.camera_position(joints)[None])
         solved = mover.move(
             torch.tensor(joints[None], dtype=torch.float32),
             position,
@@ -91,17 +92,25 @@ def test_the_loops_observations_are_those_of_the_environment(env: Any) -> None:
         np.testing.assert_allclose(arm.read().joint_positions, goal, atol=1e-8)
 
 
+def pose_of(arm: Any) -> Any:
+    return RobotBelief(T_flange_camera_color_optical, 20).camera_pose(arm.read().joint_positions)
+
+
+def looked(perception: Any, frame: Any, pose: Any, target: Any = None) -> Any:
+    perception.begin(target)
+    return perception.look(frame, pose)
+
+
 def test_masks_and_depth_tell_nearly_what_exact_rays_tell() -> None:
-    """The route of hardware against the route of the task, on the same views: labels and distances agree."""
+    """The route of hardware against the route of the task, on the same views: labels, distances and V_f agree."""
     agreeing, distances, fractions = [], [], []
     for seed, noise in ((4, 0.0), (9, 0.0), (4, 1.0), (9, 1.0)):
         arm, camera = devices(seed, depth_noise=noise)
-        observing = Observing(T_flange_camera_color_optical, 20)
         frame = camera.read()
-        pose = observing.camera_pose(arm.read().joint_positions)
+        pose = pose_of(arm)
         target = frame.truth.target_position
-        exact = TruthPerception().look(frame, pose, target)
-        seen = ImagePerception(TruthFinder()).look(frame, pose, target)
+        exact = looked(TruthPerception(), frame, pose, target)
+        seen = looked(ImagePerception(TRUE_MASKS, None), frame, pose, target)
         same = exact.rays.label == seen.rays.label
         if (
             noise
@@ -113,7 +122,7 @@ def test_masks_and_depth_tell_nearly_what_exact_rays_tell() -> None:
         fractions.append(abs(exact.visible_fraction - seen.visible_fraction))
     assert min(agreeing) > 0.95
     assert float(np.median(np.concatenate(distances))) < 0.005
-    assert max(fractions) < 1e-6, "ground truth tells V_f too"
+    assert max(fractions) < 0.1, "the sphere model's own error is 0.04 in the mean"
 
 
 def test_a_picture_agrees_with_the_truth_that_comes_with_it() -> None:
@@ -125,16 +134,28 @@ def test_a_picture_agrees_with_the_truth_that_comes_with_it() -> None:
     fruit = episode.plant.fruits[episode.target]
     visible = int((truth.labels == truth.target_label).sum())
     pose = camera._world.camera_pose()
-    area = silhouette_area(truth.target_position, float(fruit.radius) * 0.95, frame.intrinsics, pose)
+    centre = pose[:3, :3].T @ (truth.target_position - pose[:3, 3])
+    rays = frame.intrinsics.ray_directions(frame.intrinsics.pixel_centres())
+    rays /= np.linalg.norm(rays, axis=-1, keepdims=True)
+    area = int((centre @ centre - (rays @ centre) ** 2 < (float(fruit.radius) * 0.95) ** 2).sum())
     assert visible / area == pytest.approx(truth.visible_fraction, abs=0.08)
     assert set(np.unique(truth.labels)) <= {0, ROBOT_LABEL, *range(2, 2 + len(episode.plant.organs))}
 
 
-def test_a_sliver_is_not_a_whole_fruit_whatever_a_segmenter_says() -> None:
-    """It says 0.9 of a fruit for a row of pixels; for the whole fruit its word counts."""
+class GivenMasks:
+    """A segmenter that finds what a test gives it, whatever the picture shows."""
+
+    def __init__(self, *masks: Any, scores: tuple[float, ...] = (1.0,)) -> None:
+        self.found = Instances.from_masks(np.array(masks), np.array(scores, np.float32))
+
+    def __call__(self, image: Any, depth_m: Any = None) -> Instances:
+        return self.found
+
+
+def test_a_sliver_is_not_a_whole_fruit() -> None:
+    """A segmenter that finds a few rows of a fruit in full view has not found a small fruit in full view."""
     arm, camera = devices(6)
-    frame = camera.read()
-    pose = Observing(T_flange_camera_color_optical, 20).camera_pose(arm.read().joint_positions)
+    frame, pose = camera.read(), pose_of(arm)
     label = max(frame.truth.ripe_labels, key=lambda label: int((frame.truth.labels == label).sum()))
     whole = frame.truth.labels == label
     episode = load_episode("held_out", 6)
@@ -142,74 +163,53 @@ def test_a_sliver_is_not_a_whole_fruit_whatever_a_segmenter_says() -> None:
     target = (episode.T_world_plant.double().numpy() @ [*fruit.centre, 1.0])[:3]
     rows = np.flatnonzero(whole.any(axis=1))
     sliver = whole.copy()
-    sliver[rows[0] + 1 :] = False
-    assert 0 < sliver.sum() < 0.06 * whole.sum()
-
-    class Boasting(TruthFinder):
-        mask = whole
-
-        def find(self, frame: Any) -> list[Fruit]:
-            return [Fruit(mask=self.mask, visible_fraction=0.9)]
-
-    finder = Boasting()
-    assert ImagePerception(finder).look(frame, pose, target).visible_fraction == 0.9
-    finder.mask = sliver
-    view = ImagePerception(finder).look(frame, pose, target)
-    assert view.mask.any() and view.visible_fraction < 0.25
+    sliver[rows[0] + 2 :] = False
+    assert 12 <= sliver.sum() < 0.1 * whole.sum()
+    seen = looked(ImagePerception("given", GivenMasks(whole)), frame, pose, target)
+    assert seen.visible_fraction > 0.7 and (seen.mask == whole).all()
+    view = looked(ImagePerception("given", GivenMasks(sliver)), frame, pose, target)
+    assert view.visible_fraction < 0.25
 
 
 def test_an_unsure_fruit_is_found_again_but_not_chosen_as_the_target() -> None:
     arm, camera = devices(6, depth_noise=0.0)
-    frame = camera.read()
-    pose = Observing(T_flange_camera_color_optical, 20).camera_pose(arm.read().joint_positions)
+    frame, pose = camera.read(), pose_of(arm)
     sizes = {label: int((frame.truth.labels == label).sum()) for label in frame.truth.ripe_labels}
-    large, small = sorted(sizes, key=lambda label: -sizes[label])[:2]
-
-    class Wavering(TruthFinder):
-        def find(self, frame: Any) -> list[Fruit]:
-            masks = [(frame.truth.labels == large, 0.35), (frame.truth.labels == small, 0.8)]
-            return [Fruit(mask=mask, score=score) for mask, score in masks]
-
-    chosen = ImagePerception(Wavering()).find_target(frame, pose)
-    expected = locate(frame.truth.labels == small, frame.depth, frame.intrinsics, pose)
-    assert chosen is not None and expected is not None
-    np.testing.assert_allclose(chosen, expected[0])
-    known = locate(frame.truth.labels == large, frame.depth, frame.intrinsics, pose)
-    assert known is not None
-    assert ImagePerception(Wavering()).look(frame, pose, known[0]).visible_fraction > 0.0
+    large, small = (frame.truth.labels == n for n in sorted(sizes, key=lambda label: -sizes[label])[:2])
+    wavering = ImagePerception("given", GivenMasks(large, small, scores=(0.35, 0.8)))
+    chosen = looked(wavering, frame, pose)
+    np.testing.assert_array_equal(chosen.mask, small)
+    unsure = looked(ImagePerception("given", GivenMasks(large)), frame, pose).target_position
+    again = looked(wavering, frame, pose, unsure)
+    np.testing.assert_array_equal(again.mask, large)
+    assert again.visible_fraction > 0.0
 
 
 def test_fruits_are_located_to_a_centimetre_where_enough_is_seen() -> None:
     errors = []
     for seed in (4, 9):
-        _, camera = devices(seed)
-        frame = camera.read()
-        episode, pose = load_episode("held_out", seed), camera._world.camera_pose()
+        arm, camera = devices(seed)
+        frame, pose = camera.read(), pose_of(arm)
+        episode = load_episode("held_out", seed)
         T = episode.T_world_plant.double().numpy()
         for fruit in episode.plant.fruits:
-            label = 2 + fruit.organ_index
-            centre = T[:3, :3] @ np.asarray(fruit.centre, dtype=np.float64) + T[:3, 3]
-            mask = frame.truth.labels == label
-            depth = float((np.linalg.inv(pose) @ [*centre, 1.0])[2])
-            area = silhouette_area(centre, fruit.radius, frame.intrinsics, pose)
-            if depth > 0.9 or mask.sum() < 0.6 * area:
+            mask = frame.truth.labels == FIRST_ORGAN_LABEL + fruit.organ_index
+            if mask.sum() < 12:
                 continue
-            found = locate(mask, frame.depth, frame.intrinsics, pose)
-            assert found is not None
-            errors.append(float(np.linalg.norm(found[0] - centre)))
+            centre = T[:3, :3] @ np.asarray(fruit.centre, dtype=np.float64) + T[:3, 3]
+            found = looked(ImagePerception("given", GivenMasks(mask)), frame, pose)
+            depth = float((np.linalg.inv(pose) @ [*centre, 1.0])[2])
+            if found is not None and depth < 0.9 and found.visible_fraction > 0.6:
+                errors.append(float(np.linalg.norm(found.target_position - centre)))
     assert len(errors) >= 5
     assert float(np.median(errors)) < 0.010 and max(errors) < 0.03
 
 
-def test_the_silhouette_of_a_sphere_is_what_counting_pixels_gives() -> None:
-    intrinsics = color_intrinsics(640, 480)
-    centre, radius = np.array([0.06, -0.04, 0.3]), 0.035
-    rays = intrinsics.ray_directions(intrinsics.pixel_centres())
-    rays /= np.linalg.norm(rays, axis=-1, keepdims=True)
-    along = rays @ centre
-    counted = int(((centre @ centre - along**2) < radius**2).sum())
-    assert silhouette_area(centre, radius, intrinsics, np.eye(4)) == pytest.approx(counted, rel=2e-3)
-    assert silhouette_area(np.array([0, 0, 0.01]), 0.03, intrinsics, np.eye(4)) == float("inf")
+def test_a_camera_without_truth_needs_a_segmenter() -> None:
+    arm, camera = devices()
+    frame = replace(camera.read(), truth=None)
+    with pytest.raises(PerceptionError, match="choose a segmenter"):
+        looked(ImagePerception(TRUE_MASKS, None), frame, pose_of(arm), np.array([0.7, 0.0, 0.8]))
 
 
 def test_the_same_seed_gives_the_same_run_and_another_one_another() -> None:

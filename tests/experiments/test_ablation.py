@@ -62,7 +62,7 @@ def test_a_run_is_done_once_and_kept(tmp_path: Path) -> None:
     assert lines[0].startswith(f"1 of 1: {GUIDED} base, seed 3: success ")
     (result,) = json.loads((tmp_path / "ablation.json").read_text())["runs"]
     assert result["training_steps"] == 60 and result["updates"] == 0
-    assert 0.0 < result["training_cpu_seconds"] < 60.0 and 0.0 <= result["success_rate"] <= 1.0
+    assert result["training_cpu_seconds"] > 0.0 and 0.0 <= result["success_rate"] <= 1.0
     (trial,) = plan_trials(config, choose_variants(["base"]))
     written = (trial.folder / "policy.pt").stat().st_mtime_ns
     assert run_ablation(config) == text and (trial.folder / "policy.pt").stat().st_mtime_ns == written

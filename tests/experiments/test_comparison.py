@@ -277,15 +277,16 @@ def test_runs_without_an_evaluation_get_one_on_the_plants_of_their_training(tmp_
 
 def test_ppo_trains_evaluates_and_can_be_compared(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     arguments = (
+        *("-m", "maniskill_tomato.cli", "train-ppo", SPARSE, "--seeds", "3", "--out", str(tmp_path)),
         "--no-progress",
         "--episodes",
         "2",
-        "--config.total-timesteps",
+        "--total-timesteps",
         "300",
-        "--config.n-steps",
+        "--n-steps",
         "100",
     )
-    done = run_script("scripts/train_ppo.py", SPARSE, "--seeds", "3", "--out", str(tmp_path), *arguments)
+    done = run_script(*arguments)
     assert done.returncode == 0, done.stderr
     run = load_run(tmp_path / "seed-3")
     assert run.metrics is not None
@@ -305,5 +306,5 @@ def test_ppo_trains_evaluates_and_can_be_compared(tmp_path: Path, capsys: pytest
     largest = metrics["per_episode"]["max_visible_fraction"]
     np.testing.assert_allclose(largest, run.metrics["per_episode"]["max_visible_fraction"], atol=0.02)
     assert "Training" in (evaluated / "report.html").read_text()
-    again = run_script("scripts/train_ppo.py", SPARSE, "--seeds", "3", "--out", str(tmp_path), *arguments)
+    again = run_script(*arguments)
     assert again.returncode == 2 and "already holds a run" in again.stderr

@@ -397,7 +397,7 @@ loaded = [m for m in sys.modules if m.partition(".")[0] in FORBIDDEN or m.starts
 print(json.dumps([actions.tolist(), sorted(loaded)]))
 """
     result = subprocess.run(
-        [sys.executable, "-c", program], capture_output=True, text=True, check=True, timeout=60
+        [sys.executable, "-c", program], capture_output=True, text=True, check=True, timeout=300
     )
     actions, loaded = json.loads(result.stdout)
     source, observation = exported.with_suffix(".pt"), CENTRE[None].astype(np.float32)

@@ -12,8 +12,9 @@ from typing import Any
 import pytest
 import torch
 
-from maniskill_tomato import cli
-from maniskill_tomato.cli import main, merge_options, parse
+from maniskill_tomato.cli import main, parse
+from maniskill_tomato.cli.shared_options import merge_options
+from maniskill_tomato.cli.train_command import Train
 from maniskill_tomato.errors import InvalidInputError
 from maniskill_tomato.learning.rl.config_file import parse_seeds, read_run_file
 from maniskill_tomato.learning.rl.presets import get_preset
@@ -45,9 +46,9 @@ def write(path: Path, text: str) -> Path:
     return path
 
 
-def parsed(*arguments: str) -> cli.Train:
+def parsed(*arguments: str) -> Train:
     command = parse(["train", *arguments])
-    assert isinstance(command, cli.Train)
+    assert isinstance(command, Train)
     return command
 
 
@@ -226,13 +227,13 @@ def test_stopping_the_command_stops_its_seeds_with_everything_saved(tmp_path: Pa
     arguments = ("--total-timesteps", "1000000", "--checkpoint-every", "50", "--seeds", "0", "1", "2")
     process: Any = command(GUIDED, "--preset", "thesis-guided", *arguments, "--jobs", "2", "--out", str(out))
     try:
-        deadline = time.monotonic() + 120
+        deadline = time.monotonic() + 300
         while len(list(out.glob("seed-*/checkpoints"))) < 2 and time.monotonic() < deadline:
             time.sleep(0.1)
         time.sleep(0.3)
         workers = children(process.pid)
         os.kill(process.pid, number)
-        output, errors = process.communicate(timeout=60)
+        output, errors = process.communicate(timeout=300)
         while any(is_alive(pid) for pid in workers) and time.monotonic() < deadline:
             time.sleep(0.1)
         assert not any(is_alive(pid) for pid in workers)
@@ -253,18 +254,18 @@ def test_a_seed_that_is_killed_is_reported_and_continued(tmp_path: Path) -> None
     arguments = ("--total-timesteps", "1500", "--checkpoint-every", "50", "--seeds", "0", "1")
     process: Any = command(GUIDED, "--preset", "thesis-guided", *arguments, "--jobs", "2", "--out", str(out))
     try:
-        deadline = time.monotonic() + 120
+        deadline = time.monotonic() + 300
         while not list(out.glob("seed-1/checkpoints/*.pt")) and time.monotonic() < deadline:
             time.sleep(0.05)
         for pid in children(process.pid):
             if str(out / "seed-1") in os.popen(f"ls -l /proc/{pid}/fd 2>/dev/null").read():
                 os.kill(pid, signal.SIGKILL)
-        output, errors = process.communicate(timeout=120)
+        output, errors = process.communicate(timeout=300)
     finally:
         process.kill()
     assert process.returncode == 2 and "1 of 2 seeds failed: 1" in errors
     assert "ended by SIGKILL" in output
     again = command("--resume", str(out))
-    output, errors = again.communicate(timeout=120)
+    output, errors = again.communicate(timeout=300)
     assert again.returncode == 0, errors
     assert output.count("finished") == 2

@@ -2,10 +2,7 @@
 
 import json
 import math
-import subprocess
-import sys
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +15,6 @@ from maniskill_tomato.errors import CheckpointError, InvalidInputError, PolicyEr
 from maniskill_tomato.experiments.metrics import summarise
 from maniskill_tomato.experiments.rollout import run_episode, run_episodes
 from maniskill_tomato.learning.rl.envs import make_env
-from maniskill_tomato.learning.script import parse_env_options, run_training
 from maniskill_tomato.learning.view_quality.collect import QualityData, collect_episodes
 from maniskill_tomato.learning.view_quality.fit import fit, judge, mirrored
 from maniskill_tomato.learning.view_quality.quality_config import FitConfig, QualityTrainConfig
@@ -297,44 +293,14 @@ def test_a_training_begins_with_the_network_that_it_is_given(tmp_path: Path) -> 
         train_view_quality(tmp_path / "other", config, start_from=tmp_path / "missing.pt", **arguments)
 
 
-def test_options_of_the_task_are_read_from_words() -> None:
-    texts = {"perception": "occlusion_model", "contact_penalty": "0.5", "plant": '{"pool": 3}'}
-    options = parse_env_options(texts)
-    assert options == {"perception": "occlusion_model", "contact_penalty": 0.5, "plant": {"pool": 3}}
-
-
-def test_a_training_script_says_errors_in_one_line(
-    capsys: pytest.CaptureFixture[str], tmp_path: Path
-) -> None:
-    @dataclass
-    class Args:
-        out: Path = tmp_path
-
-    def fails(args: Args, report: Callable[[str], None]) -> Path:
-        report("begun")
-        raise InvalidInputError("the folder is full; empty it")
-
+@pytest.mark.parametrize("verb", ["train-view-quality", "train-imitation"])
+def test_the_command_offers_every_setting(verb: str, capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit) as stop:
-        run_training(Args, fails, [], "A script.")
-    assert stop.value.code == 2
-    told = capsys.readouterr()
-    assert told.out == "begun\n" and told.err.strip() == "error: the folder is full; empty it"
-    run_training(Args, lambda args, report: args.out / "policy.pt", ["--out", "there"], "A script.")
-    assert capsys.readouterr().out.startswith("policy there/policy.pt after ")
-
-
-def test_the_script_offers_every_setting() -> None:
-    script = Path(__file__).resolve().parents[2] / "scripts" / "train_view_quality.py"
-    done = subprocess.run([sys.executable, str(script), "--help"], capture_output=True, text=True, check=True)
-    for flag in (
-        "--jobs",
-        "--config.rounds",
-        "--config.fit.learning-rate",
-        "--config.fit.seed",
-        "--start-from",
-        "--env-options",
-    ):
-        assert flag in done.stdout
+        main([verb, "--help"])
+    assert stop.value.code == 0
+    told = capsys.readouterr().out
+    for flag in ("--jobs", "--rounds", "--fit.learning-rate", "--fit.seed", "--seed", "--env-options"):
+        assert flag in told
 
 
 # ------------------------------------------------------------ files, evaluation

@@ -14,11 +14,8 @@ from maniskill_tomato.assets import asset_path
 from maniskill_tomato.errors import CheckpointError, InvalidInputError
 from maniskill_tomato.experiments.episode_record import EpisodeRecord
 from maniskill_tomato.experiments.rollout import run_episode
-from maniskill_tomato.learning.imitation.move_regression import (
-    MoveToSeeData,
-    RegressionConfig,
-    train_move_network,
-)
+from maniskill_tomato.learning.imitation.move_to_see_training import MoveToSeeData, train_move_network
+from maniskill_tomato.learning.imitation.regression_config import RegressionConfig
 from maniskill_tomato.plants.generator import generate_plant
 from maniskill_tomato.plants.organs import Plant
 from maniskill_tomato.policies import baselines, moves
@@ -560,7 +557,7 @@ def test_a_file_that_is_no_network_is_refused(tmp_path: Any) -> None:
     (tmp_path / "x.pt").write_bytes(b"nothing")
     with pytest.raises(CheckpointError, match="not a readable checkpoint"):
         load_deep_move_to_see(tmp_path / "x.pt")
-    with pytest.raises(CheckpointError, match=r"no network of deep_3dmts; .*train_deep_move_to_see"):
+    with pytest.raises(CheckpointError, match=r"no network of deep_3dmts; .*train-deep-3dmts"):
         load_deep_move_to_see(asset_path("policies/TomatoViewpoint-v1.pt"))
     few = MoveToSeeData(torch.zeros(5, 4, 16, 16), torch.ones(5), torch.zeros(5, 3))
     with pytest.raises(InvalidInputError, match="too few"):

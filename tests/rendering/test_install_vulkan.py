@@ -48,7 +48,7 @@ def dry_run(
         (apt / name).write_text(text)
     environment = {**os.environ, "OS_RELEASE_FILE": str(folder / "os-release"), "APT_DIR": str(apt)}
     return subprocess.run(
-        ["bash", str(SCRIPT), "--dry-run"], env=environment, capture_output=True, text=True, timeout=60
+        ["bash", str(SCRIPT), "--dry-run"], env=environment, capture_output=True, text=True, timeout=300
     )
 
 
@@ -191,7 +191,7 @@ def test_other_distributions_are_told_what_to_do(os_release: str, advice: str, t
 
 
 def test_an_unknown_option_is_refused() -> None:
-    result = subprocess.run(["bash", str(SCRIPT), "--force"], capture_output=True, text=True, timeout=60)
+    result = subprocess.run(["bash", str(SCRIPT), "--force"], capture_output=True, text=True, timeout=300)
     assert result.returncode == 1
     assert "unknown option '--force'" in result.stderr
 
@@ -208,7 +208,7 @@ def test_a_hidden_driver_is_reported_as_no_device() -> None:
     environment = {**os.environ, "VK_ICD_FILENAMES": os.devnull, "VK_DRIVER_FILES": os.devnull}
     script = SCRIPT.parent / "check_vulkan.py"
     result = subprocess.run(
-        [sys.executable, str(script)], env=environment, capture_output=True, text=True, timeout=60
+        [sys.executable, str(script)], env=environment, capture_output=True, text=True, timeout=300
     )
     assert result.returncode == 1
     assert result.stdout.startswith("no: the Vulkan loader found no driver")
@@ -218,7 +218,7 @@ def test_a_hidden_driver_is_reported_as_no_device() -> None:
 @pytest.mark.render
 def test_every_device_is_listed_with_the_feature_that_sapien_needs() -> None:
     script = SCRIPT.parent / "check_vulkan.py"
-    result = subprocess.run([sys.executable, str(script)], capture_output=True, text=True, timeout=60)
+    result = subprocess.run([sys.executable, str(script)], capture_output=True, text=True, timeout=300)
     assert result.returncode == 0, result.stdout
     *devices, verdict = result.stdout.splitlines()
     assert any(

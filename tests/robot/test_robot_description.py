@@ -11,10 +11,12 @@ import pytest
 import torch
 import trimesh
 
+from build_robot import build
 from maniskill_tomato import assets
 from maniskill_tomato.errors import InvalidInputError
-from maniskill_tomato.robot import d435, description, glb, iiwa14, meshes, solids, urdf
+from maniskill_tomato.robot import d435, description, iiwa14
 from maniskill_tomato.robot.kinematics import link_transforms
+from robot_model import glb, meshes, solids, urdf
 
 mj: Any = mujoco
 
@@ -289,7 +291,7 @@ def test_link_meshes_can_be_changed_without_harm() -> None:
 
 def test_the_generator_gives_the_shipped_files(tmp_path: Path) -> None:
     shipped = Path(description.urdf_path()).parent
-    files = description.build(tmp_path)
+    files = build(tmp_path)
     assert {f.relative_to(tmp_path) for f in files} == {
         f.relative_to(shipped) for f in shipped.rglob("*") if f.is_file()
     }

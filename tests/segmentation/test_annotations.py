@@ -19,7 +19,7 @@ from maniskill_tomato.segmentation.datasets.annotations import (
     joined,
 )
 from maniskill_tomato.segmentation.datasets.coco import read_coco, write_coco
-from maniskill_tomato.segmentation.datasets.formats import read_annotated
+from maniskill_tomato.segmentation.datasets.reading import read_annotated
 from maniskill_tomato.segmentation.datasets.voc import read_voc, write_voc
 from maniskill_tomato.segmentation.masks import EncodedMask
 

@@ -8,7 +8,7 @@ import pytest
 from numpy.typing import NDArray
 
 from maniskill_tomato.errors import InvalidInputError
-from maniskill_tomato.segmentation.datasets.annotations import AnnotatedImage, Instance
+from maniskill_tomato.segmentation.datasets.annotations import AnnotatedImage, Instance, ignored_fruit
 from maniskill_tomato.segmentation.instances import Instances
 from maniskill_tomato.segmentation.metrics.coco_metrics import CocoScore
 from maniskill_tomato.segmentation.metrics.detection_metrics import (
@@ -21,7 +21,6 @@ from maniskill_tomato.segmentation.metrics.detection_metrics import (
     match,
     without_narrow,
 )
-from maniskill_tomato.segmentation.training.training_pictures import ignored_fruit
 
 pytest.importorskip("pycocotools")
 

@@ -32,13 +32,17 @@ from maniskill_tomato.segmentation.light_segmenter import (
 from maniskill_tomato.segmentation.masks import EncodedMask
 from maniskill_tomato.segmentation.metrics.detection_metrics import box_overlaps
 from maniskill_tomato.segmentation.training.augmentation import augmented
-from maniskill_tomato.segmentation.training.fruit_targets import TrainingPicture, fruit_losses, make_targets
+from maniskill_tomato.segmentation.training.fruit_targets import fruit_losses, make_targets
 from maniskill_tomato.segmentation.training.light_config import AugmentationConfig, LightTrainConfig
 from maniskill_tomato.segmentation.training.light_training import (
     LightTraining,
     learning_rate,
 )
-from maniskill_tomato.segmentation.training.training_pictures import PictureDraw, training_picture
+from maniskill_tomato.segmentation.training.training_pictures import (
+    PictureDraw,
+    TrainingPicture,
+    training_picture,
+)
 from maniskill_tomato.segmentation.weights import save_weights
 
 SMALL = FruitNetworkConfig(

@@ -1,16 +1,15 @@
-"""Mask R-CNN, YOLO's files and the two scripts, on drawn pictures."""
+"""Mask R-CNN, YOLO's files and the two commands, on drawn pictures."""
 
 import json
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from types import ModuleType
 
 import cv2
 import numpy as np
 import pytest
 import torch
 
+from maniskill_tomato.cli import main
 from maniskill_tomato.errors import CheckpointError
 from maniskill_tomato.segmentation.datasets.annotations import AnnotatedImage, AnnotatedImages, Instance
 from maniskill_tomato.segmentation.datasets.coco import write_coco
@@ -31,7 +30,7 @@ from maniskill_tomato.segmentation.yolo import (
 )
 
 TINY = replace(
-    MASK_RCNN_PRESETS["light"],
+    MASK_RCNN_PRESETS["light-lite0"],
     epochs=2,
     steps_per_epoch=1,
     batch_size=1,
@@ -180,27 +179,27 @@ def test_yolo_is_trained_with_table_4_1_or_with_the_library_s_own_settings() -> 
     assert stock["epochs"] == 7 and "lr0" not in stock and not stock["pretrained"]
 
 
-def test_the_training_script_writes_weights_and_curves(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], load_script: Callable[[str], ModuleType]
+def test_the_training_command_writes_weights_and_curves(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     drawn_set(tmp_path / "set")
     network = (
-        "--config.network.backbone",
+        "--network.backbone",
         "plain",
-        "--config.network.widths",
+        "--network.widths",
         "8",
         "8",
         "8",
         "8",
-        "--config.network.blocks",
+        "--network.blocks",
         "0",
         "0",
         "0",
         "0",
     )
-    options = ("--config.steps", "2", "--config.log-every", "1", "--config.batch-size", "2", *network)
+    options = ("--steps", "2", "--log-every", "1", "--batch-size", "2", *network)
     arguments = ["light", "--data", str(tmp_path / "set"), "--validation", str(tmp_path / "set"), *options]
-    load_script("train_segmenter").main([*arguments, "--out", str(tmp_path / "run")])
+    main(["train-segmenter", *arguments, "--out", str(tmp_path / "run")])
     assert "weights" in capsys.readouterr().out
     assert {p.name for p in (tmp_path / "run").iterdir()} == {
         "checkpoint.pt",
@@ -209,16 +208,25 @@ def test_the_training_script_writes_weights_and_curves(
         "weights.pt",
     }
     with pytest.raises(SystemExit) as exit_info:
-        load_script("train_segmenter").main(["light", "--data", str(tmp_path / "nowhere")])
-    assert exit_info.value.code == 2 and "no data set" in capsys.readouterr().err
+        main(["train-segmenter", "light", "--data", str(tmp_path / "nowhere")])
+    assert exit_info.value.code == 2 and "--data: there is no folder" in capsys.readouterr().err
 
 
-def test_the_evaluation_script_finds_a_perfect_segmenter_perfect(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], load_script: Callable[[str], ModuleType]
+def test_judging_finds_a_perfect_segmenter_perfect(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     drawn_set(tmp_path / "set")
-    load_script("evaluate_segmenter").main(
-        ["--data", str(tmp_path / "set"), "--segmenter", "colour", "--out", str(tmp_path / "out")]
+    main(
+        [
+            "judge",
+            "segmenter",
+            "--data",
+            str(tmp_path / "set"),
+            "--segmenter",
+            "colour",
+            "--out",
+            str(tmp_path / "out"),
+        ]
     )
     metrics = json.loads((tmp_path / "out" / "metrics.json").read_text())
     assert metrics["fruits"] == 6 and metrics["box_AP50"] == 1 and metrics["mask_AP50"] == 1

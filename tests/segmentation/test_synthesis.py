@@ -1,10 +1,8 @@
 """Rendered data sets: the parts as functions with known answers, and a small data set where a renderer is there."""
 
 import json
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from types import ModuleType
 from typing import Any
 
 import cv2
@@ -12,7 +10,8 @@ import numpy as np
 import pytest
 import trimesh
 
-from maniskill_tomato.cli import Dataset, main, parse
+from maniskill_tomato.cli import main, parse
+from maniskill_tomato.cli.dataset_command import Dataset
 from maniskill_tomato.errors import InvalidInputError
 from maniskill_tomato.robot.d435 import (
     CameraIntrinsics,
@@ -22,7 +21,7 @@ from maniskill_tomato.robot.d435 import (
     min_depth,
 )
 from maniskill_tomato.robot.depth_noise import DepthNoise, measure_depth
-from maniskill_tomato.segmentation.synthesis.dataset import DatasetConfig, _numbers, make_dataset
+from maniskill_tomato.segmentation.synthesis.dataset_rendering import DatasetConfig, _numbers, make_dataset
 from maniskill_tomato.segmentation.synthesis.silhouette import draw_silhouette
 
 CAMERA = color_intrinsics(320, 240)
@@ -139,18 +138,18 @@ def test_the_command_takes_its_options(tmp_path: Path) -> None:
 def test_missing_photos_are_an_error_of_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit):
         main(["dataset", "--count", "1", "--real", str(tmp_path / "gone"), "--out", str(tmp_path / "out")])
-    assert capsys.readouterr().err.startswith("error: there is no data set at")
+    assert capsys.readouterr().err.startswith("error: --real: there is no folder")
     assert not (tmp_path / "out").exists()
 
 
 @pytest.mark.render
 @pytest.mark.slow
 def test_a_small_data_set_is_whole_continued_and_the_same_again(
-    tmp_path: Path, load_script: Callable[[str], ModuleType]
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     from maniskill_tomato.rendering.vulkan_probe import rendering_available
-    from maniskill_tomato.segmentation.datasets.formats import read_annotated
-    from maniskill_tomato.segmentation.synthesis.statistics import write_statistics
+    from maniskill_tomato.segmentation.datasets.reading import read_annotated
+    from maniskill_tomato.segmentation.synthesis.dataset_page import write_statistics
 
     if not rendering_available():
         pytest.skip("needs a Vulkan device")
@@ -172,13 +171,12 @@ def test_a_small_data_set_is_whole_continued_and_the_same_again(
             # V_f is written with five decimals.
             assert fruit.visible_fraction <= seen.sum() / whole.sum() + 6e-6
     assert write_statistics(read, tmp_path / "a").is_file()
-    judge_script = load_script("judge_occlusion")
-    judge_script.main(
-        judge_script.Args(data=tmp_path / "a", figure="images/000000.jpg", out=tmp_path / "occ")
-    )
+    judge = ("judge", "occlusion", "--data", str(tmp_path / "a"), "--out", str(tmp_path / "occ"), "--figure")
+    main([*judge, "images/000000.jpg"])
     assert cv2.imread(str(tmp_path / "occ" / "steps.png")) is not None
-    with pytest.raises(InvalidInputError, match="--figure"):
-        judge_script.main(judge_script.Args(data=tmp_path / "a", figure="images/9.jpg", out=tmp_path / "occ"))
+    with pytest.raises(SystemExit):
+        main([*judge, "images/9.jpg"])
+    assert capsys.readouterr().err.startswith("error: --figure must be one of")
     # Continued to three images it keeps the first two, and made anew in one go it is the same.
     grown = make_dataset(replace(config, count=3), tmp_path / "a")
     again = make_dataset(replace(config, count=3), tmp_path / "b")

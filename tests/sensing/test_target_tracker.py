@@ -111,7 +111,7 @@ def test_fruits_that_are_not_ripe_are_passed_over() -> None:
     fruits = [
         fruit(TARGET, category="tomato_unripe"),
         fruit(TARGET, category="tomato_turning"),
-        fruit(NEIGHBOUR, category="tomato"),
+        fruit(TARGET + [0.0, 0.03, 0.0], category="tomato"),
     ]
     assert chosen(fruits) == 2
     assert chosen(fruits[:2]) is None

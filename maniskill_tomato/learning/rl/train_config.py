@@ -118,7 +118,7 @@ class TrainConfig:
 
     # Curriculum.
     leaf_density_start: float | None = None
-    """Highest leaf density of the plants at the start of the run; it rises linearly to the task's. None: no limit."""
+    """Highest leaf density of the plants at the start of the run; it rises linearly to the task's. `none`: no limit."""
     leaf_density_steps: int = 5000
     """Steps in which it rises."""
 
@@ -127,7 +127,8 @@ class TrainConfig:
     """Other ripe tomatoes for which every step is stored once more, as if they had been the target."""
     success_threshold_start: float | None = None
     """V_f above which a view counts as a success at the start of the run, potential reward only; it rises linearly
-    to 1, and the task's own threshold holds as soon as it is lower. None: always the task's."""
+    to 1, and the task's own threshold holds as soon as it is lower. `none`: always the
+    task's."""
     success_threshold_steps: int = 5000
     """Steps in which it rises."""
 
@@ -169,7 +170,7 @@ class TrainConfig:
     checkpoint_every: int = 5000
     """Environment steps between checkpoints."""
     checkpoint_seconds: float | None = 60.0
-    """Longest time between checkpoints, in [s]; what a crash can cost. None leaves it to `checkpoint_every`."""
+    """Longest time between checkpoints, in [s]; what a crash can cost. `none` leaves it to `checkpoint_every`."""
     checkpoints_kept: int = 3
     """Newest checkpoints that stay on the disk."""
     torch_threads: int = 1

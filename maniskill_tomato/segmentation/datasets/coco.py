@@ -24,8 +24,8 @@ from maniskill_tomato.segmentation.datasets.annotations import (
     Instance,
     clip_box,
     leaves_image,
-    read_picture,
 )
+from maniskill_tomato.segmentation.datasets.picture_files import read_picture
 from maniskill_tomato.segmentation.masks import Box, EncodedMask
 
 VISIBLE_FILE = "annotations.json"

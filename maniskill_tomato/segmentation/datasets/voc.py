@@ -16,8 +16,8 @@ from maniskill_tomato.segmentation.datasets.annotations import (
     Instance,
     clip_box,
     leaves_image,
-    read_picture,
 )
+from maniskill_tomato.segmentation.datasets.picture_files import read_picture
 
 IMAGE_SUFFIXES = (".jpg", ".jpeg", ".png", ".bmp")
 IMAGE_FOLDERS = ("JPEGImages", "images", ".")

@@ -6,7 +6,6 @@ neither as found nor as missed, and a detection of which the threshold's share l
 COCO treats crowds.
 """
 
-from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Literal
 
@@ -14,9 +13,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from maniskill_tomato.errors import InvalidInputError
-from maniskill_tomato.segmentation.datasets.annotations import BEHIND, AnnotatedImage
+from maniskill_tomato.segmentation.datasets.annotations import (
+    BEHIND,
+    SMALLEST_SHARE,
+    AnnotatedImage,
+    ignored_fruit,
+)
 from maniskill_tomato.segmentation.instances import Instances
-from maniskill_tomato.segmentation.training.training_pictures import SMALLEST_SHARE, ignored_fruit
 
 Overlap = Literal["box", "mask"]
 
@@ -225,8 +228,3 @@ def _ratios(
     shared: NDArray[np.float64], area_a: NDArray[np.float64], area_b: NDArray[np.float64]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     return shared / np.maximum(area_a + area_b - shared, 1e-9), shared / np.maximum(area_a, 1e-9)
-
-
-def mean_average_precision(curves: Sequence[PrecisionRecall]) -> float:
-    """The mean of the average precisions, for instance over thresholds 0.5 to 0.95."""
-    return float(np.mean([curve.average_precision for curve in curves]))

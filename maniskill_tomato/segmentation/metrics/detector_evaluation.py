@@ -7,7 +7,9 @@ from pathlib import Path
 import numpy as np
 
 from maniskill_tomato.errors import InvalidInputError
-from maniskill_tomato.segmentation.datasets.annotations import BEHIND, AnnotatedImage
+from maniskill_tomato.segmentation.datasets.annotations import BEHIND, SMALLEST_SHARE, AnnotatedImage
+from maniskill_tomato.segmentation.datasets.picture_files import write_picture
+from maniskill_tomato.segmentation.drawing import contact_sheet, draw_instances
 from maniskill_tomato.segmentation.instances import Image
 from maniskill_tomato.segmentation.metrics.coco_metrics import CocoScore
 from maniskill_tomato.segmentation.metrics.detection_metrics import (
@@ -18,9 +20,7 @@ from maniskill_tomato.segmentation.metrics.detection_metrics import (
     without_narrow,
 )
 from maniskill_tomato.segmentation.metrics.detection_plots import plot_precision_recall
-from maniskill_tomato.segmentation.pictures import contact_sheet, draw_instances, write_picture
 from maniskill_tomato.segmentation.segmenter import Segmenter
-from maniskill_tomato.segmentation.training.training_pictures import SMALLEST_SHARE
 
 PICTURES = 16
 """Images on the sheet of results."""

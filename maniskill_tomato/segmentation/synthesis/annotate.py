@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from maniskill_tomato.robot.d435 import CameraIntrinsics
 from maniskill_tomato.segmentation.datasets.annotations import Instance
 from maniskill_tomato.segmentation.masks import EncodedMask
-from maniskill_tomato.segmentation.synthesis.scene import Thing
+from maniskill_tomato.segmentation.synthesis.greenhouse import Thing
 from maniskill_tomato.segmentation.synthesis.silhouette import draw_silhouette
 
 Float64 = NDArray[np.float64]

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from maniskill_tomato.plants.materials import MATERIALS
 from maniskill_tomato.plants.textures import cloud
-from maniskill_tomato.segmentation.synthesis.look import SceneLook
+from maniskill_tomato.segmentation.synthesis.appearance import SceneAppearance
 
 UInt8 = NDArray[np.uint8]
 
@@ -22,17 +22,17 @@ fruits in the median, blue 0.24."""
 
 
 class PlantMaterials(dict[str, sapien.render.RenderMaterial]):
-    """The plants' materials under one look, made when first asked for; like the dictionary that shapes take."""
+    """The plants' materials with one appearance, made when first asked for; like the dictionary that shapes take."""
 
-    def __init__(self, look: SceneLook, rng: Generator) -> None:
-        """Keeps the look.
+    def __init__(self, appearance: SceneAppearance, rng: Generator) -> None:
+        """Keeps the appearance.
 
         Args:
-            look: Decides colours, blemishes and gloss.
+            appearance: Decides colours, blemishes and gloss.
             rng: Places the blemishes.
         """
         super().__init__()
-        self._look = look
+        self._appearance = appearance
         self._seed = int(rng.integers(2**31))
 
     def __contains__(self, name: object) -> bool:
@@ -45,18 +45,22 @@ class PlantMaterials(dict[str, sapien.render.RenderMaterial]):
         colour: NDArray[np.floating[Any]] = pixels[..., :3]
         roughness, specular = material.roughness, material.specular
         if name.startswith("leaf"):
-            colour = colour * np.array(self._look.leaf_gain, dtype=np.float32)
-            colour = _blemished(colour, self._look.leaf_blemish, rng)
-            roughness = float(np.clip(roughness * self._look.gloss, 0.3, 0.95))
+            colour = colour * np.array(self._appearance.leaf_gain, dtype=np.float32)
+            colour = _blemished(colour, self._appearance.leaf_blemish, rng)
+            roughness = float(np.clip(roughness * self._appearance.gloss, 0.3, 0.95))
         elif name.startswith("fruit"):
             colour = (
-                colour * np.array(self._look.fruit_gain, dtype=np.float32) * np.exp(rng.normal(0, 0.05, 3))
+                colour
+                * np.array(self._appearance.fruit_gain, dtype=np.float32)
+                * np.exp(rng.normal(0, 0.05, 3))
             )
-            colour = colour * (1 - self._look.fruit_bloom) + np.array(BLOOM) * self._look.fruit_bloom
-            roughness = float(np.clip(roughness * self._look.gloss, 0.12, 0.5))
+            colour = (
+                colour * (1 - self._appearance.fruit_bloom) + np.array(BLOOM) * self._appearance.fruit_bloom
+            )
+            roughness = float(np.clip(roughness * self._appearance.gloss, 0.12, 0.5))
             specular = 0.25
         else:
-            colour = colour * np.array(self._look.leaf_gain, dtype=np.float32)
+            colour = colour * np.array(self._appearance.leaf_gain, dtype=np.float32)
         pixels = np.dstack([np.clip(colour, 0, 1), pixels[..., 3:]])
         self[name] = textured((pixels * 255).astype(np.uint8), roughness=roughness, specular=specular)
         return self[name]

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from maniskill_tomato.assets import asset_path
 from maniskill_tomato.segmentation.synthesis import paint
-from maniskill_tomato.segmentation.synthesis.look import SceneLook
+from maniskill_tomato.segmentation.synthesis.appearance import SceneAppearance
 
 AddBody = Callable[[list[sapien.render.RenderShape], sapien.Pose], sapien.Entity]
 HALF_LENGTH = 4.0
@@ -49,18 +49,18 @@ def _box(
     )
 
 
-def add_surroundings(add: AddBody, look: SceneLook, rng: Generator) -> None:
+def add_surroundings(add: AddBody, appearance: SceneAppearance, rng: Generator) -> None:
     """Adds everything that is neither plant nor robot.
 
     Args:
         add: Puts shapes into the scene at a pose.
-        look: Which surroundings.
+        appearance: Which surroundings.
         rng: Their places and stains.
     """
-    rows = [0.0] + [look.row_distance * k for k in (1, 2)] + [-look.row_distance]
+    rows = [0.0] + [appearance.row_distance * k for k in (1, 2)] + [-appearance.row_distance]
     gutter, slab = (
-        paint.dirty(look.paint, rng, dirt=float(rng.uniform(0, 0.6))),
-        paint.printed(look.paint, rng),
+        paint.dirty(appearance.paint, rng, dirt=float(rng.uniform(0, 0.6))),
+        paint.printed(appearance.paint, rng),
     )
     wool, pipe = paint.dirty((0.42, 0.36, 0.26), rng, dirt=0.6), paint.plain((0.8, 0.8, 0.78), roughness=0.4)
     for x in rows:
@@ -72,21 +72,21 @@ def add_surroundings(add: AddBody, look: SceneLook, rng: Generator) -> None:
         for side in (-0.25, 0.25):
             rail = sapien.render.RenderShapeCylinder(0.026, HALF_LENGTH, pipe)
             turned = sapien.Pose(
-                [x + 0.5 * look.row_distance + side, 0, look.floor + 0.1], [0.7071, 0, 0, 0.7071]
+                [x + 0.5 * appearance.row_distance + side, 0, appearance.floor + 0.1], [0.7071, 0, 0, 0.7071]
             )
             add([rail], turned)
         if rng.random() < 0.5:
             wide = sapien.render.RenderShapeCylinder(0.05, HALF_LENGTH, gutter)
-            add([wide], sapien.Pose([x + 0.25, 0, look.floor + 0.25], [0.7071, 0, 0, 0.7071]))
-    ground = paint.dirty(look.floor_colour, rng, dirt=float(rng.uniform(0.1, 0.9)))
-    add([_box([5.0, 5.0, 0.01], ground)], sapien.Pose([0, 0, look.floor]))
-    _add_strings(add, look, rng)
-    _add_walls(add, look, rng)
+            add([wide], sapien.Pose([x + 0.25, 0, appearance.floor + 0.25], [0.7071, 0, 0, 0.7071]))
+    ground = paint.dirty(appearance.floor_colour, rng, dirt=float(rng.uniform(0.1, 0.9)))
+    add([_box([5.0, 5.0, 0.01], ground)], sapien.Pose([0, 0, appearance.floor]))
+    _add_strings(add, appearance, rng)
+    _add_walls(add, appearance, rng)
 
 
-def _add_strings(add: AddBody, look: SceneLook, rng: Generator) -> None:
+def _add_strings(add: AddBody, appearance: SceneAppearance, rng: Generator) -> None:
     colours = ((0.95, 0.95, 0.92), (0.75, 0.72, 0.6), (0.12, 0.12, 0.12))
-    for _ in range(look.strings):
+    for _ in range(appearance.strings):
         material = paint.plain(colours[int(rng.integers(3))])
         radius = float(rng.uniform(0.0008, 0.003))
         x, y = float(rng.normal(0.02, 0.12)), float(rng.uniform(-0.9, 0.9))
@@ -110,16 +110,16 @@ def _x_axis_to(
     return pose
 
 
-def _add_walls(add: AddBody, look: SceneLook, rng: Generator) -> None:
-    far = 5.0 if look.backdrop != "bright" else 2.2
-    wall = paint.far_greenery(look.wall, rng) if look.greenery else paint.glowing(look.wall)
+def _add_walls(add: AddBody, appearance: SceneAppearance, rng: Generator) -> None:
+    far = 5.0 if appearance.backdrop != "bright" else 2.2
+    wall = paint.far_greenery(appearance.wall, rng) if appearance.greenery else paint.glowing(appearance.wall)
     dark = paint.plain((0.35, 0.36, 0.36))
     for sign in (1.0, -1.0):
         add([_box([0.01, 6.0, 4.0], wall, 4.0)], sapien.Pose([sign * far, 0, 3.0]))
         add([_box([6.0, 0.01, 4.0], wall, 4.0)], sapien.Pose([0, sign * 5.0, 3.0]))
         for y in np.arange(-4, 4.1, float(rng.uniform(0.8, 2.0))):
             add([_box([0.02, 0.03, 4.0], dark)], sapien.Pose([sign * (far - 0.05), float(y), 3.0]))
-    roof = paint.glowing((1.2 * look.wall[0], 1.2 * look.wall[1], 1.25 * look.wall[2]))
+    roof = paint.glowing((1.2 * appearance.wall[0], 1.2 * appearance.wall[1], 1.25 * appearance.wall[2]))
     add([_box([6.0, 6.0, 0.01], roof)], sapien.Pose([0, 0, 4.0]))
     beam = paint.plain((0.7, 0.72, 0.72))
     for x in np.arange(-4, 4.1, 1.0):

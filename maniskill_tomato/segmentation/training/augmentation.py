@@ -1,14 +1,15 @@
 """Training pictures made from annotated ones: other scale, place, light and company."""
 
 from collections.abc import Callable
+from dataclasses import replace
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from maniskill_tomato.segmentation.instances import mask_box
-from maniskill_tomato.segmentation.training.fruit_targets import TrainingPicture
 from maniskill_tomato.segmentation.training.light_config import AugmentationConfig
+from maniskill_tomato.segmentation.training.training_pictures import TrainingPicture
 
 
 def augmented(
@@ -122,19 +123,7 @@ def _coloured(
     if rng.random() < config.noise_probability:
         image += rng.normal(0, rng.uniform(1, 10), image.shape[:2])[:, :, None]
     table = (np.linspace(0, 1, 256) ** rng.uniform(*config.gamma) * 255).astype(np.uint8)
-    return _with(picture, table[np.clip(image, 0, 255).astype(np.uint8)])
-
-
-def _with(picture: TrainingPicture, image: NDArray[np.uint8]) -> TrainingPicture:
-    """The same annotation of another image."""
-    return TrainingPicture(
-        image=image,
-        boxes=picture.boxes,
-        ignored=picture.ignored,
-        labels=picture.labels,
-        whole_boxes=picture.whole_boxes,
-        categories=picture.categories,
-    )
+    return replace(picture, image=table[np.clip(image, 0, 255).astype(np.uint8)])
 
 
 def _joined(

@@ -7,7 +7,7 @@ import numpy as np
 
 from maniskill_tomato.segmentation.instances import Image
 from maniskill_tomato.segmentation.training.detector_presets import ClassicAugmentation
-from maniskill_tomato.segmentation.training.fruit_targets import TrainingPicture
+from maniskill_tomato.segmentation.training.training_pictures import TrainingPicture
 
 
 def classic_augmentation(

@@ -5,7 +5,7 @@ from typing import Literal
 
 from maniskill_tomato.errors import InvalidInputError
 
-Backbone = Literal["resnet101", "resnet50", "mobilenet", "efficientnet_lite0"]
+Backbone = Literal["resnet101", "resnet50", "efficientnet_lite0"]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -112,22 +112,6 @@ MASK_RCNN_PRESETS: dict[str, MaskRcnnConfig] = {
         dropout=0.5,
         augmentation=FOUR_AUGMENTATIONS,
     ),
-    # Ours: small enough to be trained on a CPU from random weights.
-    "light": MaskRcnnConfig(
-        backbone="mobilenet",
-        epochs=20,
-        steps_per_epoch=300,
-        validation_steps=16,
-        batch_size=2,
-        learning_rates=((1, 1e-2), (15, 1e-3)),
-        longest_side=384,
-        shortest_side=320,
-        anchor_sides=(16, 32, 64, 128, 256),
-        proposal_nms=0.7,
-        rois_per_image=128,
-        augmentation=FOUR_AUGMENTATIONS,
-        bfloat16=True,
-    ),
     # Ours: on the light segmenter's backbone, whose ImageNet weights come as a package (`--pretrained`).
     "light-lite0": MaskRcnnConfig(
         backbone="efficientnet_lite0",
@@ -166,12 +150,6 @@ class YoloConfig:
     """Least confidence of an object."""
     nms_threshold: float = 0.45
     """Of two boxes with a larger intersection over union only the better one stays."""
-    match_threshold: float = 0.5
-    """Least intersection over union of a true detection."""
-    plateau_epochs: int = 2
-    """Epochs without a better validation loss after which the learning rate is divided by `plateau_factor`."""
-    plateau_factor: float = 10.0
-    """What the learning rate is divided by."""
     patience: int = 3
     """Epochs without a better validation loss after which training stops."""
     pretrained: bool = False
@@ -180,13 +158,3 @@ class YoloConfig:
 
 YOLO_PRESET = YoloConfig()
 """Table 4-1."""
-
-THESIS_DATA = {
-    "yolo": {"training": 120, "validation": 30, "test": 50},
-    "strategy-1": {"training": 153, "validation": 98, "test": 40},
-    "strategy-2": {"training": 220, "validation": 125, "test": 40},
-}
-"""Images that the thesis used (4-2-2, Tables 4-3 and 4-4)."""
-
-THESIS_AVERAGE_PRECISION = {"yolo": 0.9394, "strategy-1": 0.6725, "strategy-2": 0.7403}
-"""AP on the thesis's own test images."""

@@ -13,6 +13,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from maniskill_tomato.segmentation.fruit_network import STRIDE, FruitMaps, place_centres
+from maniskill_tomato.segmentation.training.training_pictures import TrainingPicture
 
 GAUSSIAN_SHARE = 0.54
 """Share of the box that three standard deviations to both sides span (TTFNet's alpha and beta)."""
@@ -26,25 +27,6 @@ proportion, so that large fruits with their many places do not decide alone."""
 
 MOST_WEIGHT = 4.0
 """Most that such a place weighs."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class TrainingPicture:
-    """A picture with its annotation, ready for the network."""
-
-    image: NDArray[np.uint8]
-    """Red, green, blue. Shape (H, W, 3)."""
-    boxes: NDArray[np.float32]
-    """Visible boxes, left, top, right, bottom in [px]. Shape (N, 4)."""
-    ignored: NDArray[np.bool_]
-    """Fruits that are neither asked for nor punished, for instance because they are tiny. Shape (N,)."""
-    labels: NDArray[np.int16] | None = None
-    """At each pixel the index of the fruit plus one, 0 elsewhere and -1 where it is not known; None without masks.
-    Shape (H, W)."""
-    whole_boxes: NDArray[np.float32] | None = None
-    """Boxes of the whole fruits in [px], NaN where not known. Shape (N, 4)."""
-    categories: NDArray[np.int64] | None = None
-    """Kinds, -1 where not known. Shape (N,)."""
 
 
 @dataclass(frozen=True, kw_only=True)

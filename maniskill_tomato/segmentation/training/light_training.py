@@ -1,10 +1,9 @@
 """Training of the light segmenter, from ImageNet weights or others, resumable step by step."""
 
 import copy
-import json
 import logging
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -18,15 +17,18 @@ from maniskill_tomato.segmentation.datasets.annotations import AnnotatedImage
 from maniskill_tomato.segmentation.efficientnet_lite import EfficientNetLite0
 from maniskill_tomato.segmentation.fruit_network import FruitNetwork
 from maniskill_tomato.segmentation.training.augmentation import augmented
-from maniskill_tomato.segmentation.training.fruit_targets import (
-    LOSS_WEIGHTS,
-    TrainingPicture,
-    fruit_losses,
-    make_targets,
-)
+from maniskill_tomato.segmentation.training.fruit_targets import LOSS_WEIGHTS, fruit_losses, make_targets
 from maniskill_tomato.segmentation.training.light_config import AugmentationConfig, LightTrainConfig
-from maniskill_tomato.segmentation.training.resumable_training import ResumableTraining
-from maniskill_tomato.segmentation.training.training_pictures import PictureDraw, training_picture
+from maniskill_tomato.segmentation.training.resumable_training import (
+    ResumableTraining,
+    mean_losses,
+    plain_terms,
+)
+from maniskill_tomato.segmentation.training.training_pictures import (
+    PictureDraw,
+    TrainingPicture,
+    training_picture,
+)
 from maniskill_tomato.segmentation.weights import load_weights, save_weights
 
 logger = logging.getLogger(__name__)
@@ -94,28 +96,21 @@ class LightTraining(ResumableTraining):
             group["lr"] = group["share"] * learning_rate(config, self.step)
         self.network.train()
         terms = self._losses(self.network, pictures)
-        loss = torch.stack([LOSS_WEIGHTS[name] * term for name, term in terms.items()]).sum()
+        loss = weighted(terms)
         self.optimizer.zero_grad(set_to_none=True)
         loss.backward()  # type: ignore[no-untyped-call]
         nn.utils.clip_grad_norm_(self.network.parameters(), config.gradient_norm)
         self.optimizer.step()
         self.step += 1
         self._average()
-        return {"loss": float(loss.detach()), **{name: float(term.detach()) for name, term in terms.items()}}
+        return plain_terms(loss, terms)
 
     def validation_losses(self) -> dict[str, float]:
         """The loss terms of the averaged weights on pictures that are always the same, named `val_...`."""
-        if not self.validation:
-            return {}
         self.averaged.eval()
-        sums: dict[str, float] = {}
         with torch.no_grad():
-            for pictures in self.validation:
-                terms = self._losses(self.averaged, pictures)
-                terms["loss"] = torch.stack([LOSS_WEIGHTS[n] * t for n, t in terms.items()]).sum()
-                for name, term in terms.items():
-                    sums[name] = sums.get(name, 0.0) + float(term)
-        return {f"val_{name}": value / len(self.validation) for name, value in sums.items()}
+            batches = [self._losses(self.averaged, pictures) for pictures in self.validation]
+            return mean_losses(plain_terms(weighted(terms), terms) for terms in batches)
 
     def modules(self) -> dict[str, nn.Module]:
         """The network and its average."""
@@ -135,12 +130,9 @@ class LightTraining(ResumableTraining):
         }
         save_weights(path, "light", self.config.network.to_dict(), self.averaged.state_dict(), training)
 
-    def described(self) -> dict[str, Any]:
-        """The settings and the data."""
-        described: dict[str, Any] = json.loads(json.dumps(asdict(self.config)))
-        described["images"] = [len(s) for s in self.draw.sets]
-        described["shares"] = list(self.draw.shares)
-        return described
+    def settings(self) -> dict[str, Any]:
+        """Those of the configuration."""
+        return asdict(self.config)
 
     def _losses(self, network: FruitNetwork, pictures: list[TrainingPicture]) -> dict[str, Tensor]:
         images = torch.from_numpy(np.stack([p.image for p in pictures])).permute(0, 3, 1, 2).float()
@@ -159,6 +151,11 @@ class LightTraining(ResumableTraining):
                     mean.lerp_(now, 1 - keep)
                 else:
                     mean.copy_(now)
+
+
+def weighted(terms: Mapping[str, Tensor]) -> Tensor:
+    """The loss: the sum of its terms by `LOSS_WEIGHTS`."""
+    return torch.stack([LOSS_WEIGHTS[name] * term for name, term in terms.items()]).sum()
 
 
 def learning_rate(config: LightTrainConfig, step: int) -> float:

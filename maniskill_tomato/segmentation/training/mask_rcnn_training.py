@@ -13,9 +13,16 @@ from maniskill_tomato.segmentation.datasets.annotations import AnnotatedImage
 from maniskill_tomato.segmentation.mask_rcnn import build_mask_rcnn
 from maniskill_tomato.segmentation.training.classic_augmentation import classic_augmentation
 from maniskill_tomato.segmentation.training.detector_presets import MaskRcnnConfig
-from maniskill_tomato.segmentation.training.fruit_targets import TrainingPicture
-from maniskill_tomato.segmentation.training.resumable_training import ResumableTraining
-from maniskill_tomato.segmentation.training.training_pictures import PictureDraw, training_picture
+from maniskill_tomato.segmentation.training.resumable_training import (
+    ResumableTraining,
+    mean_losses,
+    plain_terms,
+)
+from maniskill_tomato.segmentation.training.training_pictures import (
+    PictureDraw,
+    TrainingPicture,
+    training_picture,
+)
 from maniskill_tomato.segmentation.weights import save_weights
 
 GRADIENT_NORM = 5.0
@@ -88,13 +95,10 @@ class MaskRcnnTraining(ResumableTraining):
             nn.utils.clip_grad_norm_(self.network.parameters(), GRADIENT_NORM)
             self.optimizer.step()
         self.step += 1
-        return {"loss": float(loss.detach()), **{name: float(term.detach()) for name, term in terms.items()}}
+        return plain_terms(loss, terms)
 
     def validation_losses(self) -> dict[str, float]:
         """The loss terms on the validation images; torchvision tells them in training mode only, and draws regions."""
-        sums: dict[str, float] = {}
-        if not self.validation:
-            return sums
         # Statistics of the normalisation and the random numbers stay as they were.
         self.network.train()
         for module in self.network.modules():
@@ -102,27 +106,17 @@ class MaskRcnnTraining(ResumableTraining):
                 module.eval()
         state = torch.get_rng_state()
         with torch.no_grad():
-            for image in self.validation:
-                terms = self._losses([training_picture(image)])
-                terms["loss"] = torch.stack(list(terms.values())).sum()
-                for name, term in terms.items():
-                    sums[name] = sums.get(name, 0.0) + float(term)
+            images = [self._losses([training_picture(image)]) for image in self.validation]
         torch.set_rng_state(state)
-        return {f"val_{name}": value / len(self.validation) for name, value in sums.items()}
+        return mean_losses(plain_terms(torch.stack(list(terms.values())).sum(), terms) for terms in images)
 
     def modules(self) -> dict[str, nn.Module]:
         """The network."""
         return {"network": self.network}
 
-    def described(self) -> dict[str, Any]:
-        """The settings and the data."""
-        return {
-            **asdict(self.config),
-            "seed": self.seed,
-            "pretrained": self.pretrained,
-            "images": [len(s) for s in self.draw.sets],
-            "shares": list(self.draw.shares),
-        }
+    def settings(self) -> dict[str, Any]:
+        """Those of the configuration, the seed and where the weights come from."""
+        return {**asdict(self.config), "seed": self.seed, "pretrained": self.pretrained}
 
     def write_weights(self, path: Path) -> None:
         """Writes the network's weights.

@@ -3,16 +3,18 @@
 import io
 import json
 from abc import ABC, abstractmethod
-from collections.abc import Callable
+from collections import Counter
+from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
-from torch import nn
+from torch import Tensor, nn
 
 from maniskill_tomato.errors import CheckpointError, TrainingDivergedError
 from maniskill_tomato.files import read_tensors, write_atomically
+from maniskill_tomato.segmentation.training.training_pictures import PictureDraw
 
 CHECKPOINT = "checkpoint.pt"
 WEIGHTS = "weights.pt"
@@ -32,6 +34,7 @@ class ResumableTraining(ABC):
     log_every: int
     save_every: int
     rng: np.random.Generator
+    draw: PictureDraw
     optimizer: torch.optim.Optimizer
 
     def __init__(self) -> None:
@@ -52,12 +55,18 @@ class ResumableTraining(ABC):
         """The networks that a checkpoint holds, by name."""
 
     @abstractmethod
-    def described(self) -> dict[str, Any]:
-        """The settings that decide the result, as JSON can hold them."""
+    def settings(self) -> dict[str, Any]:
+        """The settings that decide the result besides the data, as JSON can hold them."""
 
     @abstractmethod
     def write_weights(self, path: Path) -> None:
         """Writes the trained network for use."""
+
+    def described(self) -> dict[str, Any]:
+        """The settings, how many images each set has and how often each is drawn from."""
+        data = {"images": [len(s) for s in self.draw.sets], "shares": list(self.draw.shares)}
+        described: dict[str, Any] = json.loads(json.dumps(self.settings() | data))
+        return described
 
     def run(
         self, out: Path, report: Callable[[str], None], stopped: Callable[[], bool] = lambda: False
@@ -129,7 +138,7 @@ class ResumableTraining(ABC):
         """
         state = read_tensors(out / CHECKPOINT)
         try:
-            if json.loads(state["settings"]) != json.loads(json.dumps(self.described())):
+            if json.loads(state["settings"]) != self.described():
                 raise CheckpointError(
                     f"{out / CHECKPOINT} was trained with other settings; repeat them, or choose another --out"
                 )
@@ -142,3 +151,18 @@ class ResumableTraining(ABC):
             self._sums = json.loads(state["sums"])
         except (KeyError, TypeError, ValueError, RuntimeError) as error:
             raise CheckpointError(f"{out / CHECKPOINT} is no state of this training ({error})") from error
+
+
+def plain_terms(loss: Tensor, terms: Mapping[str, Tensor]) -> dict[str, float]:
+    """A loss and its terms as numbers, the loss under the name `loss`."""
+    return {"loss": float(loss.detach()), **{name: float(term.detach()) for name, term in terms.items()}}
+
+
+def mean_losses(batches: Iterable[Mapping[str, float]]) -> dict[str, float]:
+    """The mean of each loss term over batches, named `val_...`; empty without a batch."""
+    sums: Counter[str] = Counter()
+    count = 0
+    for terms in batches:
+        sums.update(terms)
+        count += 1
+    return {f"val_{name}": value / count for name, value in sums.items()}

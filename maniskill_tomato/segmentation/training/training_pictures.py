@@ -1,59 +1,37 @@
-"""Annotated images as the light segmenter's training takes them."""
+"""Pictures that detectors are trained on, drawn from sets of annotated images."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 
 from maniskill_tomato.errors import InvalidInputError
 from maniskill_tomato.segmentation.datasets.annotations import (
     FRUIT_CATEGORIES,
     AnnotatedImage,
-    AnnotatedImages,
-    Instance,
+    ignored_fruit,
 )
-from maniskill_tomato.segmentation.datasets.formats import read_annotated
-from maniskill_tomato.segmentation.training.fruit_targets import TrainingPicture
-
-LEAST_VISIBLE = 0.1
-"""Fruits of which less is visible (V_f) are neither asked for nor punished."""
-
-SMALLEST_SIDE = 6.0
-"""Nor are those whose visible box is narrower than this, in [px]."""
-
-SMALLEST_SHARE = 12.0 / 640.0
-"""Nor are rendered fruits whose visible box is narrower than this share of the image's longer side.
-
-A renderer annotates fruits that no one would label: of the 3,301 boxes that people drew in greenhouse photos one in a
-hundred is narrower than 12.8 px in an image 640 px long. A 4 cm fruit of 12 px is 1.5 m away, out of reach."""
 
 
-def read_place(place: str) -> AnnotatedImages:
-    """The annotated images of FOLDER, or of FOLDER:SPLIT for one list of it.
+@dataclass(frozen=True, kw_only=True)
+class TrainingPicture:
+    """A picture with its annotation, ready for the network."""
 
-    Raises:
-        InvalidInputError: There is nothing usable.
-    """
-    if Path(place).exists():
-        return read_annotated(place)
-    folder, _, split = place.rpartition(":")
-    return read_annotated(folder, split) if folder else read_annotated(place)
-
-
-def ignored_fruit(fruit: Instance, longer_side: int, smallest_share: float = SMALLEST_SHARE) -> bool:
-    """Whether a fruit shows so little that a detector is neither asked for it nor punished for it.
-
-    Args:
-        fruit: A fruit; whoever annotated it by hand has chosen it, so that only `SMALLEST_SIDE` counts.
-        longer_side: Of its image, in [px].
-        smallest_share: What stands for `SMALLEST_SHARE`.
-    """
-    narrow = min(fruit.box_xywh[2:])
-    if narrow < SMALLEST_SIDE or fruit.visible_fraction is None:
-        return narrow < SMALLEST_SIDE
-    return fruit.visible_fraction < LEAST_VISIBLE or narrow < smallest_share * longer_side
+    image: NDArray[np.uint8]
+    """Red, green, blue. Shape (H, W, 3)."""
+    boxes: NDArray[np.float32]
+    """Visible boxes, left, top, right, bottom in [px]. Shape (N, 4)."""
+    ignored: NDArray[np.bool_]
+    """Fruits that the losses leave out, for instance because they are tiny. Shape (N,)."""
+    labels: NDArray[np.int16] | None = None
+    """Index of the fruit at each pixel plus one; 0 without a fruit, -1 where unknown. None if there are no masks.
+    Shape (H, W)."""
+    whole_boxes: NDArray[np.float32] | None = None
+    """Boxes of the whole fruits in [px], NaN where not known. Shape (N, 4)."""
+    categories: NDArray[np.int64] | None = None
+    """Kinds, -1 where not known. Shape (N,)."""
 
 
 def training_picture(image: AnnotatedImage) -> TrainingPicture:

@@ -1,0 +1,196 @@
+"""The robot's frames through `sensing`: what a picture tells about the target."""
+
+import importlib
+from dataclasses import dataclass
+from typing import Any, Final, Literal, Protocol
+
+import numpy as np
+
+from maniskill_tomato.deploy.errors import PerceptionError, ProfileError
+from maniskill_tomato.deploy.interface import Float64, Frame
+from maniskill_tomato.errors import TomatoError
+from maniskill_tomato.raycast.images import ROBOT_LABEL
+from maniskill_tomato.raycast.view_rays import ViewRays
+from maniskill_tomato.segmentation.instances import Instances
+from maniskill_tomato.segmentation.masks import BinaryMask
+from maniskill_tomato.segmentation.segmenter import Segmenter
+from maniskill_tomato.sensing.camera_perception import CameraPerception
+from maniskill_tomato.sensing.fruit_detector import FruitDetector
+from maniskill_tomato.sensing.measurement import RIPE_CATEGORIES
+from maniskill_tomato.sensing.posed_frame import PosedFrame
+from maniskill_tomato.sensing.target_tracker import choose_new_target
+
+Sight = Literal["images", "rays"]
+"""From masks and depth images, as on a robot; or from the twin's exact rays, as in the simulated task."""
+
+TRUE_MASKS: Final = "ground_truth"
+"""Name of the segmenter that takes the masks that only a simulated camera knows."""
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Sighting:
+    """What one view told about the target."""
+
+    rays: ViewRays
+    """The pattern about the target, as the simulated task has it."""
+    visible_fraction: float
+    """V_f, 0 if the target is not seen."""
+    mask: BinaryMask
+    """Visible pixels of the target. Shape (H, W)."""
+    fruits_seen: int
+    """How many ripe fruits the picture shows."""
+    target_position: Float64
+    """Where the target is believed to be, world frame, in [m]. Shape (3,)."""
+
+    @property
+    def target_seen(self) -> bool:
+        """Whether any of the target was seen."""
+        return self.visible_fraction > 0.0
+
+
+class Perception(Protocol):
+    """Turns pictures into sightings of one target."""
+
+    name: str
+    """In reports."""
+
+    def begin(self, target_position: Float64 | None) -> None:
+        """Forgets all views.
+
+        Args:
+            target_position: Where the target is, world frame, in [m]; None to choose one that the first picture shows.
+                Shape (3,).
+        """
+        ...
+
+    def look(self, frame: Frame, T_world_camera: Float64) -> Sighting | None:
+        """What a picture tells.
+
+        Args:
+            frame: The picture.
+            T_world_camera: Pose of the optical frame when it was taken. Shape (4, 4).
+
+        Returns:
+            None if there is no target yet, and the picture shows none.
+
+        Raises:
+            PerceptionError: The picture cannot be used.
+        """
+        ...
+
+
+class ImagePerception:
+    """`sensing.CameraPerception` for one camera: masks, depth, the sphere model."""
+
+    def __init__(self, segmenter_name: str, segmenter: Segmenter | None) -> None:
+        """Wraps a segmenter.
+
+        Args:
+            segmenter_name: As profiles call it.
+            segmenter: Finds fruits; None takes the masks that only a simulated camera knows.
+        """
+        self.name = f"images, masks from {segmenter_name}"
+        self._knows_truth = segmenter is None
+        self._detector = FruitDetector(segmenter)
+        self.begin(None)
+
+    def begin(self, target_position: Float64 | None) -> None:
+        """Forgets all views; without a position the largest sure ripe fruit of the first picture is the target."""
+        self._perception = CameraPerception(1, self._detector)
+        self._has_target = target_position is not None
+        if target_position is not None:
+            self._perception.begin(0, target_position, is_located=True)
+
+    def look(self, frame: Frame, T_world_camera: Float64) -> Sighting | None:
+        """The sighting by masks and depth; see `Perception`."""
+        perception = self._perception
+        try:
+            measured = self._detector.measure(self._posed(frame, T_world_camera))
+        except TomatoError as error:
+            raise PerceptionError(f"the picture cannot be segmented: {error}") from error
+        if not self._has_target:
+            chosen = choose_new_target(measured.fruits)
+            centre = None if chosen is None else measured.fruits[chosen].centre_w
+            if centre is None:
+                return None
+            perception.begin(0, centre, is_located=True)
+            self._has_target = True
+        perception.add(0, measured)
+        return Sighting(
+            rays=perception.rays(),
+            visible_fraction=float(perception.visible_fraction[0]),
+            mask=measured.mask(perception.target_fruit(0)),
+            fruits_seen=sum(fruit.is_ripe for fruit in measured.fruits),
+            target_position=perception.position_w(0),
+        )
+
+    def _posed(self, frame: Frame, T_world_camera: Float64) -> PosedFrame:
+        robot_mask, fruits = None, None
+        if self._knows_truth and frame.truth is not None:
+            labels = frame.truth.labels
+            robot_mask = np.asarray(labels == ROBOT_LABEL)
+            ripe = frame.truth.ripe_labels
+            masks = labels[None] == np.array(ripe, labels.dtype)[:, None, None]
+            fruits = Instances.from_masks(masks, categories=(RIPE_CATEGORIES[0],) * len(ripe))
+        return PosedFrame(
+            depth_m=frame.depth,
+            intrinsics=frame.intrinsics,
+            T_world_camera=T_world_camera,
+            rgb=frame.color,
+            robot_mask=robot_mask,
+            true_fruits=fruits,
+        )
+
+
+class TruthPerception:
+    """The twin's exact rays and V_f: the observations of the simulated task, number by number."""
+
+    name = "rays, ground truth"
+
+    def __init__(self) -> None:
+        self._target: Float64 | None = None
+
+    def begin(self, target_position: Float64 | None) -> None:
+        self._target = target_position
+
+    def look(self, frame: Frame, T_world_camera: Float64) -> Sighting | None:
+        truth = frame.truth
+        if truth is None:
+            raise PerceptionError(
+                "perception.sight = 'rays' needs a simulated camera; use 'images' on hardware"
+            )
+        if self._target is None:
+            self._target = truth.target_position
+        return Sighting(
+            rays=truth.rays,
+            visible_fraction=truth.visible_fraction,
+            mask=np.asarray(truth.labels == truth.target_label),
+            fruits_seen=sum(bool((truth.labels == label).any()) for label in truth.ripe_labels),
+            target_position=self._target,
+        )
+
+
+def open_perception(sight: Sight, segmenter: str) -> Perception:
+    """What a profile's `[perception]` asks for.
+
+    Args:
+        sight: How pictures are used.
+        segmenter: `TRUE_MASKS`, or a segmenter's name or file of weights.
+
+    Raises:
+        ProfileError: The segmenter cannot be opened.
+    """
+    if sight == "rays":
+        return TruthPerception()
+    if segmenter == TRUE_MASKS:
+        return ImagePerception(segmenter, None)
+    try:
+        module: Any = importlib.import_module("maniskill_tomato.segmentation.segmenter")
+        return ImagePerception(segmenter, module.make_segmenter(segmenter))
+    except ImportError as error:
+        raise ProfileError(
+            f"perception.segmenter {segmenter!r} cannot be loaded ({error}); install maniskill-tomato[perception], or "
+            f"use {TRUE_MASKS!r} with the mock profile"
+        ) from error
+    except TomatoError as error:
+        raise ProfileError(f"perception.segmenter: {error}") from error

@@ -1,0 +1,103 @@
+"""What can be checked of arguments without PyTorch, ManiSkill or a device, so that a typo costs no seconds."""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+from maniskill_tomato.errors import InvalidInputError, PolicyError, did_you_mean
+from maniskill_tomato.policies.opening import find_policy
+from maniskill_tomato.policies.registry import PRIVILEGED
+from maniskill_tomato.tasks import TASK_IDS
+
+
+def check_choice(flag: str, value: str, allowed: Sequence[str]) -> None:
+    """Accepts one of several words."""
+    if value not in allowed:
+        raise InvalidInputError.choice(flag, value, allowed)
+
+
+def check_env_id(env_id: str, allowed: Sequence[str] = TASK_IDS) -> None:
+    """Accepts the ID of a task."""
+    check_choice("ENV_ID", env_id, allowed)
+
+
+def check_count(flag: str, value: int | None, least: int = 1) -> None:
+    """Accepts a whole number of `least` or more, or none."""
+    if value is not None and value < least:
+        raise InvalidInputError(f"{flag} must be {least} or more, got {value}")
+
+
+def check_file(flag: str, path: Path | None) -> None:
+    """Accepts a file, or none."""
+    if path is not None and not path.is_file():
+        raise InvalidInputError(f"{flag}: there is no file {path}{_neighbour(path)}")
+
+
+def check_folder(flag: str, path: Path | None) -> None:
+    """Accepts a folder, or none."""
+    if path is not None and not path.is_dir():
+        raise InvalidInputError(f"{flag}: there is no folder {path}{_neighbour(path)}")
+
+
+def check_policy(
+    flag: str, name_or_file: str | Path, env_id: str | None = None, on_robot: bool = False
+) -> None:
+    """Accepts the name of a policy that can act in a task, or an existing file.
+
+    Args:
+        flag: Where it was typed.
+        name_or_file: What was typed.
+        env_id: The task; None accepts any.
+        on_robot: Whether there is no simulator that could tell it the truth.
+    """
+    try:
+        found = find_policy(name_or_file, env_id)
+    except PolicyError as error:
+        raise InvalidInputError(f"{flag}: {error}") from error
+    if on_robot and found in PRIVILEGED:
+        raise InvalidInputError(
+            f"{flag}: {found} knows what no camera could tell; it runs in simulation only"
+        )
+
+
+def check_policies(flag: str, text: str) -> None:
+    """Accepts names and files of policies with commas between them; LABEL=FILE is a file."""
+    parts = [part.strip() for part in text.split(",") if part.strip()]
+    if not parts:
+        raise InvalidInputError(f"{flag} must name one policy or more, with commas between them")
+    for part in parts:
+        check_policy(flag, part.rpartition("=")[2])
+
+
+def check_place(flag: str, place: str) -> None:
+    """Accepts FOLDER or FOLDER:SPLIT."""
+    if not Path(place).is_dir():
+        check_folder(flag, Path(place.rpartition(":")[0] or place))
+
+
+def check_segmenter(flag: str, text: str, without: Sequence[str] = ()) -> None:
+    """Accepts a segmenter's name or an existing file of weights."""
+    from maniskill_tomato.segmentation.segmenter import SEGMENTERS
+
+    names = tuple(name for name in SEGMENTERS if name not in without)
+    if text not in names and not Path(text).is_file():
+        raise InvalidInputError(
+            f"{flag} must be a file of weights or one of {', '.join(names)}; got {text!r}{did_you_mean(text, names)}"
+        )
+
+
+def check_profile(flag: str, text: str) -> None:
+    """Accepts the name of a profile that ships, or an existing file."""
+    from maniskill_tomato.deploy.profile_files import profile_names, profile_path
+
+    if not profile_path(text).is_file():
+        raise InvalidInputError(
+            f"{flag}: no profile {text!r}: give the path of a TOML file or one of {', '.join(profile_names())}"
+            f"{did_you_mean(text, profile_names())}"
+        )
+
+
+def _neighbour(path: Path) -> str:
+    """Names a file beside it that is called nearly the same."""
+    if not path.parent.is_dir():
+        return ""
+    return did_you_mean(path.name, [p.name for p in path.parent.iterdir()])

@@ -1,0 +1,86 @@
+"""`maniskill-tomato eval`: how good a policy is."""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+from maniskill_tomato.cli.arguments import Flat
+from maniskill_tomato.cli.early_checks import check_count, check_env_id, check_policy
+from maniskill_tomato.cli.shared_options import EnvId, PlantOptions
+from maniskill_tomato.policies.opening import open_policy, shipped_policy
+
+EpisodeList = Literal["validation", "held_out"]
+
+LISTED_ID = "TomatoViewpoint-v1"
+"""The task that has lists of episodes."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Eval:
+    """Evaluate a policy: metrics.json, plots, a film and report.html."""
+
+    env_id: EnvId
+    """Id of the task."""
+    policy: str | None = None
+    """File of the policy (.pt, or .onnx from `export`), or `random`, or for the general tasks a planner's name; by
+    default the one that ships with the package."""
+    episodes: int = 100
+    """How many episodes."""
+    seed: int = 1000
+    """Seed of the first episode; the others follow."""
+    out: Path = Path("runs/eval")
+    """Folder of the results."""
+    baseline: bool = True
+    """Also run random actions, to compare."""
+    video: bool = True
+    """Film the first episodes where this machine can render."""
+    allow_other_task: bool = False
+    """Accept a policy that was trained on another task."""
+    plants: Annotated[PlantOptions, Flat] = PlantOptions()
+    """Another plant."""
+    episode_list: EpisodeList | None = None
+    """Episodes of a fixed list, TomatoViewpoint-v1 only: seed i is its i-th; by default held_out, unless options of
+    the plants are given."""
+
+    def run(self) -> None:
+        """Evaluates and says where the report is."""
+        check_env_id(self.env_id)
+        check_count("--episodes", self.episodes)
+        env_id = None if self.allow_other_task else self.env_id
+        check_policy("--policy", self.policy or shipped_policy(self.env_id), env_id)
+
+        from maniskill_tomato.experiments.configs import EvaluationConfig
+        from maniskill_tomato.experiments.evaluation import evaluate
+
+        env_options = self.plants.env_options()
+        if self.episode_list is not None or (self.env_id == LISTED_ID and not env_options):
+            env_options["episodes"] = self.episode_list or "held_out"
+        config = EvaluationConfig(
+            env_id=self.env_id,
+            policy=self.policy,
+            episodes=self.episodes,
+            seed=self.seed,
+            out=self.out,
+            allow_other_task=self.allow_other_task,
+            env_options=env_options,
+            baseline=self.baseline,
+            video=self.video,
+            title="Where to look: evaluation",
+        )
+        result = evaluate(config)
+        print(f"policy  {result.origin}")
+        print(summary(result.metrics))
+        if result.left_out:
+            print(result.left_out)
+        print(f"metrics {self.out / 'metrics.json'}")
+        print(f"report  {result.report}")
+
+
+def summary(metrics: dict[str, Any]) -> str:
+    """One line with the figures that matter."""
+    low, high = metrics["success_rate_interval_95"]
+    return (
+        f"success {metrics['success_rate']:.0%} of {metrics['episodes']} episodes "
+        f"(95 % interval {low:.0%} to {high:.0%}), "
+        f"{metrics['mean_steps']:.1f} steps, largest V_f {metrics['mean_max_visible_fraction']:.2f} on average"
+    )

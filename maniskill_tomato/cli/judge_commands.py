@@ -1,0 +1,110 @@
+"""`maniskill-tomato judge`: how good the parts are that a policy rests on."""
+
+import json
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+from maniskill_tomato.cli.early_checks import check_count, check_folder, check_place, check_segmenter
+
+OcclusionModelName = Literal["thesis", "improved", "sphere", "amodal"]
+
+
+@dataclass(frozen=True, kw_only=True)
+class JudgeOcclusion:
+    """Judge occlusion models by their error in V_f on rendered images.
+
+    For plants that nothing was tuned on: `maniskill-tomato dataset --count 1000 --split held_out --no-vary-crop`.
+    """
+
+    data: Path
+    """A folder of `maniskill-tomato dataset`."""
+    out: Path = Path("runs/occlusion")
+    """Folder of occlusion.md and occlusion.json, or of steps.png."""
+    models: tuple[OcclusionModelName, ...] = ("thesis", "improved", "sphere", "amodal")
+    """Which models."""
+    count: int | None = None
+    """Only the first images; all by default."""
+    categories: tuple[str, ...] = ("tomato_ripe",)
+    """Which tomatoes count; the thesis's model knows red ones only."""
+    min_visible: int = 100
+    """Tomatoes seen in fewer pixels are left out, in [px]."""
+    min_total: int = 400
+    """Tomatoes whose whole silhouette has fewer pixels are left out, in [px]: those of the rows behind."""
+    figure: str | None = None
+    """Draw every step on this image of the folder (steps.png, as Fig. 4-28) instead of judging."""
+
+    def run(self) -> None:
+        """Runs the models and prints the tables."""
+        check_folder("--data", self.data)
+        check_count("--count", self.count)
+
+        from tqdm import tqdm
+
+        from maniskill_tomato.segmentation.datasets.reading import read_annotated
+        from maniskill_tomato.sensing.visible_fraction.occlusion_report import (
+            draw_occlusion,
+            report_occlusion,
+        )
+
+        if self.figure is not None:
+            path = draw_occlusion(
+                self.data, self.figure, self.out, models=self.models, min_visible=self.min_visible
+            )
+            print(f"figure {path}")
+            return
+        images = read_annotated(self.data).images[: self.count]
+        with tqdm(total=len(images), unit="image", disable=None) as bar:
+            text = report_occlusion(
+                images,
+                self.out,
+                models=self.models,
+                categories=self.categories,
+                min_visible=self.min_visible,
+                min_total=self.min_total,
+                on_image=bar.update,
+            )
+        print(text)
+
+
+@dataclass(frozen=True, kw_only=True)
+class JudgeSegmenter:
+    """Judge a segmenter on annotated images: precision, recall, AP (Eq. 4-1 to 4-3), COCO's AP, curves and pictures."""
+
+    data: str
+    """Folder of annotated images, or FOLDER:SPLIT for one list of it (`photos:val` for its val.txt)."""
+    segmenter: str = "light"
+    """Name of a segmenter (light, colour, mask_rcnn, yolo), or a file of weights."""
+    thorough: bool = False
+    """Let the light segmenter look at each image as often as `maniskill-tomato detect` does."""
+    limit: int | None = None
+    """Look at this many images only, spread over the list."""
+    smallest_share: float | None = None
+    """Rendered fruits narrower than this share of the image's longer side are set aside; by default 12 px of 640; 0:
+    the tiniest alone."""
+    out: Path = Path("runs/segmenter-evaluation")
+    """Folder of metrics.json, precision_recall.png and pictures.jpg."""
+
+    def run(self) -> None:
+        """Evaluates and prints the figures."""
+        check_place("--data", self.data)
+        check_segmenter("--segmenter", self.segmenter, without=("ground_truth",))
+        check_count("--limit", self.limit)
+
+        from maniskill_tomato.files import write_atomically
+        from maniskill_tomato.segmentation.datasets.annotations import SMALLEST_SHARE
+        from maniskill_tomato.segmentation.datasets.reading import read_place
+        from maniskill_tomato.segmentation.metrics.detector_evaluation import evaluate_segmenter
+        from maniskill_tomato.segmentation.segmenter import open_for_files
+
+        segmenter = open_for_files(self.segmenter, 0.02, self.thorough)
+        found = read_place(self.data)
+        if found.skipped:
+            print(f"{self.data}: {found.skipped_text()}", file=sys.stderr)
+        share = SMALLEST_SHARE if self.smallest_share is None else self.smallest_share
+        metrics = evaluate_segmenter(segmenter, found.images, self.out, self.limit, share)
+        described = {"segmenter": self.segmenter, "thorough": self.thorough, "data": self.data, **metrics}
+        write_atomically(self.out / "metrics.json", json.dumps(described, indent=1).encode())
+        for name, value in metrics.items():
+            print(f"{name:24} {value:.4g}")

@@ -1,0 +1,172 @@
+"""`maniskill-tomato train-segmenter`: three kinds of segmenters, trained on annotated images."""
+
+import sys
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Literal
+
+from maniskill_tomato.cli.arguments import Flat
+from maniskill_tomato.cli.early_checks import check_count, check_file, check_place
+from maniskill_tomato.errors import InvalidInputError
+from maniskill_tomato.segmentation.training.detector_presets import MASK_RCNN_PRESETS, YOLO_PRESET
+from maniskill_tomato.segmentation.training.light_config import LightTrainConfig
+
+if TYPE_CHECKING:
+    from maniskill_tomato.segmentation.training.resumable_training import ResumableTraining
+    from maniskill_tomato.segmentation.training.training_run import TrainingImages
+
+
+@dataclass(frozen=True, kw_only=True)
+class ImageOptions:
+    """What a segmenter is trained on."""
+
+    data: tuple[str, ...]
+    """Folders of annotated images (COCO or Pascal VOC), or FOLDER:SPLIT for one list of a folder (`photos:train` for
+    its train.txt)."""
+    shares: tuple[float, ...] = ()
+    """How often each folder is drawn from; by default all alike."""
+    validation: str | None = None
+    """Images whose losses are logged too, in the same form."""
+    limit: int | None = None
+    """Use only this many images of each folder, the first of its list."""
+    out: Path = Path("runs/segmenter")
+    """Folder of the training; one that holds a training of the same settings goes on."""
+
+    def check(self) -> None:
+        """Accepts folders that are there.
+
+        Raises:
+            InvalidInputError: One is missing, or the shares do not fit.
+        """
+        if not self.data:
+            raise InvalidInputError("--data must name one folder or more")
+        for place in self.data:
+            check_place("--data", place)
+        if self.validation is not None:
+            check_place("--validation", self.validation)
+        if self.shares and len(self.shares) != len(self.data):
+            raise InvalidInputError(f"--shares must be one for each folder of --data, got {len(self.shares)}")
+        check_count("--limit", self.limit)
+
+    def read(self) -> "TrainingImages":
+        """The images; what is left out is named on standard error."""
+        from maniskill_tomato.segmentation.training.training_run import TrainingImages
+
+        return TrainingImages.read(
+            self.data, self.shares, self.validation, self.limit, lambda line: print(line, file=sys.stderr)
+        )
+
+
+@dataclass(frozen=True, kw_only=True)
+class TrainLight(ImageOptions):
+    """Train the light segmenter, on a CPU; a training that was stopped goes on."""
+
+    start_from: Path | None = None
+    """Weights to begin with instead of ImageNet's; layers that do not fit begin anew."""
+    config: Annotated[LightTrainConfig, Flat] = field(default_factory=LightTrainConfig)
+    """How to train."""
+
+    def run(self) -> None:
+        """Trains and says where the weights are."""
+        self.check()
+        check_file("--start-from", self.start_from)
+
+        from maniskill_tomato.segmentation.training.light_training import LightTraining
+
+        def prepare() -> "ResumableTraining":
+            images = self.read()
+            return LightTraining(self.config, images.sets, images.shares, images.validation, self.start_from)
+
+        _tell_weights(lambda: _train(prepare(), self.out))
+
+
+@dataclass(frozen=True, kw_only=True)
+class TrainMaskRcnn(ImageOptions):
+    """Train Mask R-CNN with the thesis's settings, or small enough for a CPU; a training that was stopped goes on."""
+
+    preset: Literal["light-lite0", "strategy-1", "strategy-2", "strategy-3"] = "light-lite0"
+    """Settings: `light-lite0` for a CPU, or those of Tables 4-3, 4-4 and section 6-2."""
+    pretrained: bool = False
+    """Start from ImageNet weights of the backbone: of `light-lite0` those of the extra `pretrained`, of the others
+    torchvision's, which are downloaded."""
+    epochs: int | None = None
+    """Epochs, if not those of the preset."""
+    steps_per_epoch: int | None = None
+    """Steps in an epoch, if not those of the preset."""
+    seed: int = 0
+    """Of the weights and the pictures."""
+
+    def run(self) -> None:
+        """Trains and says where the weights are."""
+        self.check()
+        check_count("--epochs", self.epochs)
+        check_count("--steps-per-epoch", self.steps_per_epoch)
+        preset = MASK_RCNN_PRESETS[self.preset]
+        config = replace(
+            preset,
+            epochs=preset.epochs if self.epochs is None else self.epochs,
+            steps_per_epoch=preset.steps_per_epoch if self.steps_per_epoch is None else self.steps_per_epoch,
+        )
+
+        from maniskill_tomato.segmentation.training.mask_rcnn_training import MaskRcnnTraining
+
+        def prepare() -> "ResumableTraining":
+            images = self.read()
+            return MaskRcnnTraining(
+                config, images.sets, images.shares, images.validation, self.pretrained, self.seed
+            )
+
+        _tell_weights(lambda: _train(prepare(), self.out))
+
+
+@dataclass(frozen=True, kw_only=True)
+class TrainYolo(ImageOptions):
+    """Train YOLO through Ultralytics (extra `yolo`, licence AGPL-3.0), from random weights."""
+
+    preset: Literal["thesis", "stock"] = "thesis"
+    """Settings: those of Table 4-1, or Ultralytics' own."""
+    model: str = "yolov8n.yaml"
+    """Network of Ultralytics; the thesis's is yolov3.yaml."""
+    epochs: int | None = None
+    """Epochs, if not those of Table 4-1."""
+    seed: int = 0
+    """Of the weights and the pictures."""
+
+    def run(self) -> None:
+        """Trains and says where the weights are."""
+        self.check()
+        check_count("--epochs", self.epochs)
+
+        from maniskill_tomato.segmentation.training.training_run import run_yolo_training
+        from maniskill_tomato.segmentation.yolo import stock_settings, thesis_settings
+
+        epochs = YOLO_PRESET.epochs if self.epochs is None else self.epochs
+        settings = (
+            stock_settings(epochs)
+            if self.preset == "stock"
+            else thesis_settings(replace(YOLO_PRESET, epochs=epochs))
+        )
+        _tell_weights(lambda: run_yolo_training(self.read(), self.out, settings, self.model, self.seed))
+
+
+def _train(training: "ResumableTraining", out: Path) -> Path | None:
+    from maniskill_tomato.learning.interrupt import stop_on_signals
+    from maniskill_tomato.segmentation.training.training_run import run_training
+
+    with stop_on_signals() as request:
+        return run_training(
+            training, out, lambda line: print(line, flush=True), lambda: request.reason is not None
+        )
+
+
+def _tell_weights(train: Callable[[], Path | None]) -> None:
+    start = time.perf_counter()
+    path = train()
+    took = f"after {time.perf_counter() - start:.0f} s"
+    print(
+        f"weights {path} {took}, {time.process_time():.0f} s of the processor"
+        if path
+        else f"stopped {took}; the same command goes on"
+    )

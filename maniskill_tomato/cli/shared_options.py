@@ -1,0 +1,96 @@
+"""What several commands take, and what they do with it."""
+
+import json
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import tyro
+
+from maniskill_tomato.errors import InvalidInputError, did_you_mean
+from maniskill_tomato.plants.spec import SEED_SPLITS
+from maniskill_tomato.tasks import TASK_IDS
+
+EnvId = Annotated[
+    str, tyro.conf.Positional, tyro.conf.arg(metavar="ENV_ID", help=f"The task: {', '.join(TASK_IDS)}.")
+]
+
+
+@dataclass(frozen=True, kw_only=True)
+class PlantOptions:
+    """Another plant than the task's own."""
+
+    plant: Literal["one_tomato", "three_tomatoes", "full"] | None = None
+    """Preset of the plant."""
+    plant_seed: str | None = None
+    """Its seed, or train, validation or held_out for a new plant of that split in every episode."""
+    plant_pool: int | None = None
+    """With a split, draw only from this number of its plants; plants seen before need not grow again."""
+    plant_pose: tuple[float, float, float] | None = None
+    """Where it stands: x [m], y [m], yaw [rad]."""
+    plant_pose_noise: tuple[float, float, float] | None = None
+    """Half ranges of a uniform addition to that in every episode: x [m], y [m], yaw [rad]."""
+
+    def __post_init__(self) -> None:
+        if (
+            self.plant_seed is not None
+            and not self.plant_seed.isdigit()
+            and self.plant_seed not in SEED_SPLITS
+        ):
+            raise InvalidInputError(
+                f"plant_seed must be a number or one of {', '.join(SEED_SPLITS)}; got {self.plant_seed!r}"
+                f"{did_you_mean(self.plant_seed, SEED_SPLITS)}"
+            )
+        if self.plant_pool is not None and self.plant_pool < 1:
+            raise InvalidInputError(f"plant_pool must be 1 or more, got {self.plant_pool}")
+
+    def env_options(self) -> dict[str, Any]:
+        """The options for `gymnasium.make`."""
+        plant: dict[str, Any] = {}
+        if self.plant is not None:
+            plant["preset"] = self.plant
+        if self.plant_seed is not None:
+            plant["seed"] = int(self.plant_seed) if self.plant_seed.isdigit() else self.plant_seed
+        if self.plant_pool is not None:
+            plant["pool"] = self.plant_pool
+        options: dict[str, Any] = {"plant": plant} if plant else {}
+        if self.plant_pose is not None:
+            options["plant_pose"] = self.plant_pose
+        if self.plant_pose_noise is not None:
+            options["plant_pose_noise"] = self.plant_pose_noise
+        return options
+
+
+def merge_options(base: dict[str, Any], changes: dict[str, Any]) -> dict[str, Any]:
+    """The task options `base` with `changes` put over them, one by one within tables such as `plant`."""
+    merged = dict(base)
+    for name, value in changes.items():
+        old = merged.get(name)
+        if isinstance(old, str) and name == "plant":
+            old = {"preset": old}
+        merged[name] = {**old, **value} if isinstance(old, dict) and isinstance(value, dict) else value
+    return merged
+
+
+def parse_env_options(options: Mapping[str, str]) -> dict[str, Any]:
+    """Options of a task from the command line: each value as JSON where it is some, else as the text itself."""
+    parsed: dict[str, Any] = {}
+    for name, text in options.items():
+        try:
+            parsed[name] = json.loads(text)
+        except json.JSONDecodeError:
+            parsed[name] = text
+    return parsed
+
+
+def tell_policy(train: Callable[[Callable[[str], None]], Path]) -> None:
+    """Trains and says where the policy is and how long it took.
+
+    Args:
+        train: Given whom to tell a line, it returns the policy's file.
+    """
+    start = time.perf_counter()
+    path = train(lambda line: print(line, flush=True))
+    print(f"policy {path} after {time.perf_counter() - start:.0f} s")

@@ -1,0 +1,49 @@
+"""Images with what was found in them drawn over."""
+
+import colorsys
+from collections.abc import Sequence
+
+import cv2
+import numpy as np
+
+from maniskill_tomato.segmentation.instances import Image, Instances
+
+
+def draw_instances(image: Image, found: Instances, least_score: float = 0.0) -> Image:
+    """The image with masks, boxes and scores over it, as in Fig. 4-21 to 4-27 of the thesis.
+
+    Args:
+        image: Red, green, blue. Shape (H, W, 3).
+        found: What to draw.
+        least_score: Leave out what is less certain.
+    """
+    drawn = image.copy()
+    thickness = max(1, round(max(image.shape[:2]) / 500))
+    for index in range(len(found)):
+        if found.scores[index] < least_score:
+            continue
+        colour = tuple(int(255 * c) for c in colorsys.hsv_to_rgb((0.55 + 0.618 * index) % 1.0, 0.75, 1.0))
+        mask = found.masks[index]
+        drawn[mask] = (0.55 * drawn[mask] + 0.45 * np.array(colour)).astype(np.uint8)
+        left, top, right, bottom = (round(float(v)) for v in found.boxes[index])
+        cv2.rectangle(drawn, (left, top), (right - 1, bottom - 1), colour, thickness)
+        label = f"{found.scores[index]:.2f}"
+        place = left, max(top - 3, 9)
+        cv2.putText(drawn, label, place, cv2.FONT_HERSHEY_SIMPLEX, 0.35 * thickness, (0, 0, 0), 2 * thickness)
+        cv2.putText(
+            drawn, label, place, cv2.FONT_HERSHEY_SIMPLEX, 0.35 * thickness, (255, 255, 255), thickness
+        )
+    return drawn
+
+
+def contact_sheet(images: Sequence[Image], columns: int = 4, tile: int = 320) -> Image:
+    """Images side by side, each fitted into a square of `tile` [px]. Shape (rows * tile, columns * tile, 3)."""
+    rows = -(-len(images) // columns)
+    sheet = np.full((rows * tile, columns * tile, 3), 255, np.uint8)
+    for number, image in enumerate(images):
+        factor = tile / max(image.shape[:2])
+        size = max(round(image.shape[1] * factor), 1), max(round(image.shape[0] * factor), 1)
+        small = cv2.resize(image, size, interpolation=cv2.INTER_AREA if factor < 1 else cv2.INTER_LINEAR)
+        top, left = number // columns * tile, number % columns * tile
+        sheet[top : top + size[1], left : left + size[0]] = small
+    return sheet

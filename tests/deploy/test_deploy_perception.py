@@ -1,0 +1,130 @@
+"""The simulator's route from frames to an observation against the robot's, on the same frames."""
+
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+from maniskill_tomato.deploy.interface import Frame, FrameTruth
+from maniskill_tomato.deploy.mock.episode import load_episode
+from maniskill_tomato.deploy.robot_belief import FIRST_RPY, RobotBelief
+from maniskill_tomato.deploy.robot_perception import TRUE_MASKS, ImagePerception
+from maniskill_tomato.raycast.images import FIRST_ORGAN_LABEL, ROBOT_LABEL
+from maniskill_tomato.raycast.scene import RayScene
+from maniskill_tomato.raycast.view_rays import ViewRays
+from maniskill_tomato.robot.d435 import T_flange_camera_color_optical, color_intrinsics
+from maniskill_tomato.robot.description import link_meshes
+from maniskill_tomato.robot.kinematics import link_transforms
+from maniskill_tomato.robot.look_at_move import LookAtMover
+from maniskill_tomato.robot.rotations import matrix_to_rpy
+from maniskill_tomato.segmentation.instances import Instances
+from maniskill_tomato.sensing.camera_perception import CameraPerception
+from maniskill_tomato.sensing.fruit_detector import FruitDetector
+from maniskill_tomato.sensing.observation import ViewpointObserver
+from maniskill_tomato.sensing.posed_frame import PosedFrame
+from maniskill_tomato.sensing.simulated_camera import SimulatedCamera
+
+SEEDS = (4, 9)
+MOVES = ((0.4, 0.3, 0.2), (0.5, -0.2, 0.6), (-0.3, 0.6, 0.3))
+NO_RAYS = ViewRays(torch.zeros(1, 256, 3), torch.zeros(1, 256), torch.zeros(1, 256, dtype=torch.int8))
+
+
+def robot_frame(frame: PosedFrame, number: int) -> Frame:
+    """The same picture from a robot's camera; the truth has the same masks, under labels of a driver's choice."""
+    assert frame.true_fruits is not None and frame.robot_mask is not None
+    labels = np.zeros(frame.depth_m.shape, np.int32)
+    labels[frame.robot_mask] = ROBOT_LABEL
+    ripe = tuple(FIRST_ORGAN_LABEL + k for k in range(len(frame.true_fruits)))
+    for label, mask in zip(ripe, frame.true_fruits.masks, strict=True):
+        labels[mask] = label
+    return Frame(
+        color=np.zeros((*labels.shape, 3), np.uint8),
+        depth=frame.depth_m,
+        intrinsics=frame.intrinsics,
+        stamp=float(number),
+        number=number,
+        truth=FrameTruth(
+            labels=labels,
+            target_label=FIRST_ORGAN_LABEL,
+            target_position=np.full(3, np.nan),
+            visible_fraction=float("nan"),
+            ripe_labels=ripe,
+            rays=NO_RAYS,
+        ),
+    )
+
+
+class FrameSegmenter:
+    """A segmenter that knows every frame by its depth image: the same masks for both sides."""
+
+    def __init__(self) -> None:
+        self.known: list[PosedFrame] = []
+
+    def __call__(self, image: Any, depth_m: Any = None) -> Instances:
+        frame = next(f for f in self.known if f.depth_m is depth_m)
+        assert frame.true_fruits is not None
+        fruits = frame.true_fruits
+        return Instances.from_masks(fruits.masks, np.full(len(fruits), 0.7, np.float32), fruits.categories)
+
+
+@pytest.mark.parametrize("masks", ["true", "segmented"])
+def test_the_same_frames_give_the_same_observation_in_the_simulator_and_on_the_robot(masks: str) -> None:
+    """Two environments at once against a robot before each plant: fruits, V_f, position, rays, observation."""
+    episodes = [load_episode("held_out", seed) for seed in SEEDS]
+    n, mount = len(episodes), torch.tensor(T_flange_camera_color_optical, dtype=torch.float32)
+    scene = RayScene([e.plant for e in episodes], color_intrinsics(320, 240), robot_meshes=link_meshes())
+    width, height = 320, 240
+    camera = SimulatedCamera(scene, picture=lambda k: np.zeros((height, width, 3), np.uint8))
+    segmenter = None if masks == "true" else FrameSegmenter()
+    targets = torch.stack([e.target_position for e in episodes])
+    T_world_plant = torch.stack([e.T_world_plant for e in episodes])
+    fruit = torch.tensor([e.target for e in episodes])
+
+    perception = CameraPerception(n, FruitDetector(segmenter))
+    observer = ViewpointObserver(n, max_moves=20)
+    observer.begin(torch.arange(n), targets)
+    robots = [ImagePerception(TRUE_MASKS, segmenter) for _ in episodes]
+    beliefs = [RobotBelief(T_flange_camera_color_optical, 20) for _ in episodes]
+    for k, episode in enumerate(episodes):
+        camera.seed(k, k)
+        place = episode.target_position.double().numpy()
+        perception.begin(k, place, is_located=True)
+        robots[k].begin(place)
+
+    qpos = torch.tensor(np.array([e.start_joints for e in episodes]), dtype=torch.float32)
+    rpy = torch.tensor([FIRST_RPY] * n)
+    mover, seen = LookAtMover(), 0
+    for step in range(len(MOVES) + 1):
+        links = link_transforms(qpos)
+        T_world_camera = links[:, -1] @ mount
+        frames = camera.take(T_world_camera, fruit, T_world_plant, links)
+        if segmenter is not None:
+            segmenter.known = [frame for frame in frames if frame is not None]
+        perception.look(frames)
+        rpy = matrix_to_rpy(links[:, -1, :3, :3], rpy)
+        viewpoint = torch.cat([links[:, -1, :3, 3], rpy], dim=-1)
+        left = torch.full((n,), 20 - step)
+        rays, fractions = perception.rays(), perception.visible_fraction
+        observation = observer.observe(viewpoint, T_world_camera, rays, fractions, left)
+        for k, frame in enumerate(frames):
+            assert frame is not None
+            joints = qpos[k].double().numpy()
+            pose = beliefs[k].camera_pose(joints)
+            sighting = robots[k].look(robot_frame(frame, step), pose)
+            assert sighting is not None
+            mine = perception.views(k)[-1]
+            assert sighting.fruits_seen == len(mine.fruits)
+            np.testing.assert_array_equal(sighting.mask, mine.mask(perception.target_fruit(k)))
+            assert sighting.visible_fraction == pytest.approx(float(fractions[k]), abs=1e-6)
+            np.testing.assert_allclose(sighting.target_position, perception.position_w(k), atol=1e-6)
+            torch.testing.assert_close(sighting.rays.label[0], rays.label[k])
+            torch.testing.assert_close(sighting.rays.distance[0], rays.distance[k], rtol=0.0, atol=1e-6)
+            told = beliefs[k].observe(joints, sighting, 20 - step)
+            torch.testing.assert_close(told.observation[0], observation[k], rtol=0.0, atol=1e-6)
+            seen += sighting.target_seen
+        if step < len(MOVES):
+            position = T_world_camera[:, :3, 3].double()
+            solved = mover.move(qpos, position, targets.double(), torch.tensor([MOVES[step]] * n))
+            qpos = solved.qpos.float()
+    assert seen >= n * len(MOVES) / 2, "the target must be seen in most of the views"

@@ -1,0 +1,196 @@
+"""Ways round an obstacle: found where there is one, and free of contacts by a calculation of their own."""
+
+from typing import Any
+
+import mujoco
+import numpy as np
+import pytest
+import torch
+
+from maniskill_tomato.deploy.clock import SimulatedClock
+from maniskill_tomato.deploy.detour import MAX_MOVES, DetourPlanner
+from maniskill_tomato.deploy.guarded_arm import GuardedArm
+from maniskill_tomato.deploy.interface import ArmState, Float64, JointMove
+from maniskill_tomato.deploy.move_choice import MoveChooser, MoveRequest
+from maniskill_tomato.deploy.safety import Safety
+from maniskill_tomato.deploy.safety_config import Box, SafetyConfig
+from maniskill_tomato.robot.d435 import T_flange_camera_color_optical
+from maniskill_tomato.robot.description import link_meshes, urdf_path
+from maniskill_tomato.robot.iiwa14 import LINK_NAMES, READY_QPOS
+from maniskill_tomato.robot.kinematics import forward_kinematics, link_transforms
+
+mj: Any = mujoco
+
+NOTHING = np.zeros((0, 3))
+
+
+def standing(joints: Float64) -> ArmState:
+    return ArmState(joint_positions=joints, joint_velocities=np.zeros(7), stamp=0.0)
+
+
+def camera(joints: Float64) -> Float64:
+    """The optical frame. Shape (4, 4)."""
+    pose: Float64 = forward_kinematics(torch.as_tensor(joints)).numpy() @ T_flange_camera_color_optical
+    return pose
+
+
+def leaf(rng: np.random.Generator, centre: Float64) -> Float64:
+    """Points of a blade of 12 x 8 cm at any angle, in [m]. Shape (N, 3)."""
+    u, v = np.meshgrid(np.arange(-0.06, 0.06, 0.015), np.arange(-0.04, 0.04, 0.015))
+    flat = np.stack([u.ravel(), v.ravel(), np.zeros(u.size)], axis=-1)
+    points: Float64 = flat @ np.linalg.qr(rng.normal(size=(3, 3)))[0].T + centre
+    return points
+
+
+def refused_moves(safety: Safety, count: int) -> list[tuple[Float64, Float64, Float64]]:
+    """Starts, goals and leaves between them of moves that are refused for the leaf, both ends clear of it."""
+    found: list[tuple[Float64, Float64, Float64]] = []
+    rng = np.random.default_rng(3)
+    while len(found) < count:
+        start, goal = (READY_QPOS + 0.12 * rng.normal(size=7) for _ in range(2))
+        middle = camera((start + goal) / 2)
+        points = leaf(rng, middle[:3, 3] + 0.03 * middle[:3, 2] + 0.06 * rng.normal(size=3))
+        if any(safety.stands_in_collision(joints, points) for joints in (start, goal)):
+            continue
+        move = JointMove(joint_positions=goal, speed_fraction=0.1)
+        refusal = safety.check(move, standing(start), 0.0, 0.0, points)
+        if refusal is not None and refusal.reason == "plant":
+            found.append((start, goal, points))
+    return found
+
+
+def depths_in_links(start: Float64, way: list[JointMove], points: Float64) -> Float64:
+    """How deep each point gets into the hull of a link from the forearm on, along the whole way, in [m]."""
+    deepest = np.full(len(points), -np.inf)
+    hulls = {name: link_meshes()[name][0] for name in LINK_NAMES[5:]}
+    trimesh = pytest.importorskip("trimesh")
+    solids = {name: trimesh.convex.convex_hull(vertices) for name, vertices in hulls.items()}
+    at = start
+    for move in way:
+        for share in np.linspace(0.0, 1.0, 12):
+            joints = at + share * (move.joint_positions - at)
+            links = link_transforms(torch.as_tensor(joints)[None])[0].numpy()
+            for name, solid in solids.items():
+                T = np.linalg.inv(links[LINK_NAMES.index(name)])
+                local = points @ T[:3, :3].T + T[:3, 3]
+                planes = solid.face_normals
+                offsets = (planes * solid.triangles[:, 0]).sum(-1)
+                inside = (offsets[:, None] - planes @ local.T).min(axis=0)
+                deepest = np.maximum(deepest, inside)
+        at = move.joint_positions
+    return deepest
+
+
+def test_most_moves_that_a_leaf_stops_get_a_way_round_it_that_touches_nothing() -> None:
+    safety = Safety()
+    planner = DetourPlanner(safety, T_flange_camera_color_optical)
+    found = 0
+    for start, goal, points in refused_moves(safety, 5):
+        way = planner.plan(standing(start), goal, 0.0, 0.0, points)
+        if way is None:
+            continue
+        found += 1
+        assert 2 <= len(way) <= MAX_MOVES
+        np.testing.assert_allclose(way[-1].joint_positions, goal)
+        assert int((depths_in_links(start, way, points) > 0.0).sum()) < safety.config.plant_points_needed
+    assert found >= 3
+
+
+def test_a_way_round_a_post_keeps_its_distance_all_along_by_mujoco() -> None:
+    start, goal = (np.array([turn, 0.2, 0.0, -1.4, 0.0, 0.9, 0.0]) for turn in (-0.5, 0.5))
+    x, _, z = camera((start + goal) / 2)[:3, 3]
+    post = Box(low=(x, -0.02, z - 0.1), high=(x + 0.03, 0.02, z + 0.1))
+    safety = Safety(SafetyConfig(obstacles=(post,), max_flange_step=1.0))
+    straight = JointMove(joint_positions=goal, speed_fraction=0.1)
+    refusal = safety.check(straight, standing(start), 0.0, 0.0, None)
+    assert refusal is not None and refusal.reason == "obstacle"
+    way = DetourPlanner(safety, T_flange_camera_color_optical).plan(standing(start), goal, 0.0, 0.0, NOTHING)
+    assert way is not None and len(way) >= 2
+
+    spec = mj.MjSpec.from_file(urdf_path())
+    half, middle = (np.array(post.high) - post.low) / 2, (np.array(post.high) + post.low) / 2
+    spec.worldbody.add_geom(name="post", type=mj.mjtGeom.mjGEOM_BOX, size=half.tolist(), pos=middle.tolist())
+    model = spec.compile()
+    data = mj.MjData(model)
+    links = [g for g in range(model.ngeom) if model.geom_bodyid[g] > 0]
+    at, nearest = start, np.inf
+    for move in way:
+        for share in np.linspace(0.0, 1.0, 60):
+            data.qpos[:] = at + share * (move.joint_positions - at)
+            mj.mj_forward(model, data)
+            nearest = min(
+                nearest,
+                *(mj.mj_geomDistance(model, data, g, model.geom("post").id, 1.0, None) for g in links),
+            )
+        at = move.joint_positions
+    # Between the joint positions that the checks look at, 0.02 rad apart, a link may come a little nearer.
+    assert nearest > safety.config.obstacle_clearance - 0.003
+
+
+def test_there_is_no_way_to_a_goal_inside_a_leaf() -> None:
+    safety = Safety()
+    goal = READY_QPOS + np.array([0.1, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0])
+    points = leaf(np.random.default_rng(0), camera(goal)[:3, 3])
+    planner = DetourPlanner(safety, T_flange_camera_color_optical)
+    assert planner.plan(standing(READY_QPOS.copy()), goal, 0.0, 0.0, points) is None
+
+
+class Instant:
+    """An arm that is where it is sent at once."""
+
+    simulated, can_stop = True, True
+
+    def __init__(self, joints: Float64, clock: SimulatedClock) -> None:
+        self.joints, self.clock = joints, clock
+
+    def read(self, max_age_s: float = 0.5) -> ArmState:
+        return ArmState(joint_positions=self.joints, joint_velocities=np.zeros(7), stamp=self.clock.now())
+
+    def command(self, move: JointMove) -> JointMove:
+        self.clock.sleep(10.0)
+        self.joints = move.joint_positions
+        return move
+
+    def wait(self, timeout_s: float) -> bool:
+        return True
+
+    def stop(self) -> bool:
+        return True
+
+
+def test_a_chosen_way_passes_the_guard_move_by_move_and_ends_at_the_tasks_own_posture(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    safety = Safety(SafetyConfig(max_frame_age=1000.0))
+    start, goal, points = refused_moves(safety, 1)[0]
+    chooser = MoveChooser(safety, T_flange_camera_color_optical)
+    monkeypatch.setattr("maniskill_tomato.deploy.move_choice.OTHERS_TRIED", 0)
+    request = MoveRequest(
+        joint_positions=start,
+        camera_position=camera(start)[:3, 3],
+        target_position=np.array([0.8, 0.0, 0.9]),
+        action=(0.0, 0.0, 0.0),
+    )
+    chosen = chooser.choose(request, goal, standing(start), 0.0, 0.0, points)
+    assert chosen.refusal is None and chosen.move is not None and chosen.then
+    clock = SimulatedClock(0.0)
+    arm: Any = Instant(start, clock)
+    guarded = GuardedArm(arm, safety, clock)
+    for move in (chosen.move, *chosen.then):
+        guarded.command(move, 0.0, points)
+        assert guarded.wait(0.0)
+    np.testing.assert_allclose(arm.joints, goal)
+
+
+def test_a_move_that_nothing_stops_is_made_at_once() -> None:
+    chooser = MoveChooser(Safety(), T_flange_camera_color_optical)
+    goal = READY_QPOS + np.array([0.1, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0])
+    request = MoveRequest(
+        joint_positions=READY_QPOS.copy(),
+        camera_position=camera(READY_QPOS)[:3, 3],
+        target_position=np.array([0.8, 0.0, 0.9]),
+        action=(0.0, 0.0, 0.0),
+    )
+    chosen = chooser.choose(request, goal, standing(READY_QPOS.copy()), 0.0, 0.0, NOTHING)
+    assert chosen.move is not None and chosen.then == () and chosen.refusal is None
+    np.testing.assert_allclose(chosen.move.joint_positions, goal)
