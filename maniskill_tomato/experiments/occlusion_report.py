@@ -6,24 +6,13 @@ from dataclasses import asdict
 from pathlib import Path
 
 from maniskill_tomato.errors import InvalidInputError
+from maniskill_tomato.experiments.occlusion_figure import draw_steps
+from maniskill_tomato.experiments.occlusion_scores import annotated_fruits, judge, make_view, markdown
 from maniskill_tomato.files import write_atomically
 from maniskill_tomato.segmentation.datasets.annotations import AnnotatedImage
 from maniskill_tomato.segmentation.datasets.reading import read_annotated
-from maniskill_tomato.sensing.visible_fraction.amodal import AmodalModel
-from maniskill_tomato.sensing.visible_fraction.estimate import OcclusionModel
-from maniskill_tomato.sensing.visible_fraction.figure import draw_steps
-from maniskill_tomato.sensing.visible_fraction.improved import ImprovedModel
-from maniskill_tomato.sensing.visible_fraction.judge import annotated_fruits, judge, make_view, markdown
-from maniskill_tomato.sensing.visible_fraction.sphere import SphereModel
+from maniskill_tomato.sensing.visible_fraction.occlusion_models import make_occlusion_model
 from maniskill_tomato.sensing.visible_fraction.thesis import ThesisModel
-
-MODELS: dict[str, Callable[[], OcclusionModel]] = {
-    "thesis": ThesisModel,
-    "improved": ImprovedModel,
-    "sphere": SphereModel,
-    "amodal": AmodalModel,
-}
-"""The models by name."""
 
 
 def report_occlusion(
@@ -41,7 +30,7 @@ def report_occlusion(
     Args:
         images: With depth, cameras and V_f.
         out: Folder of the files.
-        models: Names of `MODELS`.
+        models: Names of `OCCLUSION_MODELS`.
         categories: Which tomatoes count.
         min_visible: Tomatoes seen in fewer pixels are left out.
         min_total: Tomatoes whose whole silhouette has fewer pixels, too.
@@ -52,7 +41,7 @@ def report_occlusion(
     """
     judged, milliseconds = judge(
         tuple(images),
-        {name: MODELS[name]() for name in models},
+        {name: make_occlusion_model(name) for name in models},
         min_visible=min_visible,
         min_total=min_total,
         on_image=on_image,
@@ -74,7 +63,7 @@ def draw_occlusion(data: Path, file_name: str, out: Path, *, models: Sequence[st
         data: A folder of rendered images.
         file_name: The image's name in it.
         out: Folder of the picture.
-        models: Names of `MODELS`.
+        models: Names of `OCCLUSION_MODELS`.
         min_visible: Tomatoes seen in fewer pixels are left out.
 
     Returns:
@@ -96,7 +85,7 @@ def draw_occlusion(data: Path, file_name: str, out: Path, *, models: Sequence[st
         raise InvalidInputError(
             f"{file_name} has no depth or camera; take a folder of `maniskill-tomato dataset`"
         )
-    others = {name: list(MODELS[name]()(view)) for name in models if name != "thesis"}
+    others = {name: list(make_occlusion_model(name)(view)) for name in models if name != "thesis"}
     path = out / "steps.png"
     draw_steps(view, ThesisModel().run(view), path, others)
     return path

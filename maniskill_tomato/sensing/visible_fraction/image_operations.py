@@ -1,4 +1,4 @@
-"""The steps of the thesis's occlusion model (4-2-4), each a function of images.
+"""Operations on images of which the thesis's occlusion model (4-2-4) consists.
 
 Binary images are uint8, 0 or 255, as OpenCV takes them; shapes are (height, width) unless said otherwise.
 """

@@ -8,7 +8,7 @@ import numpy as np
 
 from maniskill_tomato.robot.d435 import CameraIntrinsics
 from maniskill_tomato.segmentation.datasets.annotations import AnnotatedImage, Instance
-from maniskill_tomato.sensing.visible_fraction.estimate import OcclusionModel, TomatoView
+from maniskill_tomato.sensing.visible_fraction.estimate import OcclusionModel, SegmentedImage
 
 BANDS = ((0.0, 0.2), (0.2, 0.4), (0.4, 0.6), (0.6, 0.8), (0.8, 0.95), (0.95, 1.001))
 """Levels of the true visible fraction."""
@@ -48,7 +48,7 @@ def annotated_fruits(image: AnnotatedImage) -> list[Instance]:
     return [i for i in image.fruits if i.visible_mask is not None and i.visible_fraction is not None]
 
 
-def make_view(image: AnnotatedImage, fruits: list[Instance]) -> TomatoView | None:
+def make_view(image: AnnotatedImage, fruits: list[Instance]) -> SegmentedImage | None:
     """What a robot with a perfect segmenter has of an image; None without depth or camera."""
     depth = image.load_depth()
     if depth is None or image.camera is None:
@@ -58,7 +58,7 @@ def make_view(image: AnnotatedImage, fruits: list[Instance]) -> TomatoView | Non
         width=image.width, height=image.height, fx=k[0, 0], fy=k[1, 1], cx=k[0, 2], cy=k[1, 2]
     )
     masks = tuple(i.visible_mask.decode() for i in fruits if i.visible_mask is not None)
-    return TomatoView(rgb=image.load(), depth_m=depth, masks=masks, intrinsics=intrinsics)
+    return SegmentedImage(rgb=image.load(), depth_m=depth, masks=masks, intrinsics=intrinsics)
 
 
 def judge(

@@ -9,11 +9,13 @@ import numpy as np
 from matplotlib.axes import Axes
 
 from maniskill_tomato.files import write_atomically
-from maniskill_tomato.sensing.visible_fraction.estimate import Estimate, TomatoView, UInt8
+from maniskill_tomato.sensing.visible_fraction.estimate import Estimate, SegmentedImage, UInt8
 from maniskill_tomato.sensing.visible_fraction.thesis import ThesisSteps
 
 
-def draw_steps(view: TomatoView, result: ThesisSteps, path: Path, extra: dict[str, list[Estimate]]) -> None:
+def draw_steps(
+    view: SegmentedImage, result: ThesisSteps, path: Path, extra: dict[str, list[Estimate]]
+) -> None:
     """Draws (a) to (h) and, below, what other models make of the same image.
 
     Args:
