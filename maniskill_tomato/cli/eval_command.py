@@ -7,7 +7,7 @@ from typing import Annotated, Any, Literal
 from maniskill_tomato.cli.arguments import Flat
 from maniskill_tomato.cli.early_checks import check_count, check_env_id, check_policy
 from maniskill_tomato.cli.shared_options import EnvId, PlantOptions
-from maniskill_tomato.policies.opening import open_policy, shipped_policy
+from maniskill_tomato.policies.opening import shipped_policy
 
 EpisodeList = Literal["validation", "held_out"]
 
