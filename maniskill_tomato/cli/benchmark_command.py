@@ -3,6 +3,7 @@
 from collections import Counter
 from dataclasses import dataclass
 
+from maniskill_tomato.cli.early_checks import check_count, check_policies
 from maniskill_tomato.experiments.configs import BenchmarkConfig
 
 
@@ -12,7 +13,9 @@ class Benchmark(BenchmarkConfig):
 
     def run(self) -> None:
         """Runs what is missing and says where the results are."""
-        # PyTorch and ManiSkill take seconds to import.
+        check_policies("--policies", self.policies)
+        check_count("--jobs", self.jobs)
+
         from maniskill_tomato.experiments.viewpoint_benchmark import run_benchmark
 
         result = run_benchmark(self)

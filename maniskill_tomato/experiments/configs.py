@@ -62,7 +62,7 @@ class BenchmarkConfig:
     episodes: int = 500
     """How many episodes of the list."""
     episode_list: str = "held_out"
-    """Which fixed list: held_out to report, validation to choose, or a file of `scripts/certify_episodes.py`."""
+    """Which fixed list: held_out to report, validation to choose, or a file of `tools/certify_episodes.py`."""
     seed: int = 0
     """The first of them."""
     out: Path = Path("runs/benchmark")

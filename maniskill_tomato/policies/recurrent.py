@@ -111,4 +111,6 @@ def load_recurrent(path: Path, device: str | torch.device = "cpu") -> RecurrentP
         actor = RecurrentActor(**data["sizes"])
         return RecurrentPolicy(actor, tuple(data["parts"]), dict(data["facts"])), actor
 
-    return load_network(path, FORMAT, device, build, "recurrent policy; scripts/train_imitation.py makes one")
+    return load_network(
+        path, FORMAT, device, build, "recurrent policy; `maniskill-tomato train-imitation` makes one"
+    )

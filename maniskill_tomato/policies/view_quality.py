@@ -105,7 +105,7 @@ def load_view_quality(path: Path, device: str | torch.device = "cpu") -> ViewQua
         return ViewQuality(network, ViewQualityConfig(**data["config"]), dict(data["facts"])), network
 
     return load_network(
-        path, FORMAT, device, build, "view-quality policy; scripts/train_view_quality.py makes one"
+        path, FORMAT, device, build, "view-quality policy; `maniskill-tomato train-view-quality` makes one"
     )
 
 

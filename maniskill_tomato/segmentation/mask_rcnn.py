@@ -195,7 +195,7 @@ def open_mask_rcnn(
     """
     if weights is None:
         raise CheckpointError(
-            "no Mask R-CNN weights ship; train some with `python scripts/train_segmenter.py mask-rcnn` and give "
+            "no Mask R-CNN weights ship; train some with `maniskill-tomato train-segmenter mask-rcnn` and give "
             "their file as the segmenter"
         )
     data = load_weights(Path(weights), "mask_rcnn")

@@ -93,7 +93,7 @@ def open_yolo(weights: Path | str | None = None, score_threshold: float | None =
         raise InvalidInputError(f"score_threshold must be between 0 and 1, got {threshold}")
     if weights is None or not Path(weights).is_file():
         raise CheckpointError(
-            f"no YOLO weights at {weights}; train some with `python scripts/train_segmenter.py yolo` and give their "
+            f"no YOLO weights at {weights}; train some with `maniskill-tomato train-segmenter yolo` and give their "
             "file, whose name begins with yolo, as the segmenter"
         )
     return YoloSegmenter(import_ultralytics().YOLO(str(weights)), threshold)

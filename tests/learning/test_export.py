@@ -593,9 +593,9 @@ def test_the_command_answers_bad_files_in_words(tmp_path: Path, capsys: pytest.C
     (tmp_path / "bad.pt").write_text("hello")
     (tmp_path / "bad.onnx").write_text("hello")
     for arguments, message in (
-        (("export", "--policy", str(tmp_path / "no.pt")), "no checkpoint at"),
+        (("export", "--policy", str(tmp_path / "no.pt")), "--policy: there is no file"),
         (("export", "--policy", str(tmp_path / "bad.pt")), "not a readable checkpoint"),
-        (("eval", GUIDED, "--policy", str(tmp_path / "no.onnx")), "no policy at"),
+        (("eval", GUIDED, "--policy", str(tmp_path / "no.onnx")), "--policy: no policy at"),
         (("eval", GUIDED, "--policy", str(tmp_path / "bad.onnx")), "cannot read the description"),
     ):
         with pytest.raises(SystemExit) as ended:

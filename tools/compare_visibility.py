@@ -1,7 +1,7 @@
 """Compares the ray-cast visible fraction with rendered segmentation images; draws a plot and prints JSON.
 
 Example:
-    python scripts/compare_visibility.py --plot docs/images/visibility_comparison.png
+    python tools/compare_visibility.py --plot docs/images/visibility_comparison.png
 """
 
 import json

@@ -2,8 +2,8 @@
 
 Needs Vulkan (lavapipe on a CPU will do). Examples:
 
-    python scripts/gallery.py
-    python scripts/gallery.py --view close --preset full --seed 3 --out close.jpg
+    python tools/gallery.py
+    python tools/gallery.py --view close --preset full --seed 3 --out close.jpg
 """
 
 import logging

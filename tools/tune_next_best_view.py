@@ -1,7 +1,7 @@
 """Settings of the next-best-view planners compared on validation plants.
 
 Usage:
-    python scripts/tune_next_best_view.py --episodes 120 --first-seed 50000
+    python tools/tune_next_best_view.py --episodes 120 --first-seed 50000
 """
 
 import itertools

@@ -4,9 +4,9 @@ A list that is shorter than --count is made longer first, with episodes as the t
 episodes that were not asked about are; the list is written after every block, so that a run that was stopped goes on.
 
 Usage:
-    python scripts/certify_episodes.py --list held_out --count 1000 --jobs 2
-    python scripts/certify_episodes.py --list validation --count 200
-    python scripts/certify_episodes.py --list held_out --count 200 --fresh-seed 5000000 --out runs/fresh.json
+    python tools/certify_episodes.py --list held_out --count 1000 --jobs 2
+    python tools/certify_episodes.py --list validation --count 200
+    python tools/certify_episodes.py --list held_out --count 200 --fresh-seed 5000000 --out runs/fresh.json
 """
 
 import functools

@@ -1,7 +1,7 @@
 """Renders the README's picture: the arm from outside, its camera's first view and the last one of an episode.
 
 Usage:
-    python scripts/episode_picture.py --out docs/images/episode.png
+    python tools/episode_picture.py --out docs/images/episode.png
 """
 
 import sys

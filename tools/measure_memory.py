@@ -5,7 +5,7 @@ reachable views chosen at random. After one, three and six views the prediction 
 view lattice is compared with its visible fraction. Prints JSON; `--plot` draws an episode (needs a Vulkan device).
 
 Example:
-    python scripts/measure_memory.py --plants 80 --plot docs/images/observation.png
+    python tools/measure_memory.py --plants 80 --plot docs/images/observation.png
 """
 
 import json
