@@ -42,11 +42,11 @@ class JudgeOcclusion:
 
         from tqdm import tqdm
 
-        from maniskill_tomato.segmentation.datasets.reading import read_annotated
-        from maniskill_tomato.sensing.visible_fraction.occlusion_report import (
+        from maniskill_tomato.experiments.occlusion_report import (
             draw_occlusion,
             report_occlusion,
         )
+        from maniskill_tomato.segmentation.datasets.reading import read_annotated
 
         if self.figure is not None:
             path = draw_occlusion(

@@ -12,9 +12,11 @@ from maniskill_tomato.segmentation.segmenter import Segmenter
 from maniskill_tomato.sensing.measurement import DetectedFruit, Measurement, Position
 from maniskill_tomato.sensing.posed_frame import PosedFrame
 from maniskill_tomato.sensing.visible_fraction.estimate import (
+    RADIUS_SPREAD,
+    USUAL_RADIUS,
     Estimate,
     OcclusionModel,
-    TomatoView,
+    SegmentedImage,
     fruit_depth,
 )
 from maniskill_tomato.sensing.visible_fraction.sphere import SphereConfig, SphereModel
@@ -24,12 +26,6 @@ FEWEST_PIXELS: Final = 12
 
 LEAST_SCORE: Final = 0.3
 """A fruit with a lower score is left out. Low, because fruits that are mostly hidden get low scores."""
-
-USUAL_RADIUS: Final = 0.029
-"""Median radius of the tasks' tomatoes, in [m]."""
-
-RADIUS_SPREAD: Final = 0.14
-"""Standard deviation of the logarithm of their radius."""
 
 SURFACE_SHARE: Final = 0.7
 """The centre of a fruit lies this share of a radius behind the median depth of its visible surface."""
@@ -62,7 +58,7 @@ class FruitDetector:
         masks = tuple(np.ascontiguousarray(mask) for mask in found.masks)
         depth = frame.depth_m.astype(np.float64)
         rgb = np.zeros((*depth.shape, 3), np.uint8) if frame.rgb is None else frame.rgb
-        view = TomatoView(rgb=rgb, depth_m=depth, masks=masks, intrinsics=frame.intrinsics)
+        view = SegmentedImage(rgb=rgb, depth_m=depth, masks=masks, intrinsics=frame.intrinsics)
         fruits = tuple(
             _fruit(frame, view, mask, estimate, category, float(score))
             for mask, estimate, category, score in zip(
@@ -83,7 +79,7 @@ class FruitDetector:
 
 def _fruit(
     frame: PosedFrame,
-    view: TomatoView,
+    view: SegmentedImage,
     mask: BinaryMask,
     estimate: Estimate,
     category: str,
@@ -109,7 +105,7 @@ def _fruit(
 
 
 def _centre(
-    estimate: Estimate, view: TomatoView, mask: BinaryMask, ray: NDArray[np.float64]
+    estimate: Estimate, view: SegmentedImage, mask: BinaryMask, ray: NDArray[np.float64]
 ) -> Position | None:
     """Centre in the optical frame, in [m]: the model's, or one behind the middle of the mask. Shape (3,)."""
     if estimate.centre_optical is not None:

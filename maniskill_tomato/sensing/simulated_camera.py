@@ -17,9 +17,8 @@ from maniskill_tomato.sensing.camera_perception import CameraPerception
 from maniskill_tomato.sensing.fruit_detector import FruitDetector
 from maniskill_tomato.sensing.measurement import Position
 from maniskill_tomato.sensing.posed_frame import PosedFrame
-from maniskill_tomato.sensing.visible_fraction.estimate import OcclusionModel, UInt8
-from maniskill_tomato.sensing.visible_fraction.improved import ImprovedModel
-from maniskill_tomato.sensing.visible_fraction.thesis import ThesisModel
+from maniskill_tomato.sensing.visible_fraction.estimate import UInt8
+from maniskill_tomato.sensing.visible_fraction.occlusion_models import make_occlusion_model
 
 Perception = Literal["ground_truth", "occlusion_model", "thesis_model", "improved_model", "segmenter"]
 """What reward, observation and the target's position come from.
@@ -130,11 +129,10 @@ def make_camera(
     if perception == "ground_truth":
         return None
     segmenter = make_segmenter("light") if perception == "segmenter" else None
-    models: dict[Perception, OcclusionModel] = {
-        "thesis_model": ThesisModel(),
-        "improved_model": ImprovedModel(),
-    }
-    detector = FruitDetector(segmenter, models.get(perception))
+    model = None
+    if perception in ("thesis_model", "improved_model"):
+        model = make_occlusion_model(perception.removesuffix("_model"))
+    detector = FruitDetector(segmenter, model)
     if perception in RENDERED:
         camera = SimulatedCamera(scene, intrinsics=intrinsics, picture=picture)
     else:

@@ -10,11 +10,11 @@ from maniskill_tomato.errors import InvalidInputError
 from maniskill_tomato.robot.d435 import color_intrinsics
 from maniskill_tomato.segmentation.instances import Image, Instances
 from maniskill_tomato.segmentation.masks import BinaryMask
-from maniskill_tomato.sensing.visible_fraction import steps
+from maniskill_tomato.sensing.visible_fraction import image_operations as operations
 from maniskill_tomato.sensing.visible_fraction.amodal import AmodalModel
-from maniskill_tomato.sensing.visible_fraction.estimate import TomatoView, filled_depth, fruit_depth
+from maniskill_tomato.sensing.visible_fraction.estimate import SegmentedImage, filled_depth, fruit_depth
 from maniskill_tomato.sensing.visible_fraction.improved import ImprovedConfig, ImprovedModel
-from maniskill_tomato.sensing.visible_fraction.judge import Judged, by_band, markdown, score
+from maniskill_tomato.sensing.visible_fraction.occlusion_models import make_occlusion_model
 from maniskill_tomato.sensing.visible_fraction.sphere import SphereConfig, SphereModel
 from maniskill_tomato.sensing.visible_fraction.thesis import ThesisConfig, ThesisModel
 
@@ -29,7 +29,7 @@ def draw(
     centre: tuple[float, float] = (0.0, 0.0),
     depth: float = 0.4,
     noise: float = 0.0,
-) -> tuple[TomatoView, float]:
+) -> tuple[SegmentedImage, float]:
     """A red sphere, and a green leaf before the part of it right of `leaf_from` (in radii, -1 hides all, 1 nothing).
 
     Returns:
@@ -59,7 +59,7 @@ def draw(
     mask = sphere & ~leaf
     rng = np.random.default_rng(1)
     depth_m = depth_m + noise * depth_m**2 * rng.standard_normal(depth_m.shape)
-    view = TomatoView(rgb=rgb, depth_m=depth_m, masks=(mask,), intrinsics=INTRINSICS)
+    view = SegmentedImage(rgb=rgb, depth_m=depth_m, masks=(mask,), intrinsics=INTRINSICS)
     # T counts the part outside the image too: the same test on a canvas three images wide.
     wide = (np.arange(-WIDTH, 2 * WIDTH) + 0.5 - INTRINSICS.cx) / INTRINSICS.fx
     wide = np.broadcast_to(wide, (HEIGHT, 3 * WIDTH))
@@ -94,7 +94,7 @@ def test_a_nearer_leaf_hides_and_a_deeper_one_does_not() -> None:
     # The same leaf behind the tomato is background: the tomato is then wholly visible as the half that it shows.
     behind = view.depth_m.copy()
     behind[(behind < 0.36) & (behind > 0)] = 0.6
-    deep = TomatoView(rgb=view.rgb, depth_m=behind, masks=view.masks, intrinsics=INTRINSICS)
+    deep = SegmentedImage(rgb=view.rgb, depth_m=behind, masks=view.masks, intrinsics=INTRINSICS)
     for model in (ImprovedModel(), SphereModel()):
         assert model(view)[0].visible_fraction < truth + 0.2
         assert model(deep)[0].visible_fraction > 0.9
@@ -107,7 +107,7 @@ def test_the_thesis_model_bridges_a_leaf_across_a_tomato() -> None:
     strip[:, 156:166] = True
     rgb[strip], depth[strip] = (60, 130, 50), 0.3
     truth = (mask & ~strip).sum() / mask.sum()
-    crossed = TomatoView(rgb=rgb, depth_m=depth, masks=(mask & ~strip,), intrinsics=INTRINSICS)
+    crossed = SegmentedImage(rgb=rgb, depth_m=depth, masks=(mask & ~strip,), intrinsics=INTRINSICS)
     (estimate,) = ThesisModel()(crossed)
     # At the image's edge perspective stretches a sphere's silhouette by an eighth, which a circle does not know.
     assert estimate.visible_fraction == pytest.approx(truth, abs=0.1)
@@ -128,7 +128,7 @@ def test_the_learned_whole_box_completes_a_tomato_that_the_segmenter_found() -> 
         )
 
     intrinsics = replace(color_intrinsics(), width=100, height=100)
-    view = TomatoView(
+    view = SegmentedImage(
         rgb=np.zeros((100, 100, 3), np.uint8),
         depth_m=np.ones((100, 100)),
         masks=(seen, other),
@@ -154,22 +154,22 @@ def test_the_thesis_steps_are_what_they_say() -> None:
     rgb[0, 0] = (10, 200, 0)
     rgb[1, 1] = (200, 10, 0)
     rgb[2, 2] = (95, 100, 0)
-    leaves = steps.leaf_image(rgb, 10)
+    leaves = operations.leaf_image(rgb, 10)
     assert leaves[0, 0] == 255 and np.count_nonzero(leaves) == 1
-    assert np.flatnonzero(steps.red_image(rgb)).tolist() == [5]
+    assert np.flatnonzero(operations.red_image(rgb)).tolist() == [5]
     binary = np.full((1, 3), 255, np.uint8)
-    kept = steps.remove_deeper(binary, np.array([[0.3, 0.0, 0.9]]), 0.5)
+    kept = operations.remove_deeper(binary, np.array([[0.3, 0.0, 0.9]]), 0.5)
     assert kept.tolist() == [[255, 255, 0]]
 
 
 def test_an_ellipse_is_found_again() -> None:
-    image = steps.fill_ellipse(((80.0, 60.0), (60.0, 40.0), 30.0), (120, 160))
-    (outline,) = steps.outlines(image, 10)
-    found = steps.fit_ellipse(outline)
+    image = operations.fill_ellipse(((80.0, 60.0), (60.0, 40.0), 30.0), (120, 160))
+    (outline,) = operations.outlines(image, 10)
+    found = operations.fit_ellipse(outline)
     assert found is not None
     (x, y), (a, b), _ = found
     assert (x, y) == pytest.approx((80, 60), abs=1) and sorted((a, b)) == pytest.approx([40, 60], abs=2)
-    assert steps.fit_ellipse(outline[:4]) is None
+    assert operations.fit_ellipse(outline[:4]) is None
 
 
 def test_touching_tomatoes_are_kept_apart_by_the_watershed() -> None:
@@ -179,7 +179,7 @@ def test_touching_tomatoes_are_kept_apart_by_the_watershed() -> None:
     rgb, depth = view.rgb.copy(), view.depth_m.copy()
     rgb[other] = (190, 30, 25)
     depth[other] = np.roll(view.depth_m, int(2 * radius) - 1, axis=1)[other]
-    both = TomatoView(rgb=rgb, depth_m=depth, masks=(view.masks[0], other), intrinsics=INTRINSICS)
+    both = SegmentedImage(rgb=rgb, depth_m=depth, masks=(view.masks[0], other), intrinsics=INTRINSICS)
     for estimate in (*ImprovedModel()(both), *SphereModel()(both)):
         assert estimate.visible_fraction > 0.9
     # The thesis's red image holds both as one.
@@ -191,17 +191,17 @@ def test_images_without_tomatoes_or_depth_are_no_error(
     model: ThesisModel | ImprovedModel | SphereModel,
 ) -> None:
     view, _ = draw(leaf_from=0.0)
-    nothing = TomatoView(rgb=view.rgb, depth_m=view.depth_m, masks=(), intrinsics=INTRINSICS)
+    nothing = SegmentedImage(rgb=view.rgb, depth_m=view.depth_m, masks=(), intrinsics=INTRINSICS)
     assert list(model(nothing)) == []
-    blind = TomatoView(
+    blind = SegmentedImage(
         rgb=view.rgb, depth_m=np.full((HEIGHT, WIDTH), np.nan), masks=view.masks, intrinsics=INTRINSICS
     )
     (estimate,) = model(blind)
     assert not estimate.visible_fraction < 0
     empty = np.zeros((HEIGHT, WIDTH), bool)
-    unseen = TomatoView(rgb=view.rgb, depth_m=view.depth_m, masks=(empty,), intrinsics=INTRINSICS)
+    unseen = SegmentedImage(rgb=view.rgb, depth_m=view.depth_m, masks=(empty,), intrinsics=INTRINSICS)
     assert np.isnan(model(unseen)[0].visible_fraction)
-    everything = TomatoView(rgb=view.rgb, depth_m=view.depth_m, masks=(~empty,), intrinsics=INTRINSICS)
+    everything = SegmentedImage(rgb=view.rgb, depth_m=view.depth_m, masks=(~empty,), intrinsics=INTRINSICS)
     assert len(model(everything)) == 1
 
 
@@ -218,7 +218,7 @@ def test_wrong_images_are_refused() -> None:
         {"intrinsics": color_intrinsics(640, 480)},
     ):
         with pytest.raises(InvalidInputError):
-            TomatoView(**(good | change))  # type: ignore[arg-type]
+            SegmentedImage(**(good | change))  # type: ignore[arg-type]
     with pytest.raises(InvalidInputError, match="behind_m must be positive"):
         ThesisConfig(behind_m=-1.0)
     with pytest.raises(InvalidInputError, match="margin must be positive"):
@@ -233,15 +233,9 @@ def test_holes_of_the_depth_take_the_farther_side() -> None:
     assert np.isnan(fruit_depth(depth, depth == 0.0))
 
 
-def test_scores_follow_from_the_errors() -> None:
-    def one(truth: float, estimate: float) -> Judged:
-        return Judged(
-            model="m", file_name="a", category="tomato", visible_px=1, truth=truth, estimate=estimate
-        )
-
-    judged = [one(0.1, 0.2), one(0.9, 0.8), one(0.5, float("nan"))]
-    result = score(judged)
-    assert result.mae == pytest.approx((0.1 + 0.1 + 0.5) / 3) and result.failures == 1
-    assert result.bias == pytest.approx(0.0) and result.rmse == pytest.approx(0.1)
-    assert [s.count for _, s in by_band(judged)] == [1, 0, 1, 0, 1, 0]
-    assert "| m | 3 | 0.233 |" in markdown(judged, {"m": 3.0})
+def test_models_are_made_by_name_and_other_names_are_refused() -> None:
+    view, _ = draw(leaf_from=2.0)
+    for name in ("thesis", "improved", "sphere"):
+        assert len(make_occlusion_model(name)(view)) == 1
+    with pytest.raises(InvalidInputError, match="sphere"):
+        make_occlusion_model("cube")

@@ -12,7 +12,7 @@ from maniskill_tomato.errors import InvalidInputError
 from maniskill_tomato.segmentation.instances import box_ellipse
 from maniskill_tomato.segmentation.metrics.detection_metrics import mask_overlaps
 from maniskill_tomato.segmentation.segmenter import Segmenter, make_segmenter
-from maniskill_tomato.sensing.visible_fraction.estimate import Estimate, TomatoView
+from maniskill_tomato.sensing.visible_fraction.estimate import Estimate, SegmentedImage
 
 LEAST_OVERLAP = 0.3
 """Intersection over union of a given mask with that of a found fruit from which on they are the same fruit."""
@@ -25,7 +25,7 @@ class AmodalModel:
         """Takes a segmenter that tells whole boxes; by default the one that ships, with a low threshold."""
         self.segmenter = segmenter or make_segmenter("light", score_threshold=0.1)
 
-    def __call__(self, view: TomatoView) -> Sequence[Estimate]:
+    def __call__(self, view: SegmentedImage) -> Sequence[Estimate]:
         """V and T of every mask; no estimate where the segmenter finds no fruit.
 
         Raises:

@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Final, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,13 +11,19 @@ from maniskill_tomato.errors import InvalidInputError
 from maniskill_tomato.robot.d435 import CameraIntrinsics
 from maniskill_tomato.segmentation.masks import BinaryMask
 
+USUAL_RADIUS: Final = 0.029
+"""Median radius of the tasks' tomatoes, in [m]."""
+
+RADIUS_SPREAD: Final = 0.14
+"""Standard deviation of the logarithm of their radius."""
+
 Float64 = NDArray[np.float64]
 UInt8 = NDArray[np.uint8]
 
 
 @dataclass(frozen=True, kw_only=True)
-class TomatoView:
-    """One image of tomatoes, checked."""
+class SegmentedImage:
+    """One image with depth and the masks of the tomatoes in it, checked."""
 
     rgb: UInt8
     """Shape (height, width, 3)."""
@@ -85,7 +91,7 @@ class Estimate:
 class OcclusionModel(Protocol):
     """From an image to one estimate for each of its masks, in their order."""
 
-    def __call__(self, view: TomatoView) -> Sequence[Estimate]:
+    def __call__(self, view: SegmentedImage) -> Sequence[Estimate]:
         """Estimates V and T of every mask."""
         ...
 

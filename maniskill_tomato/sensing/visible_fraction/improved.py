@@ -11,11 +11,12 @@ import numpy as np
 
 from maniskill_tomato.errors import InvalidInputError
 from maniskill_tomato.segmentation.masks import BinaryMask
-from maniskill_tomato.sensing.visible_fraction import steps
+from maniskill_tomato.sensing.visible_fraction import image_operations as operations
 from maniskill_tomato.sensing.visible_fraction.estimate import (
+    USUAL_RADIUS,
     Estimate,
     Float64,
-    TomatoView,
+    SegmentedImage,
     UInt8,
     filled_depth,
     fruit_depth,
@@ -26,7 +27,7 @@ from maniskill_tomato.sensing.visible_fraction.estimate import (
 class ImprovedConfig:
     """Sizes relative to the tomato's own, in place of pixels."""
 
-    diameter_m: float = 0.058
+    diameter_m: float = 2 * USUAL_RADIUS
     """Diameter of a tomato, in [m]; with its depth it gives the size in pixels that all kernels follow."""
     kernel_share: float = 0.5
     """Width of the kernel that bridges occluders over that size."""
@@ -48,12 +49,12 @@ class ImprovedModel:
         """Keeps the constants."""
         self.config = config or ImprovedConfig()
 
-    def __call__(self, view: TomatoView) -> list[Estimate]:
+    def __call__(self, view: SegmentedImage) -> list[Estimate]:
         """Estimates V and T of every mask; one without depth has failed."""
         depth = filled_depth(view.depth_m)
         return [self._one(view, depth, k) for k in range(len(view.masks))]
 
-    def _one(self, view: TomatoView, depth: Float64, k: int) -> Estimate:
+    def _one(self, view: SegmentedImage, depth: Float64, k: int) -> Estimate:
         c, mask = self.config, view.masks[k]
         own = fruit_depth(view.depth_m, mask)
         if not np.isfinite(own):
@@ -72,12 +73,12 @@ class ImprovedModel:
         grown = self._bridged(here, allowed, size)
         if others:
             grown = _separated(view.rgb[window], grown, here, others)
-        pieces = steps.outlines(grown, 1.0)
+        pieces = operations.outlines(grown, 1.0)
         if not pieces:
             return Estimate.failed()
-        ellipse = steps.fit_ellipse(np.asarray(cv2.convexHull(np.concatenate(pieces)), np.int32))
-        inside = steps.fill_ellipse(ellipse, here.shape) if ellipse is not None else grown
-        inside = steps.remove_deeper(inside, z, own + c.behind_share * c.diameter_m)
+        ellipse = operations.fit_ellipse(np.asarray(cv2.convexHull(np.concatenate(pieces)), np.int32))
+        inside = operations.fill_ellipse(ellipse, here.shape) if ellipse is not None else grown
+        inside = operations.remove_deeper(inside, z, own + c.behind_share * c.diameter_m)
         for other in others:
             # A touching tomato is not part of this one unless it is the nearer of the two.
             theirs = fruit_depth(depth[window], other)

@@ -20,7 +20,7 @@ from maniskill_tomato.segmentation.masks import BinaryMask
 from maniskill_tomato.sensing.visible_fraction.estimate import (
     Estimate,
     Float64,
-    TomatoView,
+    SegmentedImage,
     filled_depth,
     fruit_depth,
 )
@@ -90,7 +90,7 @@ class SphereModel:
         """Keeps the prior."""
         self.config = config or SphereConfig()
 
-    def __call__(self, view: TomatoView) -> list[Estimate]:
+    def __call__(self, view: SegmentedImage) -> list[Estimate]:
         """Estimates V and T of every mask; an empty one has failed. Without depth the outline alone decides."""
         depth = filled_depth(view.depth_m)
         fits = [_Fit.prepare(view, depth, mask, self.config) for mask in view.masks]
@@ -140,7 +140,7 @@ class _Fit:
 
     @classmethod
     def prepare(
-        cls, view: TomatoView, depth: Float64, mask: BinaryMask, config: SphereConfig
+        cls, view: SegmentedImage, depth: Float64, mask: BinaryMask, config: SphereConfig
     ) -> "_Fit | None":
         """Collects the evidence in a window; None for an empty mask."""
         first_x, first_y, width, height = cv2.boundingRect(mask.view(np.uint8))
@@ -163,7 +163,7 @@ class _Fit:
 
     @property
     def radius_m(self) -> float:
-        """In [m]."""
+        """Of the circle at the depth of the visible surface, as the prior counts it, in [m]."""
         return float(self.circle[2]) * self.own / self.focal
 
     def outline_share(self) -> float:
@@ -181,7 +181,7 @@ class _Fit:
         self.circle = _fit(self.evidence, self.own, self.focal, config)
 
     def estimate(
-        self, view: TomatoView, shown: Float64, config: SphereConfig, fruits: BinaryMask
+        self, view: SegmentedImage, shown: Float64, config: SphereConfig, fruits: BinaryMask
     ) -> Estimate:
         """V and T under the circle.
 
@@ -209,16 +209,18 @@ class _Fit:
             rows, columns = rows[hidden], columns[hidden]
         whole = mask.copy()
         whole[rows, columns] = True
-        centre = None
+        centre, radius_m = None, float("nan")
         if self.measured:
             z = _centre_depth(self.evidence.mask_depth, self.circle, self.own, self.focal)
             centre = ((x - i.cx) / i.fx * z, (y - i.cy) / i.fy * z, z)
+            tangent = float(radius) / self.focal
+            radius_m = z * tangent / float(np.hypot(1.0, tangent))
         return Estimate(
             visible=int(np.count_nonzero(mask)),
             total=int(np.count_nonzero(whole)) + outside,
             whole=whole,
             centre_optical=centre,
-            radius_m=self.radius_m if self.measured else float("nan"),
+            radius_m=radius_m,
         )
 
 

@@ -6,9 +6,9 @@ import cv2
 import numpy as np
 
 from maniskill_tomato.errors import InvalidInputError
-from maniskill_tomato.sensing.visible_fraction import steps
-from maniskill_tomato.sensing.visible_fraction.estimate import Estimate, TomatoView, UInt8, fruit_depth
-from maniskill_tomato.sensing.visible_fraction.steps import Contour, Ellipse
+from maniskill_tomato.sensing.visible_fraction import image_operations as operations
+from maniskill_tomato.sensing.visible_fraction.estimate import Estimate, SegmentedImage, UInt8, fruit_depth
+from maniskill_tomato.sensing.visible_fraction.image_operations import Contour, Ellipse
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -63,29 +63,29 @@ class ThesisModel:
         """Keeps the constants."""
         self.config = config or ThesisConfig()
 
-    def run(self, view: TomatoView) -> ThesisSteps:
+    def run(self, view: SegmentedImage) -> ThesisSteps:
         """All steps of one image."""
         c = self.config
         shape = view.rgb.shape[:2]
-        tomatoes = steps.combine_masks(view.masks, shape)
-        leaves = steps.leaf_image(view.rgb, c.leaf_threshold)
-        inpainted = steps.inpaint(view.rgb, leaves, c.inpaint_radius)
-        binary = steps.clean(steps.red_image(inpainted), c.erosion, c.dilation)
+        tomatoes = operations.combine_masks(view.masks, shape)
+        leaves = operations.leaf_image(view.rgb, c.leaf_threshold)
+        inpainted = operations.inpaint(view.rgb, leaves, c.inpaint_radius)
+        binary = operations.clean(operations.red_image(inpainted), c.erosion, c.dilation)
         depths = [d for mask in view.masks if np.isfinite(d := fruit_depth(view.depth_m, mask))]
         farthest = max(depths) + c.behind_m if depths else np.inf
-        binary = steps.remove_deeper(binary, view.depth_m, farthest)
+        binary = operations.remove_deeper(binary, view.depth_m, farthest)
         contours, ellipses, whole, fractions = [], [], [], []
-        for contour in steps.outlines(binary, c.smallest):
-            ellipse = steps.fit_ellipse(contour)
+        for contour in operations.outlines(binary, c.smallest):
+            ellipse = operations.fit_ellipse(contour)
             if ellipse is None:
                 continue
-            inside = steps.fill_ellipse(ellipse, shape)
+            inside = operations.fill_ellipse(ellipse, shape)
             own = fruit_depth(view.depth_m, (inside > 0) & (tomatoes > 0))
             if not np.isfinite(own):
                 continue
             # Only the largest of the new contours is the tomato; the depth filter leaves crumbs.
-            filtered = steps.remove_deeper(inside, view.depth_m, own + c.behind_m)
-            pieces = steps.outlines(filtered, c.smallest)
+            filtered = operations.remove_deeper(inside, view.depth_m, own + c.behind_m)
+            pieces = operations.outlines(filtered, c.smallest)
             if not pieces:
                 continue
             new = np.zeros(shape, dtype=np.uint8)
@@ -106,7 +106,7 @@ class ThesisModel:
             fractions=tuple(fractions),
         )
 
-    def __call__(self, view: TomatoView) -> list[Estimate]:
+    def __call__(self, view: SegmentedImage) -> list[Estimate]:
         """Each mask gets V and T of the contour that holds most of it; masks that no contour holds have failed."""
         result = self.run(view)
         estimates = []
