@@ -442,7 +442,7 @@ def square(size: int, left: float, side: float) -> TrainingPicture:
     """A picture with one square fruit in the middle of its height."""
     top = (size - side) / 2
     box = np.array([[left, top, left + side, top + side]], np.float32)
-    labels = np.zeros((size, size), np.int32)
+    labels = np.zeros((size, size), np.int16)
     labels[round(top) : round(top + side), round(left) : round(left + side)] = 1
     return TrainingPicture(
         image=np.zeros((size, size, 3), np.uint8),

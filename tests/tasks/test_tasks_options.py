@@ -27,11 +27,10 @@ def make(**kwargs: Any) -> Any:
 @pytest.mark.parametrize("env_id", TASK_IDS)
 def test_the_normalised_reward_is_the_reward_over_the_largest_that_a_move_can_have(env_id: str) -> None:
     """The largest are Eq. 5-1's and Eq. 5-7's bounds, and in the other tasks a gain of 1 with the success reward."""
-    largest = {GUIDED: 1.5, SPARSE: 1.0}.get(env_id)
+    largest = {GUIDED: 1.5, SPARSE: 1.0}.get(env_id, 0.0)
     rewards = []
     for mode in ("dense", "normalized_dense"):
-        options = {"obs_mode": "state", "render_backend": "none", "reward_mode": mode}
-        env: Any = gym.make(env_id, **options)
+        env: Any = gym.make(env_id, obs_mode="state", render_backend="none", reward_mode=mode)
         env.reset(seed=3)
         actions = [torch.full(env.action_space.shape, size) for size in (0.05, 1.0)]
         rewards.append([float(env.step(action)[1]) for action in actions])
