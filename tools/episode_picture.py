@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 import maniskill_tomato  # noqa: F401
 from maniskill_tomato.assets import asset_path
-from maniskill_tomato.learning.rl.policy import load_policy
+from maniskill_tomato.policies.trained_actor import load_actor
 
 TASK = "TomatoViewpointGuided-v1"
 
@@ -48,7 +48,7 @@ def main(args: Args) -> int:
         human_render_camera_configs=dict(size),
         enable_shadow=True,
     )
-    policy = load_policy(asset_path(f"policies/{TASK}.pt"), "cpu", TASK)
+    policy = load_actor(asset_path(f"policies/{TASK}.pt"), "cpu", TASK)
     obs, info = env.reset(seed=args.seed)
     first, first_fraction = _wrist(obs), float(info["visible_fraction"])
     moves, done = 0, False

@@ -1,4 +1,4 @@
-"""A trained policy, ready to act."""
+"""Reading what a training wrote: checkpoints, and the actor in them, ready to act."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -7,16 +7,30 @@ from typing import Any
 import torch
 from torch import Tensor
 
+import maniskill_tomato
 from maniskill_tomato.errors import CheckpointError, InvalidInputError
-from maniskill_tomato.learning.rl.agent import make_actor
-from maniskill_tomato.learning.rl.checkpoint import load_checkpoint
-from maniskill_tomato.learning.rl.networks import Actor, ObservationNormalizer
-from maniskill_tomato.learning.rl.presets import EPSILON_GREEDY_HIGH, EPSILON_GREEDY_LOW, TrainConfig
+from maniskill_tomato.files import read_tensors
+from maniskill_tomato.policies.actor import Actor, ObservationNormalizer
+
+FORMAT = 1
+"""Version of the layout that `learning.rl.checkpoint.make_checkpoint` documents."""
+
+REQUIRED_KEYS = (
+    "format",
+    "package_version",
+    "env_id",
+    "config",
+    "observation",
+    "action",
+    "normalizer",
+    "actor",
+    "counters",
+)
 
 
 @dataclass(frozen=True, kw_only=True)
-class Policy:
-    """An actor with its normaliser and action scale: observations in, environment actions out."""
+class TrainedActor:
+    """An actor with its normaliser and action scale: observations in, actions of the environment out."""
 
     actor: Actor
     normalizer: ObservationNormalizer
@@ -26,7 +40,8 @@ class Policy:
     """Shape (action_dim,)."""
     action_high: Tensor
     """Shape (action_dim,)."""
-    config: TrainConfig
+    config: dict[str, Any]
+    """The training's options, as `learning.rl.train_config.TrainConfig.to_dict` wrote them."""
     env_id: str
     """The task that it was trained on."""
     package_version: str
@@ -45,7 +60,7 @@ class Policy:
     @property
     def algorithm(self) -> str:
         """TD3 or DDPG."""
-        return "TD3" if self.config.twin_critics else "DDPG"
+        return "TD3" if self.config.get("twin_critics", False) else "DDPG"
 
     def act(self, observations: Tensor) -> Tensor:
         """The actions for a batch of observations, without exploration.
@@ -67,27 +82,28 @@ class Policy:
             actions: Tensor = self.actor(self.normalizer(observations)) * self.action_scale
         return torch.maximum(torch.minimum(actions, self.action_high), self.action_low)
 
+    def describe(self) -> dict[str, Any]:
+        """Where it comes from, for reports."""
+        return {
+            "kind": self.algorithm,
+            "trained_on": self.env_id,
+            "trained_with": self.env_options,
+            "training_steps": self.counters.get("steps"),
+            "training_episodes": self.counters.get("episodes"),
+            "training_seconds": round(float(self.counters.get("seconds", 0.0)), 1),
+            "training_seed": self.counters.get("seed"),
+            "package_version": self.package_version,
+        }
 
-class RandomPolicy:
-    """Uniformly random actions from the ranges of Eq. 5-6: what a policy must beat."""
 
-    def __init__(self, seed: int, device: torch.device | str = "cpu") -> None:
-        self._generator = torch.Generator(device=device).manual_seed(seed)
-        self._low = torch.tensor(EPSILON_GREEDY_LOW, device=device)
-        self._range = torch.tensor(EPSILON_GREEDY_HIGH, device=device) - self._low
-
-    def act(self, observations: Tensor) -> Tensor:
-        """Random actions, [m] and [rad]. Shape (B, 6)."""
-        uniform = torch.rand(len(observations), 6, generator=self._generator, device=self._low.device)
-        return self._low + uniform * self._range
-
-
-def load_policy(path: Path | str, device: torch.device | str = "cpu", env_id: str | None = None) -> Policy:
-    """Reads a policy from a checkpoint or a policy file.
+def load_actor(
+    path: Path | str, device: torch.device | str = "cpu", env_id: str | None = None
+) -> TrainedActor:
+    """The actor of a checkpoint or a policy file.
 
     Args:
         path: The file.
-        device: Where the policy runs.
+        device: Where the actor runs.
         env_id: The task that it must have been trained on; None accepts any.
 
     Raises:
@@ -96,14 +112,13 @@ def load_policy(path: Path | str, device: torch.device | str = "cpu", env_id: st
     data = load_checkpoint(path, device)
     if env_id is not None and data["env_id"] != env_id:
         raise CheckpointError(
-            f"{path} was trained on {data['env_id']}, not on {env_id}; give the policy of this task, or pass "
-            "--allow-other-task to try it all the same"
+            f"{path} was trained on {data['env_id']}, not on {env_id}; give a policy of this task (`maniskill-tomato "
+            "eval` tries any with --allow-other-task)"
         )
     try:
-        config = TrainConfig.from_dict(data["config"])
         (observation_dim,) = data["observation"]["shape"]
         scale = data["action"]["scale"]
-        actor = make_actor(config, observation_dim, len(scale)).to(device)
+        actor = Actor(observation_dim, len(scale), tuple(data["config"]["actor_hidden"])).to(device)
         actor.load_state_dict(data["actor"])
         normalizer = ObservationNormalizer.identity(observation_dim).to(device)
         normalizer.load_state_dict(data["normalizer"])
@@ -114,23 +129,42 @@ def load_policy(path: Path | str, device: torch.device | str = "cpu", env_id: st
         raise CheckpointError(
             f"{path} holds weights that are not finite; use an earlier checkpoint from its run folder"
         )
-    return Policy(
+    options = data.get("env_options")
+    if options is not None and not isinstance(options, dict):
+        raise CheckpointError(
+            f"{path} does not fit itself: env_options is {options!r}; train the policy again"
+        )
+    return TrainedActor(
         actor=actor.eval().requires_grad_(False),
         normalizer=normalizer.requires_grad_(False),
         action_scale=scale,
         action_low=low,
         action_high=high,
-        config=config,
+        config=data["config"],
         env_id=data["env_id"],
         package_version=data["package_version"],
         counters=data["counters"],
-        env_options=_options(path, data.get("env_options")),
+        env_options=options,
     )
 
 
-def _options(path: Path | str, options: Any) -> dict[str, Any] | None:
-    if options is not None and not isinstance(options, dict):
+def load_checkpoint(path: Path | str, device: torch.device | str = "cpu") -> dict[str, Any]:
+    """The content of a checkpoint file (see `make_checkpoint`).
+
+    Raises:
+        CheckpointError: The file is missing, damaged, not one of ours, or of a newer format.
+    """
+    data = read_tensors(path, device)
+    if not isinstance(data, dict) or any(key not in data for key in REQUIRED_KEYS):
         raise CheckpointError(
-            f"{path} does not fit itself: env_options is {options!r}; train the policy again"
+            f"{path} is not a checkpoint of this package, which would hold {', '.join(REQUIRED_KEYS)}"
         )
-    return options
+    checkpoint: dict[str, Any] = data
+    if not isinstance(checkpoint["format"], int) or checkpoint["format"] > FORMAT:
+        raise CheckpointError(
+            f"{path} has checkpoint format {checkpoint['format']}, written by version "
+            f"{checkpoint['package_version']}; "
+            f"this version, {maniskill_tomato.__version__}, reads up to {FORMAT}: upgrade maniskill-tomato",
+            newer_format=True,
+        )
+    return checkpoint
