@@ -1,8 +1,8 @@
-"""Runs compared: grouped by configuration over seeds, with interquartile means and bootstrap intervals."""
+"""Training runs as their folders tell of them."""
 
 import csv
 import json
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -11,12 +11,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from maniskill_tomato.errors import InvalidInputError
-from maniskill_tomato.experiments.statistics import interquartile_band, interquartile_mean
-from maniskill_tomato.learning.rl.presets import PRESETS, TrainConfig, modernise
-
-CURVE_POINTS = 120
-CURVE_WINDOW = 0.05
-"""Share of the axis that a training curve averages over."""
 
 REQUIRED_METRICS = ("env_id", "episodes", "seed", "success_rate", "mean_steps")
 
@@ -51,36 +45,6 @@ class Run:
     def training_seconds(self) -> float | None:
         """Training time, in [s], breaks between interrupted and resumed parts left out."""
         return None if self.clock is None else float(self.clock[-1, 1])
-
-
-@dataclass(frozen=True, eq=False, kw_only=True)
-class Group:
-    """The runs of one configuration on one task, which differ in their seeds only."""
-
-    env_id: str
-    label: str
-    """Short name that tells the configuration from the other ones."""
-    runs: Sequence[Run]
-
-    def scores(self, metric: str) -> Float64:
-        """A figure of metrics.json for every evaluated run. Shape (evaluated runs,)."""
-        return np.array(
-            [run.metrics[metric] for run in self.runs if run.metrics is not None], dtype=np.float64
-        )
-
-
-@dataclass(frozen=True, eq=False, kw_only=True)
-class Curve:
-    """A figure over the course of training: interquartile mean over runs, with its band."""
-
-    at: Float64
-    """Environment steps or seconds. Shape (points,)."""
-    mean: Float64
-    """Shape (points,)."""
-    low: Float64
-    """Equal to the mean for a single run. Shape (points,)."""
-    high: Float64
-    """Shape (points,)."""
 
 
 def find_runs(folders: Iterable[Path]) -> list[Path]:
@@ -167,119 +131,6 @@ def read_clock(folder: Path) -> Float64 | None:
         if part:
             clock = [point for point in clock if point[0] < min(part)] + sorted(part.items())
     return np.array(clock, dtype=np.float64) if clock else None
-
-
-def group_runs(runs: Sequence[Run]) -> list[Group]:
-    """The runs by task and configuration, in the order of their first appearance within a task.
-
-    Raises:
-        InvalidInputError: Two runs have the same task, configuration and seed.
-    """
-    found: dict[tuple[str, str], list[Run]] = {}
-    for run in runs:
-        same = found.setdefault((run.env_id, json.dumps(run.config, sort_keys=True)), [])
-        for other in same:
-            if other.seed == run.seed:
-                raise InvalidInputError(
-                    f"{other.path} and {run.path} have the same task, configuration and seed; give one of them"
-                )
-        same.append(run)
-    configs = [members[0].config for members in found.values()]
-    groups = [
-        Group(
-            env_id=env_id,
-            label=_label(members[0].config, configs),
-            runs=sorted(members, key=lambda run: run.seed),
-        )
-        for (env_id, _), members in found.items()
-    ]
-    return sorted(groups, key=lambda group: group.env_id)
-
-
-def training_curve(group: Group, column: str, wall_time: bool) -> Curve | None:
-    """A column of episodes.csv over the course of training, averaged over a window and then over the runs.
-
-    Each point is the mean of the episodes that ended within the last twentieth of the axis before it; the axis
-    ends where the shortest run of the group does. The band is the pointwise 95 % interval.
-
-    Args:
-        group: The runs.
-        column: The column, for instance `success`.
-        wall_time: Over training time in [s] instead of environment steps.
-
-    Returns:
-        None if a run has no finished episode or, for `wall_time`, no clock.
-    """
-    series: list[tuple[Float64, Float64]] = []
-    for run in group.runs:
-        at = run.episodes["end_step"]
-        if len(at) == 0 or (wall_time and run.clock is None):
-            return None
-        if wall_time and run.clock is not None:
-            at = np.interp(at, run.clock[:, 0], run.clock[:, 1])
-        series.append((at, run.episodes[column]))
-    end = min(float(at[-1]) for at, _ in series)
-    grid = np.linspace(end / CURVE_POINTS, end, CURVE_POINTS)
-    smooth = np.stack([trailing_mean(at, values, grid, CURVE_WINDOW * end) for at, values in series])
-    known = np.isfinite(smooth).all(axis=0)
-    smooth, grid = smooth[:, known], grid[known]
-    mean = interquartile_mean(smooth, axis=0)
-    low, high = interquartile_band(smooth)
-    return Curve(at=grid, mean=mean, low=low, high=high)
-
-
-def trailing_mean(at: Float64, values: Float64, grid: Float64, window: float) -> Float64:
-    """Mean of the values whose place is in (g - window, g] for every g of `grid`; NaN where there is none.
-
-    Args:
-        at: Places of the values, rising. Shape (N,).
-        values: Shape (N,).
-        grid: Shape (G,).
-        window: Width of the window, in units of `at`.
-
-    Returns:
-        Shape (G,).
-    """
-    sums = np.concatenate(([0.0], np.cumsum(values)))
-    first = np.searchsorted(at, grid - window, side="right")
-    after = np.searchsorted(at, grid, side="right")
-    counts = after - first
-    means: Float64 = np.where(counts > 0, (sums[after] - sums[first]) / np.maximum(counts, 1), np.nan)
-    return means
-
-
-def _label(config: dict[str, Any], others: Sequence[dict[str, Any]]) -> str:
-    """The algorithm or nearest preset, and what differs from that preset or between runs of the algorithm."""
-    algorithm = config.get("algorithm")
-    options = {k: v for k, v in config.items() if k not in ("algorithm", "env_options")}
-    shown: dict[str, Any] = {}
-    if algorithm is None:
-        algorithm, shown = _nearest_preset(options)
-    else:
-        same = [other for other in others if other.get("algorithm") == algorithm]
-        shown = {k: v for k, v in options.items() if any(other.get(k) != v for other in same)}
-    parts = [str(algorithm), *(f"{name} {_short(value)}" for name, value in shown.items())]
-    if "env_options" in config:
-        parts.append(json.dumps(config["env_options"], sort_keys=True))
-    return ", ".join(parts)
-
-
-def _nearest_preset(options: dict[str, Any]) -> tuple[str, dict[str, Any]]:
-    """The preset that shares most options, and the options that it does not share."""
-    defaults = TrainConfig(total_timesteps=1).to_dict()
-    complete = {**defaults, "total_timesteps": None, **modernise(options)}
-    differences: dict[str, dict[str, Any]] = {}
-    for name, preset in PRESETS.items():
-        values = preset.to_dict()
-        differences[name] = {k: v for k, v in complete.items() if k not in values or values[k] != v}
-    nearest = min(differences, key=lambda name: len(differences[name]))
-    return nearest, differences[nearest]
-
-
-def _short(value: object) -> str:
-    if isinstance(value, float):
-        return f"{value:g}"
-    return "x".join(_short(v) for v in value) if isinstance(value, list) else str(value)
 
 
 def _read_json(path: Path) -> dict[str, Any]:

@@ -1,23 +1,14 @@
-"""`scripts/compare_twin.py`: the twin beside the simulated task."""
+"""The twin beside the simulated task."""
 
-import importlib.util
 import json
-import subprocess
-import sys
 from pathlib import Path
 from typing import Any
 
 import pytest
 
-SCRIPT = Path(__file__).parents[2] / "scripts" / "compare_twin.py"
-
-
-def script() -> Any:
-    spec = importlib.util.spec_from_file_location("compare_twin", SCRIPT)
-    assert spec is not None and spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
+from maniskill_tomato.errors import TomatoError
+from maniskill_tomato.experiments.configs import TwinConfig
+from maniskill_tomato.experiments.twin_comparison import compare_twin, summarise_twin
 
 
 def episode(number: int, twin: bool, simulated: bool, moves: int, truly: bool = True) -> dict[str, Any]:
@@ -40,7 +31,7 @@ def episode(number: int, twin: bool, simulated: bool, moves: int, truly: bool = 
 def test_the_summary_counts_what_a_pencil_counts() -> None:
     cannot = episode(3, False, True, 1)
     cannot["twin"] = {"success": False, "reason": "cannot begin", "detail": "no", "steps": []}
-    found = script().summary(
+    found = summarise_twin(
         [
             episode(0, True, True, 4),
             episode(1, True, False, 6, truly=False),
@@ -63,14 +54,16 @@ def test_the_summary_counts_what_a_pencil_counts() -> None:
     assert found["simulation_contact_share_of_episodes"] == 0.25
 
 
-def test_the_script_runs_an_episode_on_both_and_goes_on_where_it_was(tmp_path: Path) -> None:
-    command = [sys.executable, str(SCRIPT), "--seed", "6", "--episodes", "1", "--out", str(tmp_path)]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=500)
-    assert done.returncode == 0, done.stderr
-    content = json.loads((tmp_path / "summary.json").read_text())
+def test_an_episode_runs_on_both_and_is_not_run_again(tmp_path: Path) -> None:
+    config = TwinConfig(seed=6, episodes=1, out=tmp_path)
+    lines: list[str] = []
+    content = compare_twin(config, lines.append)
     assert content["episodes"] == 1 and content["reasons"] == {"success": 1}
-    kept = (tmp_path / "episodes.json").read_bytes()
-    again = subprocess.run(command, capture_output=True, text=True, timeout=500)
-    assert again.returncode == 0 and (tmp_path / "episodes.json").read_bytes() == kept
-    wrong = subprocess.run([*command, "--profile", "nothing"], capture_output=True, text=True, timeout=500)
-    assert wrong.returncode == 2 and wrong.stderr.startswith("error: no profile 'nothing'")
+    assert lines[0].startswith("  6  twin success")
+    assert json.loads((tmp_path / "summary.json").read_text())["looks"] == content["looks"]
+    stored = {path: path.read_bytes() for path in tmp_path.rglob("*.jsonl")}
+    assert len(stored) == 1
+    assert compare_twin(config, lines.append)["looks"] == content["looks"] and len(lines) == 1
+    assert {path: path.read_bytes() for path in tmp_path.rglob("*.jsonl")} == stored
+    with pytest.raises(TomatoError, match="no profile 'nothing'"):
+        compare_twin(TwinConfig(profile="nothing", out=tmp_path))
