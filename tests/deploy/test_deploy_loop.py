@@ -16,7 +16,7 @@ from torch import Tensor
 
 from maniskill_tomato.assets import asset_path
 from maniskill_tomato.deploy.clock import SimulatedClock
-from maniskill_tomato.deploy.errors import ProfileError, RefusedError
+from maniskill_tomato.deploy.deploy_errors import ProfileError, RefusedError
 from maniskill_tomato.deploy.guarded_arm import GuardedArm
 from maniskill_tomato.deploy.interface import Frame, JointMove
 from maniskill_tomato.deploy.loop import Loop
