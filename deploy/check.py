@@ -11,12 +11,13 @@ import numpy as np
 from maniskill_tomato.deploy.capture import Capture
 from maniskill_tomato.deploy.errors import DeployError, RecordingError
 from maniskill_tomato.deploy.interface import JointMove
-from maniskill_tomato.deploy.policies import decide, default_policy, open_policy
+from maniskill_tomato.deploy.policies import TASK, decide, default_policy
 from maniskill_tomato.deploy.profile import Profile
 from maniskill_tomato.deploy.robot_belief import RobotBelief
 from maniskill_tomato.deploy.workcell import make_workcell
 from maniskill_tomato.errors import TomatoError
 from maniskill_tomato.files import write_atomically
+from maniskill_tomato.policies.opening import open_policy
 from maniskill_tomato.raycast.view_rays import NEAREST_DEPTH
 
 
@@ -48,7 +49,7 @@ def check(profile: Profile, policy: str | None, seed: int, out: Path | None) -> 
     name = default_policy() if policy is None else policy
     opened: Any = None
     try:
-        opened = open_policy(name, seed)
+        opened = open_policy(name, env_id=TASK, seed=seed)
         yield Finding(what="policy", good=True, detail=f"{name} ({opened.name})")
     except TomatoError as error:
         yield Finding(what="policy", good=False, detail=str(error))

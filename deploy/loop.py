@@ -39,7 +39,7 @@ from maniskill_tomato.deploy.stage_times import StageTimes
 from maniskill_tomato.deploy.steps import Recorder, RunResult, Step
 from maniskill_tomato.deploy.stops import Stops
 from maniskill_tomato.errors import PolicyError, TomatoError
-from maniskill_tomato.policies.protocol import Planner
+from maniskill_tomato.policies.protocol import Policy
 
 WAIT_SLICE: Final = 0.1
 """While the arm moves, stops are looked for this often, in [s]."""
@@ -68,7 +68,7 @@ class Loop:
         camera: Camera,
         capture: Capture,
         perception: Perception,
-        policy: Planner,
+        policy: Policy,
         T_flange_camera: Float64,
         clock: Clock,
         config: LoopConfig,

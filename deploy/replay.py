@@ -18,13 +18,14 @@ from maniskill_tomato.deploy.errors import CutOffError, NotConnectedError, Recor
 from maniskill_tomato.deploy.guarded_arm import GuardedArm
 from maniskill_tomato.deploy.interface import Arm, ArmState, Camera, Float64, Frame, FrameTruth, JointMove
 from maniskill_tomato.deploy.loop import Loop
-from maniskill_tomato.deploy.policies import open_policy
+from maniskill_tomato.deploy.policies import TASK
 from maniskill_tomato.deploy.profile import Profile, parse_profile
 from maniskill_tomato.deploy.recording import FORMAT, decode_depth, decode_png, read_messages, unpack
 from maniskill_tomato.deploy.robot_perception import open_perception
 from maniskill_tomato.deploy.safety import Safety
 from maniskill_tomato.deploy.steps import RunResult, Step
 from maniskill_tomato.deploy.stops import Stops
+from maniskill_tomato.policies.opening import open_policy
 from maniskill_tomato.raycast.view_rays import ViewRays
 from maniskill_tomato.robot.d435 import CameraIntrinsics
 
@@ -139,7 +140,9 @@ def replay(recorded: RecordedRun, policy: str | None = None) -> Replay:
         # A look's other attempts were not recorded.
         capture=Capture(camera, replace(profile.capture, attempts=1), clock),
         perception=open_perception(profile.perception.sight, profile.perception.segmenter),
-        policy=open_policy(policy or str(recorded.info["policy"]), int(recorded.info["seed"])),
+        policy=open_policy(
+            policy or str(recorded.info["policy"]), env_id=TASK, seed=int(recorded.info["seed"])
+        ),
         T_flange_camera=profile.T_flange_camera,
         clock=clock,
         config=replace(profile.loop, settle=0.0),

@@ -11,13 +11,14 @@ from maniskill_tomato import __version__
 from maniskill_tomato.deploy.clock import Clock
 from maniskill_tomato.deploy.errors import ProfileError, RecordingError
 from maniskill_tomato.deploy.loop_config import Mode, Proposal
-from maniskill_tomato.deploy.policies import default_policy, open_policy
+from maniskill_tomato.deploy.policies import TASK, default_policy
 from maniskill_tomato.deploy.profile import Profile
 from maniskill_tomato.deploy.recording import McapRecorder
 from maniskill_tomato.deploy.run_report import Contact, write_report
 from maniskill_tomato.deploy.steps import Recorder, RunResult, Step
 from maniskill_tomato.deploy.stops import Stops
 from maniskill_tomato.deploy.workcell import make_workcell, prepare_folder
+from maniskill_tomato.policies.opening import open_policy
 
 RECORDING = "run.mcap"
 """Name of the recording in the output folder."""
@@ -81,7 +82,7 @@ def run(
     """
     profile = config.profile
     name = default_policy() if config.policy is None else config.policy
-    policy = open_policy(name, config.seed)
+    policy = open_policy(name, env_id=TASK, seed=config.seed)
     workcell = make_workcell(profile, config.seed, clock)
     mode: Mode = config.mode or ("unattended" if workcell.simulated else "dry_run")
     if not workcell.simulated and not profile.calibrated:

@@ -20,7 +20,7 @@ from maniskill_tomato.deploy.robot_perception import Perception, open_perception
 from maniskill_tomato.deploy.safety import Safety
 from maniskill_tomato.deploy.steps import Recorder
 from maniskill_tomato.deploy.stops import Stops
-from maniskill_tomato.policies.protocol import Planner
+from maniskill_tomato.policies.protocol import Policy
 
 TWIN_START = 1_000.0
 """What the twin's clock shows at first, in [s]."""
@@ -62,7 +62,7 @@ class Workcell:
 
     def loop(
         self,
-        policy: Planner,
+        policy: Policy,
         stops: Stops,
         mode: Mode,
         recorder: Recorder | None = None,

@@ -6,6 +6,8 @@ load only when `gymnasium.make` builds one.
 
 from gymnasium.envs.registration import WrapperSpec, register, registry
 
+from maniskill_tomato.policies.layout import GENERAL_IDS as GENERAL_IDS
+
 if __name__ != "maniskill_tomato.tasks":
     raise ImportError(
         f"imported as {__name__!r}; import `maniskill_tomato.tasks` instead "
@@ -23,9 +25,6 @@ MAX_ROW_STEPS = 120
 
 THESIS_IDS = ("TomatoViewpointGuided-v1", "TomatoViewpointSparse-v1")
 """The thesis's tasks: nine observed numbers, six increments."""
-
-GENERAL_IDS = ("TomatoViewpoint-v1", "TomatoViewpointRow-v1")
-"""The tasks on plants never seen before."""
 
 TASK_IDS = (*THESIS_IDS, *GENERAL_IDS)
 

@@ -48,6 +48,9 @@ COMMANDS: Final[dict[str, CommandEntry]] = {
     ),
     "export": CommandEntry("export_command:Export", "Write a policy as ONNX, which runs without PyTorch"),
     "eval": CommandEntry("eval_command:Eval", "Evaluate a policy and write a report"),
+    "benchmark": CommandEntry(
+        "benchmark_command:Benchmark", "Compare policies on the same held-out episodes"
+    ),
     "dataset": CommandEntry("dataset_command:Dataset", "Render annotated images of tomato rows"),
     "detect": CommandEntry("detect_command:Detect", "Find the tomatoes in images"),
     "train-segmenter light": CommandEntry("segmenter_commands:TrainLight", "The light segmenter, on a CPU"),
@@ -86,7 +89,7 @@ GROUPS: Final[dict[str, tuple[str, ...]]] = {
         "train-deep-3dmts",
         "demonstrations",
     ),
-    "Measure": ("eval",),
+    "Measure": ("eval", "benchmark"),
     "See": ("dataset", "train-segmenter", "detect", "judge"),
     "Use": ("export", "deploy"),
 }

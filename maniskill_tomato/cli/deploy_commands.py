@@ -10,7 +10,7 @@ import tyro
 from maniskill_tomato.cli.calibrate_command import end_by_signal
 from maniskill_tomato.cli.early_checks import check_file, check_policy, check_profile
 from maniskill_tomato.errors import InvalidInputError
-from maniskill_tomato.policies.planner_names import PLANNERS, PRIVILEGED
+from maniskill_tomato.policies.layout import GENERAL_IDS
 
 if TYPE_CHECKING:
     from maniskill_tomato.deploy.loop_config import Proposal
@@ -164,11 +164,7 @@ class DeployProfiles:
 
 def _check_policy(policy: str | None) -> None:
     if policy is not None:
-        if policy in PRIVILEGED:
-            raise InvalidInputError(
-                f"--policy: {policy} knows what no camera could tell; it runs in simulation only"
-            )
-        check_policy("--policy", policy, [name for name in PLANNERS if name not in PRIVILEGED])
+        check_policy("--policy", policy, GENERAL_IDS[0], on_robot=True)
 
 
 def _ask(proposal: "Proposal") -> bool:

@@ -1,10 +1,11 @@
 """What can be checked of arguments without PyTorch, ManiSkill or a device, so that a typo costs no seconds."""
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 
-from maniskill_tomato.errors import InvalidInputError, did_you_mean
-from maniskill_tomato.policies.planner_names import PLANNERS
+from maniskill_tomato.errors import InvalidInputError, PolicyError, did_you_mean
+from maniskill_tomato.policies.opening import find_policy
+from maniskill_tomato.policies.registry import PRIVILEGED
 from maniskill_tomato.tasks import TASK_IDS
 
 
@@ -37,26 +38,34 @@ def check_folder(flag: str, path: Path | None) -> None:
         raise InvalidInputError(f"{flag}: there is no folder {path}{_neighbour(path)}")
 
 
-def check_policy(flag: str, text: str, names: Iterable[str] = PLANNERS) -> None:
-    """Accepts one of the names, or an existing file of a policy."""
-    known = tuple(names)
-    if text in known or Path(text).is_file():
-        return
-    or_names = f", or one of {', '.join(known)}" if known else ""
-    raise InvalidInputError(
-        f"{flag}: no policy at {text!r}; give a .pt or .onnx file{or_names}"
-        f"{did_you_mean(text, known) or _neighbour(Path(text))}"
-    )
+def check_policy(
+    flag: str, name_or_file: str | Path, env_id: str | None = None, on_robot: bool = False
+) -> None:
+    """Accepts the name of a policy that can act in a task, or an existing file.
+
+    Args:
+        flag: Where it was typed.
+        name_or_file: What was typed.
+        env_id: The task; None accepts any.
+        on_robot: Whether there is no simulator that could tell it the truth.
+    """
+    try:
+        found = find_policy(name_or_file, env_id)
+    except PolicyError as error:
+        raise InvalidInputError(f"{flag}: {error}") from error
+    if on_robot and found in PRIVILEGED:
+        raise InvalidInputError(
+            f"{flag}: {found} knows what no camera could tell; it runs in simulation only"
+        )
 
 
 def check_policies(flag: str, text: str) -> None:
-    """Accepts planners and files of policies with commas between them; LABEL=FILE is a file."""
+    """Accepts names and files of policies with commas between them; LABEL=FILE is a file."""
     parts = [part.strip() for part in text.split(",") if part.strip()]
     if not parts:
         raise InvalidInputError(f"{flag} must name one policy or more, with commas between them")
     for part in parts:
-        label, _, file = part.rpartition("=")
-        check_policy(flag, file, () if label else PLANNERS)
+        check_policy(flag, part.rpartition("=")[2])
 
 
 def check_place(flag: str, place: str) -> None:

@@ -6,9 +6,8 @@ from typing import Annotated, Any, Literal
 
 from maniskill_tomato.cli.arguments import Flat
 from maniskill_tomato.cli.early_checks import check_count, check_env_id, check_policy
-from maniskill_tomato.cli.shared_options import EnvId, PlantOptions, shipped_policy
-from maniskill_tomato.policies.planner_names import PLANNERS
-from maniskill_tomato.tasks import GENERAL_IDS
+from maniskill_tomato.cli.shared_options import EnvId, PlantOptions
+from maniskill_tomato.policies.opening import shipped_policy
 
 EpisodeList = Literal["validation", "held_out"]
 
@@ -46,49 +45,30 @@ class Eval:
     def run(self) -> None:
         """Evaluates and says where the report is."""
         check_env_id(self.env_id)
-        general = self.env_id in GENERAL_IDS
         check_count("--episodes", self.episodes)
-        if self.policy is not None:
-            check_policy("--policy", self.policy, ("random", *PLANNERS) if general else ("random",))
+        env_id = None if self.allow_other_task else self.env_id
+        check_policy("--policy", self.policy or shipped_policy(self.env_id), env_id)
 
-        from maniskill_tomato.experiments.evaluate import EvaluationConfig, evaluate
-        from maniskill_tomato.experiments.exported import open_policy, origin
-        from maniskill_tomato.experiments.rollout import ActingPolicy
-        from maniskill_tomato.experiments.viewpoint_policy import open_viewpoint_policy
-        from maniskill_tomato.learning.rl.policy import RandomPolicy
-        from maniskill_tomato.policies.protocol import Planner
+        from maniskill_tomato.experiments.configs import EvaluationConfig
+        from maniskill_tomato.experiments.evaluation import evaluate
 
-        path: Path | None = None
         env_options = self.plants.env_options()
-        policy: ActingPolicy | Planner | str = RandomPolicy(self.seed)
-        if general:
-            if self.policy == "random":
-                policy = "random_step"
-            elif self.policy in PLANNERS:
-                policy = self.policy
-            else:
-                path = Path(self.policy) if self.policy else shipped_policy(self.env_id)
-                policy = open_viewpoint_policy(path, None if self.allow_other_task else self.env_id)
-        elif self.policy != "random":
-            path = Path(self.policy) if self.policy else shipped_policy(self.env_id)
-            opened = open_policy(path, env_id=None if self.allow_other_task else self.env_id)
-            print(f"policy  {origin(opened)}")
-            policy = opened
         if self.episode_list is not None or (self.env_id == LISTED_ID and not env_options):
             env_options["episodes"] = self.episode_list or "held_out"
-        run_dir = path.parent if path is not None and (path.parent / "history.npz").is_file() else None
         config = EvaluationConfig(
             env_id=self.env_id,
+            policy=self.policy,
             episodes=self.episodes,
             seed=self.seed,
             out=self.out,
+            allow_other_task=self.allow_other_task,
             env_options=env_options,
             baseline=self.baseline,
             video=self.video,
             title="Where to look: evaluation",
-            training_run=run_dir,
         )
-        result = evaluate(config, policy, path)
+        result = evaluate(config)
+        print(f"policy  {result.origin}")
         print(summary(result.metrics))
         if result.left_out:
             print(result.left_out)

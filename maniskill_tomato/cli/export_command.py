@@ -4,7 +4,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from maniskill_tomato.cli.early_checks import check_file
-from maniskill_tomato.cli.shared_options import shipped_policy
+from maniskill_tomato.policies.opening import shipped_policy
 from maniskill_tomato.tasks import THESIS_IDS
 
 

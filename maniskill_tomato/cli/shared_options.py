@@ -11,7 +11,7 @@ import tyro
 
 from maniskill_tomato.errors import InvalidInputError, did_you_mean
 from maniskill_tomato.plants.spec import SEED_SPLITS
-from maniskill_tomato.tasks import GENERAL_IDS, TASK_IDS
+from maniskill_tomato.tasks import TASK_IDS
 
 EnvId = Annotated[
     str, tyro.conf.Positional, tyro.conf.arg(metavar="ENV_ID", help=f"The task: {', '.join(TASK_IDS)}.")
@@ -72,29 +72,6 @@ def merge_options(base: dict[str, Any], changes: dict[str, Any]) -> dict[str, An
             old = {"preset": old}
         merged[name] = {**old, **value} if isinstance(old, dict) and isinstance(value, dict) else value
     return merged
-
-
-def shipped_policy(env_id: str) -> Path:
-    """The trained policy that ships with the package.
-
-    Raises:
-        InvalidInputError: None ships for this task.
-    """
-    from maniskill_tomato.assets import asset_path
-
-    # One policy serves both general tasks.
-    name = GENERAL_IDS[0] if env_id in GENERAL_IDS else env_id
-    try:
-        return asset_path(f"policies/{name}.pt")
-    except FileNotFoundError as error:
-        how = (
-            "give --policy a planner's name such as nbv, or train one with `maniskill-tomato train-view-quality`"
-            if env_id in GENERAL_IDS
-            else f"train one with `maniskill-tomato train {env_id}`"
-        )
-        raise InvalidInputError(
-            f"no policy for {env_id} ships with this version; {how} and give its policy.pt with --policy"
-        ) from error
 
 
 def parse_env_options(options: Mapping[str, str]) -> dict[str, Any]:

@@ -9,6 +9,7 @@ import math
 import torch
 from torch import Tensor
 
+from maniskill_tomato.policies.layout import EPSILON_GREEDY_HIGH, EPSILON_GREEDY_LOW
 from maniskill_tomato.policies.moves import Goals
 from maniskill_tomato.policies.protocol import Planner, RandomPlanner
 from maniskill_tomato.raycast.view_rays import RayLabel, ray_pattern
@@ -49,6 +50,20 @@ class RandomStep(RandomPlanner):
         direction = self._normal(*position.shape).to(position)
         full: Tensor = direction / direction.norm(dim=-1, keepdim=True).clamp_min(1e-6)
         return full
+
+
+class RandomIncrements:
+    """A state policy of the thesis's tasks: uniformly random actions from the ranges of Eq. 5-6."""
+
+    def __init__(self, seed: int, device: torch.device | str = "cpu") -> None:
+        self._generator = torch.Generator(device=device).manual_seed(seed)
+        self._low = torch.tensor(EPSILON_GREEDY_LOW, device=device)
+        self._range = torch.tensor(EPSILON_GREEDY_HIGH, device=device) - self._low
+
+    def act(self, observations: Tensor) -> Tensor:
+        """Random actions, [m] and [rad]. Shape (B, 6)."""
+        uniform = torch.rand(len(observations), 6, generator=self._generator, device=self._low.device)
+        return self._low + uniform * self._range
 
 
 class RandomViewpoint(RandomPlanner):

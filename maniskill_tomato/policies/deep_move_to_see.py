@@ -13,15 +13,13 @@ Deviations:
   squared error would see only the largest.
 """
 
-import io
 from pathlib import Path
-from typing import Any, cast
+from typing import Any, Final
 
 import torch
 from torch import Tensor, nn
 
-from maniskill_tomato.errors import CheckpointError, InvalidInputError
-from maniskill_tomato.files import write_atomically
+from maniskill_tomato.policies.network_file import load_network, save_network
 from maniskill_tomato.policies.protocol import Planner
 from maniskill_tomato.raycast.view_rays import RAYS_PER_SIDE, RayLabel, ViewRays
 from maniskill_tomato.sensing.belief import Belief
@@ -31,7 +29,7 @@ CHANNELS = 4
 DEPTH_SCALE = 0.3
 """Distance in front of the target that counts as one, in [m]."""
 
-FORMAT = 1
+FORMAT: Final = "deep-3dmts-1"
 
 
 class MoveNetwork(nn.Module):
@@ -79,64 +77,18 @@ def view_picture(rays: ViewRays, distance: Tensor) -> Tensor:
     return torch.stack(channels, dim=1).view(-1, CHANNELS, RAYS_PER_SIDE, RAYS_PER_SIDE)
 
 
-def save_move_network(network: MoveNetwork, path: Path) -> None:
-    """Writes the weights in one step."""
-    buffer = io.BytesIO()
-    torch.save({"format": FORMAT, "weights": network.state_dict()}, buffer)
-    write_atomically(path, buffer.getvalue())
-
-
-def load_move_network(path: Path, device: str | torch.device = "cpu") -> MoveNetwork:
-    """Reads the weights.
-
-    Raises:
-        CheckpointError: The file is missing, damaged or something else.
-    """
-    try:
-        content = cast(dict[str, Any], torch.load(path, map_location=device, weights_only=True))
-        if content["format"] != FORMAT:
-            raise CheckpointError(f"{path} has format {content['format']}, this version reads {FORMAT}")
-        network = MoveNetwork().to(device)
-        network.load_state_dict(content["weights"])
-    except CheckpointError:
-        raise
-    except Exception as error:
-        raise CheckpointError(
-            f"{path} is no network of Deep 3D Move To See: {error}; train one with `maniskill-tomato train-deep-3dmts`"
-        ) from error
-    return network.eval().requires_grad_(False)
-
-
 class DeepMoveToSee(Planner):
     """Moves as the network says."""
 
     name = "deep_3dmts"
 
     def __init__(self, network: MoveNetwork) -> None:
-        self._network = network
-
-    @classmethod
-    def shipped(cls, device: str | torch.device = "cpu") -> "DeepMoveToSee":
-        """With the network that ships with the package.
-
-        Raises:
-            InvalidInputError: None ships with this version.
-        """
-        from maniskill_tomato.assets import asset_path
-
-        try:
-            path = asset_path("policies/deep_3dmts.pt")
-        except FileNotFoundError as error:
-            raise InvalidInputError(
-                "no network of deep_3dmts ships with this version; train one with `maniskill-tomato train-deep-3dmts` "
-                "and give its file as deep_3dmts=FILE"
-            ) from error
-        return cls(load_move_network(path, device))
+        self.network = network.eval().requires_grad_(False)
 
     def act(self, belief: Belief) -> Tensor:
         """The network's move, cut to a full one."""
         with torch.no_grad():
-            move: Tensor = self._network(*network_input(belief))
+            move: Tensor = self.network(*network_input(belief))
         shortened: Tensor = move / move.norm(dim=-1, keepdim=True).clamp_min(1.0)
         return shortened
 
@@ -145,3 +97,24 @@ def network_input(belief: Belief) -> tuple[Tensor, Tensor]:
     """Picture and distance of the present views. Shapes (B, 4, 16, 16) and (B,)."""
     distance = (belief.target_position - belief.camera_position).norm(dim=-1)
     return view_picture(belief.rays, distance), distance
+
+
+def save_deep_move_to_see(path: Path, policy: DeepMoveToSee) -> None:
+    """Writes the network."""
+    save_network(path, FORMAT, {}, policy.network.state_dict())
+
+
+def load_deep_move_to_see(path: Path, device: str | torch.device = "cpu") -> DeepMoveToSee:
+    """Reads what `save_deep_move_to_see` wrote.
+
+    Raises:
+        CheckpointError: The file is missing, damaged, or of something else.
+    """
+
+    def build(data: dict[str, Any]) -> tuple[DeepMoveToSee, MoveNetwork]:
+        network = MoveNetwork()
+        return DeepMoveToSee(network), network
+
+    return load_network(
+        path, FORMAT, device, build, "network of deep_3dmts; `maniskill-tomato train-deep-3dmts` makes one"
+    )

@@ -62,9 +62,21 @@ GENERAL_LAYOUT = PolicyLayout(
     action_meaning="move of the camera in its look frame, cut to norm 1; it looks at the target from there",
 )
 
-_GENERAL_TASKS = ("TomatoViewpoint-v1", "TomatoViewpointRow-v1")
+GENERAL_IDS = ("TomatoViewpoint-v1", "TomatoViewpointRow-v1")
+"""The tasks on plants never seen before; their policies may decide from a `Belief`."""
+
+EPSILON_GREEDY_LOW = (-0.07, -0.2, -0.1, -0.17, -0.17, -0.17)
+"""Lower ends of Eq. 5-6 in the order of `ACTION_NAMES`; the thesis lists pitch before roll. [m], [rad]."""
+
+EPSILON_GREEDY_HIGH = (0.1, 0.1, 0.1, 0.43, 0.17, 0.26)
+"""Upper ends of Eq. 5-6 in the order of `ACTION_NAMES`. [m], [rad]."""
+
+
+def has_belief(env_id: str) -> bool:
+    """Whether a task keeps a `Belief`, beside its state vector."""
+    return env_id in GENERAL_IDS
 
 
 def layout_of(env_id: str) -> PolicyLayout:
     """What the policies of a task observe and do; the thesis's for tasks that this package does not know."""
-    return GENERAL_LAYOUT if env_id in _GENERAL_TASKS else THESIS_LAYOUT
+    return GENERAL_LAYOUT if has_belief(env_id) else THESIS_LAYOUT

@@ -34,11 +34,6 @@ def save_network(
     write_atomically(path, buffer.getvalue())
 
 
-def holds(data: object, kind: str) -> bool:
-    """Whether the content of a file is of `save_network` with this kind."""
-    return isinstance(data, dict) and data.get("format") == kind
-
-
 def load_network(
     path: Path,
     kind: str,
@@ -59,7 +54,7 @@ def load_network(
         CheckpointError: The file is missing, damaged, or of something else.
     """
     data = read_tensors(path, device)
-    if not holds(data, kind):
+    if not isinstance(data, dict) or data.get("format") != kind:
         raise CheckpointError(f"{path} holds no {missing}")
     try:
         planner, network = build(data)

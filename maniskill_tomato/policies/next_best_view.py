@@ -102,7 +102,7 @@ class NextBestView(Planner):
 
     name = "nbv"
 
-    def __init__(self, device: str | torch.device = "cpu", config: NextBestViewConfig | None = None) -> None:
+    def __init__(self, config: NextBestViewConfig | None = None) -> None:
         self.config = config or NextBestViewConfig()
         self._measured = MeasuredViews()
         self.tried = Candidates()
@@ -151,9 +151,9 @@ class NextBestDirection(NextBestView):
 
     name = "nbv_direction"
 
-    def __init__(self, device: str | torch.device = "cpu", config: NextBestViewConfig | None = None) -> None:
+    def __init__(self, config: NextBestViewConfig | None = None) -> None:
         """Begins with its own tuned cost of a move, 0.05."""
-        super().__init__(device, config or NextBestViewConfig(move_cost=0.05))
+        super().__init__(config or NextBestViewConfig(move_cost=0.05))
 
     def _candidates(self, belief: Belief) -> Tensor:
         offsets = super()._candidates(belief) - belief.target_position[:, None]

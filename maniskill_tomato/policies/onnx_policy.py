@@ -59,8 +59,8 @@ class OnnxPolicy:
             )
         if env_id is not None and description.env_id != env_id:
             raise PolicyError(
-                f"{path} was trained on {description.env_id}, not on {env_id}; give the policy of this task, or "
-                "pass --allow-other-task to try it all the same"
+                f"{path} was trained on {description.env_id}, not on {env_id}; give a policy of this task "
+                "(`maniskill-tomato eval` tries any with --allow-other-task)"
             )
         return cls.from_bytes(model, description, path)
 
@@ -109,6 +109,19 @@ class OnnxPolicy:
         if not np.isfinite(actions).all():
             raise PolicyError("the policy answered with actions that are not finite; the arm must not move")
         return actions
+
+    def describe(self) -> dict[str, Any]:
+        """Where it comes from, for reports."""
+        training = self.description.training
+        return {
+            "kind": f"{training.get('algorithm')}, ONNX",
+            "trained_on": self.description.env_id,
+            "trained_with": self.description.trained_with,
+            "training_steps": training.get("steps"),
+            "training_episodes": training.get("episodes"),
+            "training_seed": training.get("seed"),
+            "package_version": self.description.package_version,
+        }
 
     def _check_graph(self, path: Path) -> None:
         """Refuses a graph with another input or output than the description's."""

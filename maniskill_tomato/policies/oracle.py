@@ -199,9 +199,17 @@ class Oracle(Planner):
     needs_truth = True
 
     def __init__(self, search: OracleSearch) -> None:
+        """Keeps the search; see `of`."""
         self._search = search
         self._ways: dict[int, Tensor] = {}
         self._excluded: dict[int, list[Tensor]] = {}
+
+    @classmethod
+    def of(
+        cls, ground_truth: GroundTruth, device: str | torch.device = "cpu", contact_free: bool = False
+    ) -> "Oracle":
+        """With a search among the places that the arm reaches."""
+        return cls(OracleSearch(ground_truth, device, contact_free=contact_free))
 
     def begin(self, belief: Belief, rows: Tensor) -> None:
         for i in rows.tolist():

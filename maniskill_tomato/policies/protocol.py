@@ -1,7 +1,7 @@
 """What a policy is, and what a policy that knows the truth may ask."""
 
 from abc import ABC, abstractmethod
-from typing import Any, Protocol
+from typing import Any, Protocol, runtime_checkable
 
 import torch
 from torch import Tensor
@@ -9,6 +9,7 @@ from torch import Tensor
 from maniskill_tomato.sensing.belief import Belief
 
 
+@runtime_checkable
 class Policy(Protocol):
     """Decides where B environments look next; any object with these attributes is a policy."""
 
@@ -39,7 +40,7 @@ class Policy(Protocol):
 
 
 class StatePolicy(Protocol):
-    """Decides from state vectors; `state_policy.ObservationPolicy` makes it a `Policy`."""
+    """Decides from state vectors; `adapters.ObservationPolicy` makes it a `Policy`."""
 
     def act(self, observations: Tensor) -> Tensor:
         """Actions of shape (B, A) for observations of shape (B, D), both as the task has them."""
@@ -118,6 +119,12 @@ class Planner(ABC):
     def describe(self) -> dict[str, Any]:
         """Its kind and where it comes from, for reports: numbers and strings."""
         return {"kind": self.name}
+
+
+def reseed(policy: Policy, seed: int) -> None:
+    """Begins the random numbers of a policy anew, if it draws any and says so by a method `reseed`."""
+    if (begin_anew := getattr(policy, "reseed", None)) is not None:
+        begin_anew(seed)
 
 
 class RandomPlanner(Planner):

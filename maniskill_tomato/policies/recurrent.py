@@ -8,7 +8,7 @@ from torch import Tensor, nn
 from torch.nn.utils.rnn import PackedSequence
 
 from maniskill_tomato.errors import InvalidInputError
-from maniskill_tomato.policies.network_file import holds, load_network, save_network
+from maniskill_tomato.policies.network_file import load_network, save_network
 from maniskill_tomato.policies.protocol import Planner
 from maniskill_tomato.sensing.belief import Belief
 from maniskill_tomato.sensing.observation import ObservationLayout, Part
@@ -68,6 +68,10 @@ class RecurrentPolicy(Planner):
         self.facts = facts or {}
         self._state = torch.zeros(1, 0, actor.sizes["width"])
 
+    def describe(self) -> dict[str, Any]:
+        """Its kind and its training."""
+        return {**super().describe(), **self.facts}
+
     def begin(self, belief: Belief, rows: Tensor) -> None:
         count = len(belief.camera_position)
         if self._state.shape[1] != count:
@@ -107,9 +111,6 @@ def load_recurrent(path: Path, device: str | torch.device = "cpu") -> RecurrentP
         actor = RecurrentActor(**data["sizes"])
         return RecurrentPolicy(actor, tuple(data["parts"]), dict(data["facts"])), actor
 
-    return load_network(path, FORMAT, device, build, "recurrent policy; scripts/train_imitation.py makes one")
-
-
-def is_recurrent(data: object) -> bool:
-    """Whether the content of a file is of `save_recurrent`."""
-    return holds(data, FORMAT)
+    return load_network(
+        path, FORMAT, device, build, "recurrent policy; `maniskill-tomato train-imitation` makes one"
+    )

@@ -1,87 +1,95 @@
-"""The planners by name."""
+"""Policies by name, and where each is made. Nothing heavy is imported before one is made."""
 
-from collections.abc import Callable
+from collections.abc import Mapping
+from dataclasses import dataclass
+from importlib.metadata import EntryPoint, entry_points
+from typing import TYPE_CHECKING, Final, Literal
 
-import torch
+if TYPE_CHECKING:
+    import torch
 
-from maniskill_tomato.errors import InvalidInputError
-from maniskill_tomato.policies.baselines import FixedSweep, LookAtServoing, RandomStep, RandomViewpoint, Stay
-from maniskill_tomato.policies.deep_move_to_see import DeepMoveToSee
-from maniskill_tomato.policies.gradient_view import GradientView
-from maniskill_tomato.policies.greedy_truth import GreedyTruth
-from maniskill_tomato.policies.lattice_oracle import LatticeOracle
-from maniskill_tomato.policies.move_to_see import MoveToSee, MoveToSeeOnMemory
-from maniskill_tomato.policies.next_best_view import NextBestDirection, NextBestView
-from maniskill_tomato.policies.oracle import Oracle, OracleSearch
-from maniskill_tomato.policies.planner_names import PLANNERS as PLANNERS
-from maniskill_tomato.policies.planner_names import PRIVILEGED as PRIVILEGED
-from maniskill_tomato.policies.protocol import GroundTruth, Planner
-from maniskill_tomato.policies.view_quality import ViewQuality
+    from maniskill_tomato.policies.protocol import GroundTruth, Policy
+
+ENTRY_POINT_GROUP: Final = "maniskill_tomato.policies"
+"""Other packages add policies with entry points of this group: a name, and a callable that takes a `PolicyContext` and
+returns a `Policy`."""
+
+Need = Literal["seed", "device", "ground_truth", "contact_free"]
 
 
-class _Setting:
-    """What a planner may need to be made."""
+@dataclass(frozen=True, kw_only=True)
+class PolicyContext:
+    """What a policy may need to be made."""
 
-    def __init__(
-        self,
-        ground_truth: GroundTruth | None,
-        contact_free: bool,
-        seed: int,
-        device: str | torch.device,
-    ) -> None:
-        self._truth = ground_truth
-        self.contact_free = contact_free
-        self.seed = seed
-        self.device = device
-
-    @property
-    def truth(self) -> GroundTruth:
-        if self._truth is None:
-            raise InvalidInputError(
-                "this planner knows the truth: give the ground_truth of the environment, env.unwrapped.ground_truth"
-            )
-        return self._truth
+    seed: int = 0
+    """Of its random numbers."""
+    device: "str | torch.device" = "cpu"
+    """Where the beliefs' tensors are."""
+    ground_truth: "GroundTruth | None" = None
+    """The simulator's knowledge; None where there is no simulator."""
+    contact_free: bool = False
+    """Whether the oracle touches no plant."""
 
 
-_MAKERS: dict[str, Callable[[_Setting], Planner]] = {
-    Stay.name: lambda s: Stay(),
-    RandomStep.name: lambda s: RandomStep(s.seed),
-    RandomViewpoint.name: lambda s: RandomViewpoint(s.seed),
-    FixedSweep.name: lambda s: FixedSweep(),
-    LookAtServoing.name: lambda s: LookAtServoing(),
-    MoveToSeeOnMemory.name: lambda s: MoveToSeeOnMemory(s.device),
-    DeepMoveToSee.name: lambda s: DeepMoveToSee.shipped(s.device),
-    GradientView.name: lambda s: GradientView(s.device),
-    NextBestDirection.name: lambda s: NextBestDirection(s.device),
-    NextBestView.name: lambda s: NextBestView(s.device),
-    ViewQuality.name: lambda s: ViewQuality.shipped(s.device),
-    MoveToSee.name: lambda s: MoveToSee(s.truth, s.device),
-    GreedyTruth.name: lambda s: GreedyTruth(s.truth, s.device),
-    LatticeOracle.name: lambda s: LatticeOracle(s.truth),
-    Oracle.name: lambda s: Oracle(OracleSearch(s.truth, s.device, contact_free=s.contact_free)),
+@dataclass(frozen=True)
+class Planner:
+    """A policy of this package that no file is needed for."""
+
+    made_by: str
+    """Module of this package, and a callable in it."""
+    needs: tuple[Need, ...] = ()
+    """What it is called with."""
+
+
+_PLANNERS: Mapping[str, Planner] = {
+    "stay": Planner("baselines:Stay"),
+    "random_step": Planner("baselines:RandomStep", ("seed",)),
+    "random_viewpoint": Planner("baselines:RandomViewpoint", ("seed",)),
+    "fixed_sweep": Planner("baselines:FixedSweep"),
+    "look_at": Planner("baselines:LookAtServoing"),
+    "3dmts_memory": Planner("move_to_see:MoveToSeeOnMemory", ("device",)),
+    "gradient_nbv": Planner("gradient_view:GradientView", ("device",)),
+    "nbv_direction": Planner("next_best_view:NextBestDirection"),
+    "nbv": Planner("next_best_view:NextBestView"),
+    "3dmts": Planner("move_to_see:MoveToSee", ("ground_truth", "device")),
+    "greedy_truth": Planner("greedy_truth:GreedyTruth", ("ground_truth", "device")),
+    "lattice_oracle": Planner("lattice_oracle:LatticeOracle", ("ground_truth",)),
+    "oracle": Planner("oracle:Oracle.of", ("ground_truth", "device", "contact_free")),
 }
 
+SHIPPED_FILES: Final[Mapping[str, str]] = {
+    "deep_3dmts": "policies/deep_3dmts.pt",
+    "view_quality": "policies/TomatoViewpoint-v1.pt",
+}
+"""Policies whose networks ship with the package, and their files in `assets`."""
 
-def make_planner(
-    name: str,
-    *,
-    ground_truth: GroundTruth | None = None,
-    contact_free: bool = False,
-    seed: int = 0,
-    device: str | torch.device = "cpu",
-) -> Planner:
-    """A planner with its default settings.
+PRIVILEGED: Final = tuple(name for name, planner in _PLANNERS.items() if "ground_truth" in planner.needs)
+"""Those that know the truth."""
 
-    Args:
-        name: One of `PLANNERS`.
-        ground_truth: The simulator's knowledge, for planners with `needs_truth`.
-        contact_free: Whether the oracle touches no plant.
-        seed: Of its random numbers.
-        device: Where the environment's tensors are.
+PLANNERS: Final = (*(n for n in _PLANNERS if n not in PRIVILEGED), *SHIPPED_FILES, *PRIVILEGED)
+"""All names of this package."""
+
+
+def policy_names() -> tuple[str, ...]:
+    """All names, those of this package first."""
+    return (*PLANNERS, *sorted(entry.name for entry in _entry_points() if entry.name not in PLANNERS))
+
+
+def make_planner(name: str, context: PolicyContext) -> "Policy":
+    """The policy of a name that is not among `SHIPPED_FILES`.
 
     Raises:
-        InvalidInputError: The name is unknown, or the planner needs the truth and none is given.
+        KeyError: There is none.
     """
-    if name not in _MAKERS:
-        raise InvalidInputError.choice("the planner", name, PLANNERS)
-    return _MAKERS[name](_Setting(ground_truth, contact_free, seed, device))
+    if name not in _PLANNERS:
+        others = {entry.name: entry for entry in _entry_points()}
+        made: Policy = others[name].load()(context)
+        return made
+    planner = _PLANNERS[name]
+    made_by = EntryPoint(name, f"maniskill_tomato.policies.{planner.made_by}", ENTRY_POINT_GROUP).load()
+    policy: Policy = made_by(**{need: getattr(context, need) for need in planner.needs})
+    return policy
+
+
+def _entry_points() -> tuple[EntryPoint, ...]:
+    return tuple(entry_points(group=ENTRY_POINT_GROUP))

@@ -16,7 +16,7 @@ from torch import Tensor
 
 from maniskill_tomato.errors import InvalidInputError
 from maniskill_tomato.policies.moves import Candidates, moves_needed
-from maniskill_tomato.policies.network_file import holds, load_network, save_network
+from maniskill_tomato.policies.network_file import load_network, save_network
 from maniskill_tomato.policies.protocol import Planner
 from maniskill_tomato.policies.quality_features import MAP_CHANNELS, SCALARS, quality_features
 from maniskill_tomato.policies.quality_network import ViewQualityNetwork
@@ -61,26 +61,12 @@ class ViewQuality(Planner):
         self.facts = facts or {}
         self.tried = Candidates()
 
-    @classmethod
-    def shipped(cls, device: str | torch.device = "cpu") -> "ViewQuality":
-        """The policy that ships with the package.
-
-        Raises:
-            InvalidInputError: None ships with this version.
-        """
-        from maniskill_tomato.assets import asset_path
-
-        try:
-            path = asset_path("policies/TomatoViewpoint-v1.pt")
-        except FileNotFoundError as error:
-            raise InvalidInputError(
-                "no view-quality policy ships with this version; train one with scripts/train_view_quality.py and give "
-                "its file"
-            ) from error
-        return load_view_quality(path, device)
-
     def begin(self, belief: Belief, rows: Tensor) -> None:
         self.tried.begin(belief, rows)
+
+    def describe(self) -> dict[str, Any]:
+        """Its kind and its training."""
+        return {**super().describe(), **self.facts}
 
     def success_probability(self, belief: Belief) -> Tensor:
         """P(full view) of every candidate. Shape (B, K)."""
@@ -119,13 +105,8 @@ def load_view_quality(path: Path, device: str | torch.device = "cpu") -> ViewQua
         return ViewQuality(network, ViewQualityConfig(**data["config"]), dict(data["facts"])), network
 
     return load_network(
-        path, FORMAT, device, build, "view-quality policy; scripts/train_view_quality.py makes one"
+        path, FORMAT, device, build, "view-quality policy; `maniskill-tomato train-view-quality` makes one"
     )
-
-
-def is_view_quality(data: object) -> bool:
-    """Whether the content of a file is of `save_view_quality`."""
-    return holds(data, FORMAT)
 
 
 def new_network(width: int = 32, blocks: int = 3) -> ViewQualityNetwork:

@@ -24,8 +24,7 @@ from torchvision.ops.misc import FrozenBatchNorm2d
 from maniskill_tomato.errors import CheckpointError, InvalidInputError, MissingWeightsError
 from maniskill_tomato.segmentation.efficientnet_lite import FEATURE_WIDTHS, EfficientNetLite0
 from maniskill_tomato.segmentation.fruit_network_config import FIXED_BLOCKS
-from maniskill_tomato.segmentation.instances import Image, Instances
-from maniskill_tomato.segmentation.segmenter import check_image
+from maniskill_tomato.segmentation.instances import Image, Instances, check_image
 from maniskill_tomato.segmentation.training.detector_presets import ClassicAugmentation, MaskRcnnConfig
 from maniskill_tomato.segmentation.weights import load_weights
 
@@ -195,7 +194,7 @@ def open_mask_rcnn(
     """
     if weights is None:
         raise CheckpointError(
-            "no Mask R-CNN weights ship; train some with `python scripts/train_segmenter.py mask-rcnn` and give "
+            "no Mask R-CNN weights ship; train some with `maniskill-tomato train-segmenter mask-rcnn` and give "
             "their file as the segmenter"
         )
     data = load_weights(Path(weights), "mask_rcnn")

@@ -1,4 +1,4 @@
-"""Files of segmenter weights: what they are for, how they were trained, and half-precision tensors."""
+"""Files of segmenter weights: name of the segmenter, configuration, training, tensors in half precision."""
 
 import io
 from pathlib import Path
@@ -93,12 +93,12 @@ def _read(path: Path) -> dict[str, Any]:
     """The content of a file that `save_weights` wrote."""
     if not path.is_file():
         raise CheckpointError(
-            f"no weights at {path}; train some with scripts/train_segmenter.py, or leave --segmenter out to use "
-            "those that ship"
+            f"no weights at {path}; train some with `maniskill-tomato train-segmenter`, or leave --segmenter out to "
+            "use those that ship"
         )
     data = read_tensors(path)
     if not isinstance(data, dict) or not isinstance(data.get("segmenter"), str) or "state" not in data:
         raise CheckpointError(
-            f"{path} holds no segmenter's weights; scripts/train_segmenter.py writes such files"
+            f"{path} holds no segmenter's weights; `maniskill-tomato train-segmenter` writes such files"
         )
     return data

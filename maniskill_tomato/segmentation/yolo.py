@@ -17,8 +17,7 @@ from maniskill_tomato.errors import CheckpointError, InvalidInputError, MissingP
 from maniskill_tomato.files import write_atomically
 from maniskill_tomato.segmentation.datasets.annotations import AnnotatedImage, ignored_fruit
 from maniskill_tomato.segmentation.datasets.picture_files import write_picture
-from maniskill_tomato.segmentation.instances import TOMATO, Image, Instances, box_ellipse
-from maniskill_tomato.segmentation.segmenter import check_image
+from maniskill_tomato.segmentation.instances import TOMATO, Image, Instances, box_ellipse, check_image
 from maniskill_tomato.segmentation.training.detector_presets import YOLO_PRESET, YoloConfig
 
 
@@ -93,7 +92,7 @@ def open_yolo(weights: Path | str | None = None, score_threshold: float | None =
         raise InvalidInputError(f"score_threshold must be between 0 and 1, got {threshold}")
     if weights is None or not Path(weights).is_file():
         raise CheckpointError(
-            f"no YOLO weights at {weights}; train some with `python scripts/train_segmenter.py yolo` and give their "
+            f"no YOLO weights at {weights}; train some with `maniskill-tomato train-segmenter yolo` and give their "
             "file, whose name begins with yolo, as the segmenter"
         )
     return YoloSegmenter(import_ultralytics().YOLO(str(weights)), threshold)

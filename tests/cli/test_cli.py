@@ -18,9 +18,9 @@ from maniskill_tomato.cli.eval_command import Eval
 from maniskill_tomato.cli.shared_options import PlantOptions
 from maniskill_tomato.cli.train_command import Train
 from maniskill_tomato.learning.rl.agent import make_agent
-from maniskill_tomato.learning.rl.checkpoint import load_checkpoint, make_checkpoint, save_checkpoint
-from maniskill_tomato.learning.rl.policy import load_policy
+from maniskill_tomato.learning.rl.checkpoint import make_checkpoint, save_checkpoint
 from maniskill_tomato.learning.rl.presets import get_preset
+from maniskill_tomato.policies.trained_actor import load_actor, load_checkpoint
 from maniskill_tomato.tasks import THESIS_IDS
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -89,7 +89,7 @@ def test_options_of_the_learner_are_flags(tmp_path: Path, options: tuple[str, ..
             assert str(config["config"][flag.removeprefix("--").replace("-", "_")]) == value
     assert config["env_options"] == {}
     main(["train", "--resume", str(tmp_path / "run"), "--total-timesteps", "120"])
-    policy = load_policy(tmp_path / "run" / "policy.pt")
+    policy = load_actor(tmp_path / "run" / "policy.pt")
     assert policy.counters["steps"] == 120 and policy.counters["updates"] > 0
 
 
@@ -215,7 +215,7 @@ def test_a_run_on_another_plant_leaves_policies_that_say_so(
     options = {"plant": {"preset": "three_tomatoes", "seed": 4}, "plant_pose": [0.8, 0.1, 0.5]}
     (newest, *_) = sorted((tmp_path / "checkpoints").iterdir(), reverse=True)
     for path in (tmp_path / "policy.pt", newest):
-        assert load_policy(path).env_options == options
+        assert load_actor(path).env_options == options
     capsys.readouterr()
     short = ("--episodes", "1", "--no-video", "--no-baseline", "--out", str(tmp_path / "eval"))
     main(["eval", GUIDED, "--policy", str(tmp_path / "policy.pt"), *short])
@@ -232,7 +232,7 @@ def test_the_demo_names_its_report_and_its_policy(tmp_path: Path, capsys: pytest
         "video   not wanted",
         f"policy  {tmp_path / 'training' / 'policy.pt'}",
     ]
-    assert load_policy(tmp_path / "training/policy.pt").env_id == GUIDED
+    assert load_actor(tmp_path / "training/policy.pt").env_id == GUIDED
     page = (tmp_path / "report.html").read_text()
     assert "Training" in page and 'href="training/policy.pt"' in page
 
@@ -325,4 +325,4 @@ def test_ctrl_c_in_the_terminal_saves_the_policy(tmp_path: Path) -> None:
         process.kill()
     assert process.returncode == 0, errors
     assert "(SIGINT)" in output
-    assert load_policy(tmp_path / "run/policy.pt").counters["steps"] > 0
+    assert load_actor(tmp_path / "run/policy.pt").counters["steps"] > 0

@@ -21,7 +21,7 @@ from maniskill_tomato.deploy.interface import Frame, JointMove
 from maniskill_tomato.deploy.loop import Loop
 from maniskill_tomato.deploy.loop_config import Proposal
 from maniskill_tomato.deploy.mock.episode import load_episode
-from maniskill_tomato.deploy.policies import default_policy, open_policy
+from maniskill_tomato.deploy.policies import TASK, default_policy
 from maniskill_tomato.deploy.profile import Profile, load_profile, parse_profile
 from maniskill_tomato.deploy.profile_files import profile_names
 from maniskill_tomato.deploy.robot_perception import TRUE_MASKS, ImagePerception, Sighting
@@ -29,7 +29,8 @@ from maniskill_tomato.deploy.steps import KeptSteps, RunResult
 from maniskill_tomato.deploy.stops import Stops
 from maniskill_tomato.deploy.workcell import Workcell, make_workcell
 from maniskill_tomato.errors import PolicyError
-from maniskill_tomato.policies.protocol import Planner
+from maniskill_tomato.policies.opening import open_policy
+from maniskill_tomato.policies.protocol import Planner, Policy
 from maniskill_tomato.robot.d435 import T_flange_camera_color_optical
 from maniskill_tomato.robot.kinematics import forward_kinematics
 from maniskill_tomato.sensing.belief import Belief
@@ -75,7 +76,7 @@ class Towards(Planner):
 
 def go(
     of: Profile,
-    policy: Planner | None = None,
+    policy: Policy | None = None,
     clock: Any = None,
     stops: Stops | None = None,
     seed: int = EPISODE,
@@ -94,7 +95,7 @@ def go(
 
 
 def test_a_planner_finds_the_tomato_and_the_run_ends_with_success() -> None:
-    result, _ = go(profile(loop="threshold = 0.8"), open_policy("nbv"), seed=6)
+    result, _ = go(profile(loop="threshold = 0.8"), open_policy("nbv", env_id=TASK), seed=6)
     assert result.success and result.reason == "success" and not result.is_fault
     assert result.visible_fraction > 0.8 >= max(result.visible_fractions[:-1])
     assert result.moves == len(result.visible_fractions) - 1
@@ -102,7 +103,7 @@ def test_a_planner_finds_the_tomato_and_the_run_ends_with_success() -> None:
 
 
 def test_a_view_that_never_gets_better_ends_with_the_budget() -> None:
-    result, _ = go(profile("depth_noise = 0.0"), open_policy("stay"))
+    result, _ = go(profile("depth_noise = 0.0"), open_policy("stay", env_id=TASK))
     assert (result.reason, result.moves, result.is_fault, result.success) == ("budget", 6, False, False)
     assert len(set(result.visible_fractions)) == 1
 
@@ -212,20 +213,20 @@ class Withheld(TrueMasks):
         return [label for label in ripe if label != target]
 
 
-def with_perception(of: Profile, perception: Any, policy: Planner) -> RunResult:
+def with_perception(of: Profile, perception: Any, policy: Policy) -> RunResult:
     workcell = replace(make_workcell(of, EPISODE), perception=perception)
     with workcell.arm, workcell.camera, Stops() as stops:
         return workcell.loop(policy, stops, "unattended").run()
 
 
 def test_a_target_that_stays_out_of_sight_is_lost() -> None:
-    result = with_perception(profile(loop="lost_after = 3"), Hidden(), open_policy("stay"))
+    result = with_perception(profile(loop="lost_after = 3"), Hidden(), open_policy("stay", env_id=TASK))
     assert (result.reason, result.moves, result.is_fault) == ("target_lost", 3, False)
 
 
 def test_fruits_that_change_places_in_the_list_change_nothing() -> None:
-    plain = with_perception(profile(), TrueMasks(), open_policy("nbv"))
-    swapped = with_perception(profile(), Swapped(), open_policy("nbv"))
+    plain = with_perception(profile(), TrueMasks(), open_policy("nbv", env_id=TASK))
+    swapped = with_perception(profile(), Swapped(), open_policy("nbv", env_id=TASK))
     assert swapped.visible_fractions == plain.visible_fractions
     assert swapped.reason == plain.reason
 
@@ -238,7 +239,7 @@ def test_a_neighbour_does_not_pass_for_a_target_that_is_not_found(seed: int) -> 
     workcell = replace(workcell, perception=Withheld())
     kept = KeptSteps()
     with workcell.arm, workcell.camera, Stops() as stops:
-        result = workcell.loop(open_policy(default_policy()), stops, "unattended", kept).run()
+        result = workcell.loop(open_policy(default_policy(), env_id=TASK), stops, "unattended", kept).run()
     assert not result.success and not result.is_fault
     assert max(step.view.fruits_seen for step in kept.steps) > 0
     assert result.best_visible_fraction < 0.3, "a sliver at most, where a fruit can hardly be located"
@@ -246,7 +247,7 @@ def test_a_neighbour_does_not_pass_for_a_target_that_is_not_found(seed: int) -> 
 
 def test_without_a_given_target_the_largest_fruit_in_the_picture_is_taken() -> None:
     text = TEXT.format(twin="", loop="").replace('source = "twin"', 'source = "seen"')
-    result, workcell = go(parse_profile(text, Path("seen.toml")), open_policy("nbv"))
+    result, workcell = go(parse_profile(text, Path("seen.toml")), open_policy("nbv", env_id=TASK))
     assert not result.is_fault and result.reason in ("success", "budget", "refused")
     assert result.visible_fractions[0] > 0.0
 
@@ -269,17 +270,17 @@ def test_a_policy_that_answers_nonsense_moves_nothing(action: tuple[float, ...],
 
 
 def test_policies_for_other_tasks_and_with_the_truth_are_refused(tmp_path: Path) -> None:
-    with pytest.raises(PolicyError, match="no view-quality policy"):
-        open_policy(str(asset_path("policies/TomatoViewpointGuided-v1.pt")))
+    with pytest.raises(PolicyError, match="trained on TomatoViewpointGuided-v1, not on TomatoViewpoint-v1"):
+        open_policy(str(asset_path("policies/TomatoViewpointGuided-v1.pt")), env_id=TASK)
     with pytest.raises(PolicyError, match="in simulation only"):
-        open_policy("oracle")
-    with pytest.raises(PolicyError, match=r"no policy at .*one of the planners .*nbv"):
-        open_policy(str(tmp_path / "missing.pt"))
+        open_policy("oracle", env_id=TASK)
+    with pytest.raises(PolicyError, match=r"no policy at .*one of .*nbv"):
+        open_policy(str(tmp_path / "missing.pt"), env_id=TASK)
     damaged = tmp_path / "damaged.pt"
     damaged.write_bytes(b"PK\x03\x04 nothing")
     with pytest.raises(PolicyError, match="not a readable checkpoint"):
-        open_policy(str(damaged))
-    assert open_policy(default_policy()) is not None
+        open_policy(str(damaged), env_id=TASK)
+    assert open_policy(default_policy(), env_id=TASK) is not None
 
 
 class JumpingClock(SimulatedClock):

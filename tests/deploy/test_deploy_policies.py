@@ -13,7 +13,6 @@ from onnx import numpy_helper
 
 from maniskill_tomato.assets import asset_path
 from maniskill_tomato.cli import main
-from maniskill_tomato.deploy.policies import open_policy
 from maniskill_tomato.deploy.profile import load_profile
 from maniskill_tomato.deploy.replay import load_recording
 from maniskill_tomato.deploy.steps import KeptSteps
@@ -23,9 +22,8 @@ from maniskill_tomato.errors import PolicyError
 from maniskill_tomato.learning.rl.agent import make_agent
 from maniskill_tomato.learning.rl.checkpoint import make_checkpoint, save_checkpoint
 from maniskill_tomato.learning.rl.export import export_policy
-from maniskill_tomato.learning.rl.policy import load_policy
 from maniskill_tomato.learning.rl.presets import get_preset
-from maniskill_tomato.policies.learned import LearnedPolicy
+from maniskill_tomato.policies.opening import open_policy
 from maniskill_tomato.sensing.observation import ObservationLayout
 
 TASK = "TomatoViewpoint-v1"
@@ -93,7 +91,7 @@ def test_an_exported_policy_makes_the_moves_that_it_makes_in_torch(tmp_path: Pat
     exported = [step.facts for step in load_recording(tmp_path / "out" / "run.mcap").steps]
     workcell, kept = make_workcell(load_profile(str(profile)), SEED), KeptSteps()
     with workcell.arm, workcell.camera, Stops() as stops:
-        policy = LearnedPolicy(load_policy(source, env_id=TASK))
+        policy = open_policy(source, env_id=TASK)
         workcell.loop(policy, stops, "unattended", kept).run()
     assert len(kept.steps) == len(exported) == 6
     assert any(step.outcome == "moved" for step in kept.steps)
@@ -139,10 +137,13 @@ def test_exported_policies_of_other_tasks_and_damaged_ones_are_refused_before_an
     alone = tmp_path / "alone.onnx"
     alone.write_bytes(other.read_bytes())
     for model, words in (
-        (other, "was trained on TomatoViewpointGuided-v1; the loop has the observations and moves of"),
+        (other, "was trained on TomatoViewpointGuided-v1, not on TomatoViewpoint-v1"),
         (damaged, "SHA-256 differ"),
         (alone, "must stay together"),
-        (saved(tmp_path / "raw.pt"), "run `maniskill-tomato export` and give the .onnx file"),
+        (
+            asset_path("policies/TomatoViewpointSparse-v1.pt"),
+            "was trained on TomatoViewpointSparse-v1, not on",
+        ),
     ):
         with pytest.raises(SystemExit) as end:
             run(profile, model, tmp_path / "out")
@@ -151,4 +152,4 @@ def test_exported_policies_of_other_tasks_and_damaged_ones_are_refused_before_an
         assert error.startswith("error: ") and words in error and error.count("\n") == 1
         assert not (tmp_path / "out").exists()
         with pytest.raises(PolicyError):
-            open_policy(str(model))
+            open_policy(str(model), env_id=TASK)

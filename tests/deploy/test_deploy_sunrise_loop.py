@@ -15,7 +15,7 @@ from maniskill_tomato.deploy.loop import Loop
 from maniskill_tomato.deploy.loop_config import LoopConfig
 from maniskill_tomato.deploy.mock.episode import load_episode
 from maniskill_tomato.deploy.mock.options import twin_options, twin_world
-from maniskill_tomato.deploy.policies import open_policy
+from maniskill_tomato.deploy.policies import TASK
 from maniskill_tomato.deploy.robot_perception import TruthPerception
 from maniskill_tomato.deploy.safety import Safety
 from maniskill_tomato.deploy.safety_config import SafetyConfig
@@ -23,6 +23,7 @@ from maniskill_tomato.deploy.steps import RunResult
 from maniskill_tomato.deploy.stops import Stops
 from maniskill_tomato.deploy.sunrise.loopback import LoopbackController
 from maniskill_tomato.deploy.sunrise.loopback_faults import Fault
+from maniskill_tomato.policies.opening import open_policy
 from maniskill_tomato.robot.d435 import T_flange_camera_color_optical
 
 TWIN = {"width": 160, "height": 120, "depth_noise": 0.0}
@@ -70,7 +71,7 @@ def run(
                 camera=camera,
                 capture=Capture(camera, CaptureConfig(max_age=5.0), clock),
                 perception=TruthPerception(),
-                policy=open_policy("nbv", 0),
+                policy=open_policy("nbv", env_id=TASK),
                 T_flange_camera=T_flange_camera_color_optical,
                 clock=clock,
                 config=LoopConfig(max_moves=moves),

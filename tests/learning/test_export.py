@@ -22,17 +22,18 @@ import maniskill_tomato
 from maniskill_tomato.assets import asset_path
 from maniskill_tomato.cli import main
 from maniskill_tomato.errors import CheckpointError, InvalidInputError, PolicyError
-from maniskill_tomato.experiments.exported import ExportedPolicy, open_policy, origin
 from maniskill_tomato.experiments.rollout import run_episodes
 from maniskill_tomato.learning.rl.agent import make_agent
 from maniskill_tomato.learning.rl.checkpoint import make_checkpoint, save_checkpoint
 from maniskill_tomato.learning.rl.envs import make_env
 from maniskill_tomato.learning.rl.export import DenseActor, export_actor, export_policy, rounding_tolerance
-from maniskill_tomato.learning.rl.networks import ObservationNormalizer
-from maniskill_tomato.learning.rl.policy import load_policy
 from maniskill_tomato.learning.rl.presets import PRESETS, TrainConfig, get_preset
+from maniskill_tomato.policies.actor import ObservationNormalizer
+from maniskill_tomato.policies.adapters import ObservationPolicy, origin
 from maniskill_tomato.policies.description import INPUT_NAME, PolicyDescription
 from maniskill_tomato.policies.onnx_policy import OnnxPolicy
+from maniskill_tomato.policies.opening import open_policy
+from maniskill_tomato.policies.trained_actor import load_actor
 from maniskill_tomato.sensing.observation import ObservationLayout
 from maniskill_tomato.tasks import THESIS_IDS
 
@@ -92,7 +93,7 @@ def exact(path: Path, observations: NDArray[np.floating[Any]]) -> NDArray[np.flo
 
 def exact_torch(path: Path, observations: NDArray[np.floating[Any]]) -> NDArray[np.float64]:
     """What the policy file NAME.pt says with every number in float64. Shape (B, A)."""
-    policy = load_policy(path)
+    policy = load_actor(path)
     parts = {name: getattr(policy, name).double() for name in ("action_scale", "action_low", "action_high")}
     double = replace(policy, actor=policy.actor.double(), normalizer=policy.normalizer.double(), **parts)
     return double.act(torch.from_numpy(observations).double()).numpy()
@@ -100,7 +101,7 @@ def exact_torch(path: Path, observations: NDArray[np.floating[Any]]) -> NDArray[
 
 def actor_of(path: Path) -> DenseActor:
     """The parts of the policy file NAME.pt."""
-    policy = load_policy(path)
+    policy = load_actor(path)
     return DenseActor(
         act=policy.act,
         normalizer=policy.normalizer,
@@ -356,9 +357,9 @@ def test_the_description_says_what_plant_the_training_had(tmp_path: Path) -> Non
         assert content["task"]["trained_with"] == kept
         assert content["task"]["default_plant"]["preset"] == "one_tomato"
         policy = open_policy(model)
-        assert isinstance(policy, ExportedPolicy) and policy.description.trained_with == kept
+        assert isinstance(policy, ObservationPolicy) and policy.describe()["trained_with"] == kept
         lines.append(origin(policy))
-        assert origin(load_policy(tmp_path / "p.pt")) == lines[-1].replace("TD3, ONNX", "TD3")
+        assert origin(open_policy(tmp_path / "p.pt")) == lines[-1].replace("TD3, ONNX", "TD3")
     assert lines == [
         f'TD3, ONNX, trained on {GUIDED} with plant={{"preset": "full"}}, plant_pose=[0.8, 0.1, 0.5]',
         f"TD3, ONNX, trained on {GUIDED} with the task's own plant and options",
@@ -550,7 +551,7 @@ def test_an_actor_that_the_export_does_not_know_is_not_exported(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     source = make_policy(tmp_path / "p.pt", gain=100.0)
-    monkeypatch.setattr("maniskill_tomato.learning.rl.networks.torch.relu", torch.nn.functional.gelu)
+    monkeypatch.setattr("maniskill_tomato.policies.actor.torch.relu", torch.nn.functional.gelu)
     with pytest.raises(PolicyError, match="ONNX Runtime and PyTorch differ by .* nothing was written"):
         export_policy(source, tmp_path / "out")
     assert not (tmp_path / "out").exists()
@@ -592,9 +593,9 @@ def test_the_command_answers_bad_files_in_words(tmp_path: Path, capsys: pytest.C
     (tmp_path / "bad.pt").write_text("hello")
     (tmp_path / "bad.onnx").write_text("hello")
     for arguments, message in (
-        (("export", "--policy", str(tmp_path / "no.pt")), "no checkpoint at"),
+        (("export", "--policy", str(tmp_path / "no.pt")), "--policy: there is no file"),
         (("export", "--policy", str(tmp_path / "bad.pt")), "not a readable checkpoint"),
-        (("eval", GUIDED, "--policy", str(tmp_path / "no.onnx")), "cannot read the exported policy"),
+        (("eval", GUIDED, "--policy", str(tmp_path / "no.onnx")), "--policy: no policy at"),
         (("eval", GUIDED, "--policy", str(tmp_path / "bad.onnx")), "cannot read the description"),
     ):
         with pytest.raises(SystemExit) as ended:
@@ -611,7 +612,9 @@ def test_an_exported_policy_has_the_same_episodes_as_its_source(tmp_path: Path, 
     target = export_policy(source, tmp_path).model
     env = make_env(env_id)
     try:
-        ours, theirs = (run_episodes(env, open_policy(path, env_id), 6, 40) for path in (source, target))
+        ours, theirs = (
+            run_episodes(env, open_policy(path, env_id=env_id), 6, 40) for path in (source, target)
+        )
     finally:
         env.close()
     for a, b in zip(ours, theirs, strict=True):

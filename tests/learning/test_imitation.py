@@ -10,9 +10,8 @@ import torch
 from torch import nn
 from torch.nn.utils.rnn import pack_sequence, unpack_sequence
 
-from maniskill_tomato.errors import CheckpointError, InvalidInputError
-from maniskill_tomato.experiments.view_rollout import run_view_episode
-from maniskill_tomato.experiments.viewpoint_policy import open_viewpoint_policy
+from maniskill_tomato.errors import InvalidInputError, PolicyError
+from maniskill_tomato.experiments.rollout import run_episode
 from maniskill_tomato.learning.imitation.collect import ImitationData, collect_demonstrations
 from maniskill_tomato.learning.imitation.fit import (
     direction_loss,
@@ -23,6 +22,7 @@ from maniskill_tomato.learning.imitation.imitation_config import ImitationConfig
 from maniskill_tomato.learning.imitation.training import train_imitation
 from maniskill_tomato.learning.rl.envs import make_env
 from maniskill_tomato.policies.lattice_oracle import LatticeOracle
+from maniskill_tomato.policies.opening import open_policy
 from maniskill_tomato.policies.recurrent import RecurrentActor, RecurrentPolicy, columns_of, save_recurrent
 from maniskill_tomato.robot.look_at import look_at_pose
 from maniskill_tomato.robot.look_at_move import MAX_MOVE
@@ -59,8 +59,8 @@ def test_the_lattice_oracle_goes_to_the_nearest_candidate_that_shows_the_target(
                 best, fewest = k, needed
     oracle.act(belief)
     assert int(oracle.tried.chosen[0]) == best
-    episode = run_view_episode(env, oracle, 3)
-    assert episode.success and episode.moves <= fewest[0] + 1
+    episode = run_episode(env, oracle, 3)
+    assert episode.success and episode.steps <= fewest[0] + 1
 
 
 def test_what_is_collected_is_what_was_seen_and_what_the_teacher_does(env: Any) -> None:
@@ -162,12 +162,12 @@ def test_a_recurrent_policy_begins_anew_and_survives_its_file(env: Any, tmp_path
     first, second = policy.act(belief), policy.act(belief)
     assert not torch.equal(first, second)
     save_recurrent(tmp_path / "policy.pt", policy)
-    loaded = open_viewpoint_policy(tmp_path / "policy.pt", "TomatoViewpointRow-v1")
+    loaded = open_policy(tmp_path / "policy.pt", env_id="TomatoViewpointRow-v1")
     assert isinstance(loaded, RecurrentPolicy) and loaded.facts == {"steps": 3}
     loaded.begin(belief, ONE)
     torch.testing.assert_close(loaded.act(belief), first)
-    with pytest.raises(CheckpointError, match="Sparse"):
-        open_viewpoint_policy(tmp_path / "policy.pt", "TomatoViewpointSparse-v1")
+    with pytest.raises(PolicyError, match="Sparse"):
+        open_policy(tmp_path / "policy.pt", env_id="TomatoViewpointSparse-v1")
     with pytest.raises(InvalidInputError, match="8 numbers"):
         RecurrentPolicy(RecurrentActor(9, width=16), parts)
     with pytest.raises(InvalidInputError, match="viewpoint"):
@@ -193,9 +193,9 @@ def test_a_training_goes_on_where_it_was(student: Any, tmp_path: Path) -> None:
     assert not any("blocks)" in line for line in lines)
     env = make_env("TomatoViewpoint-v1", **options)
     try:
-        episode = run_view_episode(env, open_viewpoint_policy(path, "TomatoViewpoint-v1"), 0)
+        episode = run_episode(env, open_policy(path, env_id="TomatoViewpoint-v1"), 0)
     finally:
         env.close()
-    assert 1 <= episode.moves <= 20
+    assert 1 <= episode.steps <= 20
     with pytest.raises(InvalidInputError, match="other settings"):
         train_imitation(tmp_path / "run", ImitationConfig(), env_options=options)

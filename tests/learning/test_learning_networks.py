@@ -4,19 +4,14 @@ import pytest
 import torch
 
 from maniskill_tomato.learning.rl.agent import make_agent
-from maniskill_tomato.learning.rl.networks import (
-    ACTOR_SMALL_OUTPUT_BOUND,
-    CRITIC_OUTPUT_BOUND,
-    Actor,
-    Critic,
-    ObservationNormalizer,
-)
+from maniskill_tomato.learning.rl.critic import CRITIC_OUTPUT_BOUND, Critic
 from maniskill_tomato.learning.rl.presets import (
     OBSERVATION_CENTRE,
     OBSERVATION_HALF_RANGE,
     PRESETS,
     get_preset,
 )
+from maniskill_tomato.policies.actor import ACTOR_SMALL_OUTPUT_BOUND, Actor, ObservationNormalizer
 
 
 def parameter_count(module: torch.nn.Module) -> int:

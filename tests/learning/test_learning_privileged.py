@@ -17,11 +17,11 @@ import maniskill_tomato  # noqa: F401
 from maniskill_tomato.errors import InvalidInputError
 from maniskill_tomato.learning.rl.agent import make_agent, update
 from maniskill_tomato.learning.rl.curriculum import LeafDensityCurriculum
-from maniskill_tomato.learning.rl.policy import load_policy
 from maniskill_tomato.learning.rl.presets import get_preset
 from maniskill_tomato.learning.rl.replay import Batch
 from maniskill_tomato.learning.rl.run import train
 from maniskill_tomato.plants.row import leaf_density_of
+from maniskill_tomato.policies.trained_actor import load_actor
 from maniskill_tomato.robot.look_at import look_at_pose, look_frame
 from maniskill_tomato.sensing.observation import MAP_SIDE, NEAR_MAP_SIDE, ObservationLayout
 from maniskill_tomato.sensing.true_views import TRUE_VIEWS, TrueViews, map_positions
@@ -139,7 +139,7 @@ def test_a_run_with_privileged_critics_leaves_a_policy_of_the_common_observation
 ) -> None:
     options = {"plant": {"pool": 2}}
     result = train("TomatoViewpoint-v1", SMALL, tmp_path / "run", 0, options, show_progress=False)
-    policy = load_policy(result.policy_path)
+    policy = load_actor(result.policy_path)
     assert policy.observation_dim == SIZE
     env.reset(seed=0)
     assert policy.act(env.unwrapped.belief.observation).shape == (1, 3)

@@ -23,12 +23,13 @@ from torch import Tensor
 
 from maniskill_tomato import cli
 from maniskill_tomato.errors import CheckpointError, InvalidInputError, TrainingDivergedError
-from maniskill_tomato.learning.rl.checkpoint import load_checkpoint, save_checkpoint
+from maniskill_tomato.learning.rl.checkpoint import save_checkpoint
 from maniskill_tomato.learning.rl.env_state import env_state, set_env_state
 from maniskill_tomato.learning.rl.envs import make_learner_env
 from maniskill_tomato.learning.rl.presets import TrainConfig, get_preset
 from maniskill_tomato.learning.rl.run_folder import checkpoints, clear_run, only_writer
 from maniskill_tomato.learning.rl.trainer import Trainer, TrainResult
+from maniskill_tomato.policies.trained_actor import load_checkpoint
 
 GUIDED = "TomatoViewpointGuided-v1"
 HORIZON = 12

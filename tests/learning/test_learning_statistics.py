@@ -9,10 +9,10 @@ import torch
 
 from maniskill_tomato.errors import InvalidInputError
 from maniskill_tomato.learning.rl.agent import make_agent
-from maniskill_tomato.learning.rl.networks import ObservationNormalizer
-from maniskill_tomato.learning.rl.policy import load_policy
 from maniskill_tomato.learning.rl.presets import TrainConfig, get_preset
 from maniskill_tomato.learning.rl.running_statistics import SMALLEST_SPREAD, RunningStatistics
+from maniskill_tomato.policies.actor import ObservationNormalizer
+from maniskill_tomato.policies.trained_actor import load_actor
 from maniskill_tomato.tasks import THESIS_IDS
 
 
@@ -66,6 +66,6 @@ def test_options_of_older_runs_still_mean_what_they_meant() -> None:
 def test_policies_that_ship_still_scale_as_they_were_trained() -> None:
     root = Path(__file__).resolve().parents[2]
     for env_id in THESIS_IDS:
-        policy = load_policy(root / "assets/policies" / f"{env_id}.pt")
-        assert policy.config.normalize_observations == "fixed"
+        policy = load_actor(root / "assets/policies" / f"{env_id}.pt")
+        assert policy.config["normalize_observations"] == "fixed"
         assert float(policy.normalizer.half_range[0]) == 0.5

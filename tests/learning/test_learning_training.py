@@ -17,12 +17,11 @@ import torch
 from torch import Tensor
 
 from maniskill_tomato.errors import CheckpointError, InvalidInputError, TrainingDivergedError
-from maniskill_tomato.learning.rl.checkpoint import load_checkpoint
 from maniskill_tomato.learning.rl.history import TrainingHistory, load_history
-from maniskill_tomato.learning.rl.policy import load_policy
 from maniskill_tomato.learning.rl.presets import PRESETS, TrainConfig, default_preset, get_preset
 from maniskill_tomato.learning.rl.rewards import potential_reward
 from maniskill_tomato.learning.rl.trainer import Trainer
+from maniskill_tomato.policies.trained_actor import load_actor, load_checkpoint
 
 HORIZON = 30
 
@@ -129,8 +128,8 @@ def test_training_solves_the_toy_task_that_an_untrained_policy_does_not(tmp_path
     trained = train(
         ReachTask(), small_config(total_timesteps=4000, exploration_steps=2000), tmp_path / "trained"
     )
-    assert success_rate(load_policy(untrained.policy_path), 100) < 0.3
-    assert success_rate(load_policy(trained.policy_path), 100) > 0.7
+    assert success_rate(load_actor(untrained.policy_path), 100) < 0.3
+    assert success_rate(load_actor(trained.policy_path), 100) > 0.7
 
 
 def test_fast_td3_in_small_solves_the_toy_task(tmp_path: Path) -> None:
@@ -154,7 +153,7 @@ def test_fast_td3_in_small_solves_the_toy_task(tmp_path: Path) -> None:
         step_cost=0.02,
     )
     trained = train(ReachTask(8), config, tmp_path / "run")
-    assert success_rate(load_policy(trained.policy_path), 100) > 0.7
+    assert success_rate(load_actor(trained.policy_path), 100) > 0.7
 
 
 def test_one_seed_gives_one_policy_and_another_seed_another(tmp_path: Path) -> None:
@@ -397,11 +396,11 @@ def test_a_run_begins_with_a_given_actor_which_waits_for_the_critics(tmp_path: P
     )
     second = train(ReachTask(), config, tmp_path / "second", seed=1)
     assert second.updates > 20
-    before, after = load_policy(first.policy_path), load_policy(second.policy_path)
+    before, after = load_actor(first.policy_path), load_actor(second.policy_path)
     for a, b in zip(before.actor.parameters(), after.actor.parameters(), strict=True):
         torch.testing.assert_close(a, b, rtol=0.0, atol=0.0)
     moving = replace(config, actor_starts=0)
-    third = load_policy(train(ReachTask(), moving, tmp_path / "third", seed=1).policy_path)
+    third = load_actor(train(ReachTask(), moving, tmp_path / "third", seed=1).policy_path)
     assert not torch.equal(next(third.actor.parameters()), next(before.actor.parameters()))
 
 

@@ -11,18 +11,18 @@ import torch
 from torch import Tensor
 
 from maniskill_tomato.cli import main
-from maniskill_tomato.errors import CheckpointError, InvalidInputError
+from maniskill_tomato.errors import CheckpointError, InvalidInputError, PolicyError
 from maniskill_tomato.experiments.metrics import summarise
-from maniskill_tomato.experiments.rollout import run_episodes
-from maniskill_tomato.experiments.view_rollout import run_view_episode
-from maniskill_tomato.experiments.viewpoint_policy import acting_policy, open_viewpoint_policy
+from maniskill_tomato.experiments.rollout import run_episode, run_episodes
 from maniskill_tomato.learning.rl.envs import make_env
 from maniskill_tomato.learning.view_quality.collect import QualityData, collect_episodes
 from maniskill_tomato.learning.view_quality.fit import fit, judge, mirrored
 from maniskill_tomato.learning.view_quality.quality_config import FitConfig, QualityTrainConfig
 from maniskill_tomato.learning.view_quality.training import train_view_quality
+from maniskill_tomato.policies.adapters import as_state_policy
 from maniskill_tomato.policies.moves import move_towards
 from maniskill_tomato.policies.next_best_view import NextBestView
+from maniskill_tomato.policies.opening import open_policy
 from maniskill_tomato.policies.quality_features import FEATURES, MAP_CHANNELS, SCALARS, quality_features
 from maniskill_tomato.policies.quality_network import ViewQualityNetwork
 from maniskill_tomato.policies.view_quality import (
@@ -313,9 +313,9 @@ def test_a_saved_policy_says_the_same(belief: Belief, tmp_path: Path) -> None:
     loaded = load_view_quality(tmp_path / "p.pt")
     assert loaded.config == policy.config and loaded.facts == policy.facts
     torch.testing.assert_close(loaded.success_probability(belief), policy.success_probability(belief))
-    assert isinstance(open_viewpoint_policy(tmp_path / "p.pt", "TomatoViewpointRow-v1"), ViewQuality)
-    with pytest.raises(CheckpointError, match="Sparse"):
-        open_viewpoint_policy(tmp_path / "p.pt", "TomatoViewpointSparse-v1")
+    assert isinstance(open_policy(tmp_path / "p.pt", env_id="TomatoViewpointRow-v1"), ViewQuality)
+    with pytest.raises(PolicyError, match="Sparse"):
+        open_policy(tmp_path / "p.pt", env_id="TomatoViewpointSparse-v1")
 
 
 def test_files_that_hold_no_such_policy_are_refused(tmp_path: Path) -> None:
@@ -344,12 +344,14 @@ def test_eval_runs_the_same_episodes_as_the_benchmark(
     metrics = json.loads((tmp_path / "metrics.json").read_text())
     env = make_env("TomatoViewpoint-v1", episodes="validation")
     try:
-        episodes = [run_view_episode(env, NextBestView(), i) for i in (4, 5)]
+        episodes = [run_episode(env, NextBestView(), i) for i in (4, 5)]
     finally:
         env.close()
-    assert metrics["per_episode"]["steps"] == [e.moves for e in episodes]
+    assert metrics["per_episode"]["steps"] == [e.steps for e in episodes]
     assert metrics["per_episode"]["success"] == [e.success for e in episodes]
-    contacts = sum(int(e.contact.sum()) for e in episodes) / sum(e.moves for e in episodes)
+    contacts = sum(int(e.contact.sum()) for e in episodes if e.contact is not None) / sum(
+        e.steps for e in episodes
+    )
     assert metrics["plant_contact_step_share"] == pytest.approx(contacts)
 
 
@@ -373,7 +375,7 @@ def test_without_a_policy_eval_says_how_to_get_one(
 def test_the_evaluation_of_a_row_counts_the_tomatoes_that_were_seen() -> None:
     env: Any = make_env("TomatoViewpointRow-v1", plant={"seed": 7})
     try:
-        policy = acting_policy("nbv", env)
+        policy = as_state_policy(open_policy("nbv", env_id="TomatoViewpointRow-v1"), env)
         (episode,) = run_episodes(env, policy, 1, seed=3, show_progress=False)
         env.reset(seed=3)
         info: dict[str, Any] = {}
@@ -383,11 +385,11 @@ def test_the_evaluation_of_a_row_counts_the_tomatoes_that_were_seen() -> None:
             steps, done = steps + 1, bool(terminated) or bool(truncated)
     finally:
         env.close()
-    assert episode.targets_seen is not None
-    assert episode.targets_seen == (int(info["seen_count"]), int(info["target_count"]))
+    assert episode.row is not None
+    seen, wanted = len(episode.row.seen), len(episode.row.targets)
+    assert (seen, wanted) == (int(info["seen_count"]), int(info["target_count"]))
     figures = summarise([episode, episode])
-    seen, wanted = episode.targets_seen
     assert 0 < seen <= wanted and figures["target_seen_share"] == pytest.approx(seen / wanted)
     moves = int(info["moves"])
-    assert episode.moves == moves >= steps == episode.steps
+    assert episode.row.moves == moves >= steps == episode.steps
     assert figures["moves_per_seen_target"] == pytest.approx(moves / seen)

@@ -10,9 +10,10 @@ import pytest
 import torch
 from torch import Tensor
 
+from maniskill_tomato.assets import asset_path
 from maniskill_tomato.errors import CheckpointError, InvalidInputError
-from maniskill_tomato.experiments.view_episode import ViewEpisode
-from maniskill_tomato.experiments.view_rollout import run_view_episode
+from maniskill_tomato.experiments.episode_record import EpisodeRecord
+from maniskill_tomato.experiments.rollout import run_episode
 from maniskill_tomato.learning.imitation.move_to_see_training import MoveToSeeData, train_move_network
 from maniskill_tomato.learning.imitation.regression_config import RegressionConfig
 from maniskill_tomato.plants.generator import generate_plant
@@ -22,19 +23,20 @@ from maniskill_tomato.policies.baselines import FixedSweep, LookAtServoing, Rand
 from maniskill_tomato.policies.deep_move_to_see import (
     DeepMoveToSee,
     MoveNetwork,
-    load_move_network,
+    load_deep_move_to_see,
     network_input,
-    save_move_network,
+    save_deep_move_to_see,
 )
 from maniskill_tomato.policies.gradient_view import GradientView, expected_visible_share
 from maniskill_tomato.policies.greedy_truth import GreedyTruth, greedy_directions
 from maniskill_tomato.policies.move_to_see import MoveToSee, MoveToSeeOnMemory, camera_array, size_gradient
 from maniskill_tomato.policies.moves import Candidates
 from maniskill_tomato.policies.next_best_view import NextBestDirection, NextBestView, NextBestViewConfig
+from maniskill_tomato.policies.opening import open_policy
 from maniskill_tomato.policies.oracle import Oracle, OracleSearch
 from maniskill_tomato.policies.protocol import Planner
 from maniskill_tomato.policies.reach import CameraReach
-from maniskill_tomato.policies.registry import PLANNERS, make_planner
+from maniskill_tomato.policies.registry import PLANNERS, PRIVILEGED
 from maniskill_tomato.raycast.scene import RayScene
 from maniskill_tomato.raycast.view_rays import ray_pattern
 from maniskill_tomato.robot.d435 import color_intrinsics
@@ -164,9 +166,15 @@ def anywhere(positions: Tensor, target: Tensor) -> Tensor:
     return Box().holds(positions)
 
 
-def run(world: FreeWorld, planner: Planner, episodes: range) -> list[ViewEpisode]:
+def camera_of(episode: EpisodeRecord) -> Any:
+    """Where the camera was at every view. Shape (T + 1, 3)."""
+    assert episode.camera is not None
+    return episode.camera
+
+
+def run(world: FreeWorld, planner: Planner, episodes: range) -> list[EpisodeRecord]:
     world_as_env: Any = world
-    return [run_view_episode(world_as_env, planner, i) for i in episodes]
+    return [run_episode(world_as_env, planner, i) for i in episodes]
 
 
 def belief_at(position: Tensor, target: Tensor, world: FreeWorld) -> Belief:
@@ -215,10 +223,10 @@ def test_a_random_viewpoint_is_one_of_the_reachable_candidates(world: FreeWorld)
         world.reset(seed=seed)
         belief = world.belief
         allowed = belief.lattice.positions(belief.target_position)[0][belief.reachable[0]].double()
-        gaps = torch.cdist(torch.from_numpy(episode.camera[1:]), allowed).min(dim=1).values.numpy()
-        full = np.linalg.norm(np.diff(episode.camera, axis=0), axis=1) > 0.999 * MAX_MOVE
+        gaps = torch.cdist(torch.from_numpy(camera_of(episode)[1:]), allowed).min(dim=1).values.numpy()
+        full = np.linalg.norm(np.diff(camera_of(episode), axis=0), axis=1) > 0.999 * MAX_MOVE
         # A move is a full one, or ends at a candidate, or was cut short by the smallest distance.
-        near = np.linalg.norm(episode.camera[1:] - episode.target, axis=1) < MIN_DISTANCE + 1e-4
+        near = np.linalg.norm(camera_of(episode)[1:] - episode.target[1:], axis=1) < MIN_DISTANCE + 1e-4
         assert np.all(full | (gaps < 1e-4) | near)
         ends += int((gaps < 1e-4).sum())
     assert ends > 3
@@ -386,7 +394,7 @@ def test_a_view_that_was_looked_from_is_worth_what_was_measured(world: FreeWorld
 
 def test_the_next_best_direction_keeps_its_distance(world: FreeWorld) -> None:
     for episode in run(world, NextBestDirection(), range(4)):
-        distance = np.linalg.norm(episode.camera - episode.target, axis=1)
+        distance = np.linalg.norm(camera_of(episode) - episode.target, axis=1)
         # A straight move between two points of a sphere stops inside it.
         assert distance.max() <= distance[0] + 1e-4
         assert distance[-1] > 0.6 * distance[0]
@@ -481,8 +489,8 @@ def test_no_planner_needs_fewer_moves_than_the_oracle(world: FreeWorld) -> None:
     for planner in planners:
         for episode, best in zip(run(world, planner, episodes), oracle, strict=True):
             if episode.success:
-                assert best.success, (planner.name, episode.episode)
-                assert best.moves <= episode.moves, (planner.name, episode.episode)
+                assert best.success, (planner.name, episode.seed)
+                assert best.steps <= episode.steps, (planner.name, episode.seed)
 
 
 def test_planning_on_memory_beats_random_motion(world: FreeWorld) -> None:
@@ -500,7 +508,7 @@ def test_episodes_do_not_depend_on_the_ones_before(world: FreeWorld) -> None:
     for planner in (RandomViewpoint(), NextBestView(), GradientView(reachable=anywhere), FixedSweep()):
         alone = run(world, planner, range(9, 10))[0]
         after = run(world, planner, range(7, 10))[-1]
-        np.testing.assert_allclose(after.camera, alone.camera, atol=1e-6)
+        np.testing.assert_allclose(camera_of(after), camera_of(alone), atol=1e-6)
 
 
 def test_reach_is_that_of_the_lattice(world: FreeWorld) -> None:
@@ -538,8 +546,8 @@ def test_the_network_learns_the_moves_and_keeps_them_on_disk(world: FreeWorld, t
     mean_only = float((data.moves - data.moves.mean(dim=0)).square().mean())
     assert told[-1][0] < 0.8 * mean_only
 
-    save_move_network(network, tmp_path / "network.pt")
-    again = DeepMoveToSee(load_move_network(tmp_path / "network.pt"))
+    save_deep_move_to_see(tmp_path / "network.pt", DeepMoveToSee(network))
+    again = open_policy(tmp_path / "network.pt", env_id="TomatoViewpoint-v1")
     world.reset(seed=30)
     torch.testing.assert_close(again.act(world.belief), DeepMoveToSee(network).act(world.belief))
     assert float(again.act(world.belief).norm()) <= 1.0 + 1e-6
@@ -547,33 +555,29 @@ def test_the_network_learns_the_moves_and_keeps_them_on_disk(world: FreeWorld, t
 
 def test_a_file_that_is_no_network_is_refused(tmp_path: Any) -> None:
     (tmp_path / "x.pt").write_bytes(b"nothing")
-    with pytest.raises(CheckpointError, match="Deep 3D Move To See"):
-        load_move_network(tmp_path / "x.pt")
+    with pytest.raises(CheckpointError, match="not a readable checkpoint"):
+        load_deep_move_to_see(tmp_path / "x.pt")
+    with pytest.raises(CheckpointError, match=r"no network of deep_3dmts; .*train-deep-3dmts"):
+        load_deep_move_to_see(asset_path("policies/TomatoViewpoint-v1.pt"))
     few = MoveToSeeData(torch.zeros(5, 4, 16, 16), torch.ones(5), torch.zeros(5, 3))
     with pytest.raises(InvalidInputError, match="too few"):
         train_move_network(few)
     assert MoveNetwork()(torch.zeros(2, 4, 16, 16), torch.ones(2)).shape == (2, 3)
 
 
-# -------------------------------------------------------------- registry
+# -------------------------------------------------------------- by name
 
 
 @pytest.mark.parametrize("name", PLANNERS)
-def test_every_planner_is_made_by_name_and_gives_moves(world: FreeWorld, name: str) -> None:
+def test_every_planner_is_opened_by_name_and_gives_moves(world: FreeWorld, name: str) -> None:
     world.reset(seed=4)
-    planner = make_planner(name, ground_truth=world)
+    planner = open_policy(name, env_id="TomatoViewpoint-v1", ground_truth=world)
     assert planner.name == name
+    assert planner.needs_truth == (name in PRIVILEGED)
     planner.begin(world.belief, torch.tensor([0]))
     move = planner.act(world.belief)
     assert move.shape == (1, 3)
     assert bool(torch.isfinite(move).all()) and float(move.norm()) <= 1.0 + 1e-5
-
-
-def test_names_and_the_truth_are_checked() -> None:
-    with pytest.raises(InvalidInputError, match="the planner must be one of"):
-        make_planner("best")
-    with pytest.raises(InvalidInputError, match="knows the truth"):
-        make_planner("oracle")
 
 
 def test_a_view_that_was_taken_is_not_taken_again(world: FreeWorld) -> None:

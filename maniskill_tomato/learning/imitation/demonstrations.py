@@ -13,7 +13,7 @@ import gymnasium as gym
 import torch
 
 from maniskill_tomato.errors import InvalidInputError
-from maniskill_tomato.policies.protocol import Planner
+from maniskill_tomato.policies.protocol import Policy, reseed
 
 NAME = "trajectory"
 
@@ -33,7 +33,7 @@ class Demonstrations:
 
 def record_demonstrations(
     env: gym.Env[Any, Any],
-    planner: Planner,
+    planner: Policy,
     episodes: Iterable[int],
     folder: Path,
     reset_options: Callable[[int], dict[str, Any] | None] = lambda episode: None,
@@ -72,7 +72,7 @@ def record_demonstrations(
     for episode in episodes:
         options = reset_options(episode)
         recorder.reset(seed=episode, options=options)
-        planner.reseed(episode)
+        reseed(planner, episode)
         planner.begin(world.belief, everywhere)
         done, success, steps = False, False, 0
         while not done:

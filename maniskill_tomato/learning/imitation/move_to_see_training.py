@@ -12,7 +12,12 @@ from maniskill_tomato.errors import InvalidInputError
 from maniskill_tomato.learning.imitation.regression_config import RegressionConfig
 from maniskill_tomato.learning.rl.envs import make_env
 from maniskill_tomato.policies.baselines import RandomStep
-from maniskill_tomato.policies.deep_move_to_see import MoveNetwork, network_input, save_move_network
+from maniskill_tomato.policies.deep_move_to_see import (
+    DeepMoveToSee,
+    MoveNetwork,
+    network_input,
+    save_deep_move_to_see,
+)
 from maniskill_tomato.policies.move_to_see import MoveToSee
 
 FOLLOWED = 0.5
@@ -60,7 +65,7 @@ def train_move_to_see(
             f"epoch {epoch + 1}: loss {loss:.4f}, validation {validation:.4f} (variance of the moves {variance:.4f})"
         ),
     )
-    save_move_network(network, out)
+    save_deep_move_to_see(out, DeepMoveToSee(network))
     return out
 
 

@@ -16,19 +16,16 @@ from maniskill_tomato.files import write_atomically
 from maniskill_tomato.learning.blocks import Block, run_blocks
 from maniskill_tomato.learning.imitation.collect import ImitationData, collect_demonstrations
 from maniskill_tomato.learning.imitation.fit import fit_actor, fit_recurrent
-from maniskill_tomato.learning.imitation.imitation_config import ImitationConfig, StudentKind
+from maniskill_tomato.learning.imitation.imitation_config import ImitationConfig
 from maniskill_tomato.learning.rl.agent import make_agent
 from maniskill_tomato.learning.rl.checkpoint import make_checkpoint, save_checkpoint
 from maniskill_tomato.learning.rl.envs import make_env
-from maniskill_tomato.learning.rl.policy import load_policy
 from maniskill_tomato.learning.rl.presets import get_preset
-from maniskill_tomato.policies.learned import LearnedPolicy
-from maniskill_tomato.policies.protocol import Policy
+from maniskill_tomato.policies.opening import open_policy
 from maniskill_tomato.policies.recurrent import (
     RecurrentActor,
     RecurrentPolicy,
     columns_of,
-    load_recurrent,
     save_recurrent,
 )
 from maniskill_tomato.sensing.observation import ObservationLayout
@@ -77,7 +74,7 @@ def train_imitation(
             # A quarter of the blocks meets new plants only.
             pool = None if b % 4 == 3 else config.pool
             seeds = first + b * config.block, min(config.block, episodes - b * config.block)
-            arguments = (*seeds, pool, options, config.student, student, config.student_share)
+            arguments = (*seeds, pool, options, student, config.student_share)
             blocks.append(Block(path=out / f"train-{number}-{b}.pt", make=_collect, arguments=arguments))
         if path.is_file():
             continue
@@ -113,16 +110,11 @@ def _fit(config: ImitationConfig, data: ImitationData, path: Path, report: Calla
     save_checkpoint(path, checkpoint)
 
 
-def _student(kind: StudentKind, path: Path) -> Policy:
-    return load_recurrent(path) if kind == "recurrent" else LearnedPolicy(load_policy(path))
-
-
 def _collect(
     first: int,
     episodes: int,
     pool: int | None,
     options: dict[str, Any],
-    kind: StudentKind,
     student: Path | None,
     student_share: float,
 ) -> dict[str, Tensor]:
@@ -130,7 +122,7 @@ def _collect(
     plant = {"seed": "train", "pool": pool, **dict(options.get("plant", {}))}
     env = make_env(ENV_ID, **{**options, "plant": plant})
     try:
-        led_by = None if student is None else _student(kind, student)
+        led_by = None if student is None else open_policy(student)
         data = collect_demonstrations(env, range(first, first + episodes), led_by, student_share)
     finally:
         env.close()

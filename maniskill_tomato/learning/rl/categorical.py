@@ -5,7 +5,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from maniskill_tomato.learning.rl.networks import Critic
+from maniskill_tomato.learning.rl.critic import Critic
 
 
 class CategoricalCritic(Critic):

@@ -1,4 +1,4 @@
-"""Checkpoints: weights with everything needed to use them, written whole or not at all."""
+"""Writing checkpoints: weights with everything needed to use them, whole or not at all."""
 
 import io
 import json
@@ -9,25 +9,10 @@ import torch
 from torch import Tensor
 
 import maniskill_tomato
-from maniskill_tomato.errors import CheckpointError
-from maniskill_tomato.files import read_tensors, write_atomically
+from maniskill_tomato.files import write_atomically
 from maniskill_tomato.learning.rl.agent import Agent
 from maniskill_tomato.policies.layout import layout_of
-
-FORMAT = 1
-"""Version of the layout that `make_checkpoint` documents."""
-
-REQUIRED_KEYS = (
-    "format",
-    "package_version",
-    "env_id",
-    "config",
-    "observation",
-    "action",
-    "normalizer",
-    "actor",
-    "counters",
-)
+from maniskill_tomato.policies.trained_actor import FORMAT
 
 TRAINING_PARTS = (
     "critics",
@@ -110,28 +95,6 @@ def save_checkpoint(path: Path, data: dict[str, Any]) -> None:
     buffer = io.BytesIO()
     torch.save(data, buffer)
     write_atomically(path, buffer.getvalue())
-
-
-def load_checkpoint(path: Path | str, device: torch.device | str = "cpu") -> dict[str, Any]:
-    """The content of a checkpoint file (see `make_checkpoint`).
-
-    Raises:
-        CheckpointError: The file is missing, damaged, not one of ours, or of a newer format.
-    """
-    data = read_tensors(path, device)
-    if not isinstance(data, dict) or any(key not in data for key in REQUIRED_KEYS):
-        raise CheckpointError(
-            f"{path} is not a checkpoint of this package, which would hold {', '.join(REQUIRED_KEYS)}"
-        )
-    checkpoint: dict[str, Any] = data
-    if not isinstance(checkpoint["format"], int) or checkpoint["format"] > FORMAT:
-        raise CheckpointError(
-            f"{path} has checkpoint format {checkpoint['format']}, written by version "
-            f"{checkpoint['package_version']}; "
-            f"this version, {maniskill_tomato.__version__}, reads up to {FORMAT}: upgrade maniskill-tomato",
-            newer_format=True,
-        )
-    return checkpoint
 
 
 def _names(names: tuple[str, ...], count: int) -> list[str]:

@@ -6,7 +6,8 @@ from typing import Protocol
 import torch
 from torch import Tensor
 
-from maniskill_tomato.learning.rl.presets import EPSILON_GREEDY_HIGH, EPSILON_GREEDY_LOW, TrainConfig
+from maniskill_tomato.learning.rl.presets import TrainConfig
+from maniskill_tomato.policies.layout import EPSILON_GREEDY_HIGH, EPSILON_GREEDY_LOW
 from maniskill_tomato.robot.iiwa14 import BASE_TO_SHOULDER, WRIST_TO_EE
 
 GOAL_DISTANCE = (0.25, 0.6)

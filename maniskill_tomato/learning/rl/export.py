@@ -23,9 +23,8 @@ from torch import nn
 import maniskill_tomato
 from maniskill_tomato.errors import InvalidInputError, PolicyError
 from maniskill_tomato.files import write_atomically
-from maniskill_tomato.learning.rl.checkpoint import load_checkpoint
-from maniskill_tomato.learning.rl.networks import ObservationNormalizer
-from maniskill_tomato.learning.rl.policy import load_policy
+from maniskill_tomato.learning.rl.train_config import TrainConfig
+from maniskill_tomato.policies.actor import ObservationNormalizer
 from maniskill_tomato.policies.description import (
     INPUT_NAME,
     OUTPUT_NAME,
@@ -36,6 +35,7 @@ from maniskill_tomato.policies.description import (
 )
 from maniskill_tomato.policies.layout import layout_of
 from maniskill_tomato.policies.onnx_policy import OnnxPolicy, description_path
+from maniskill_tomato.policies.trained_actor import load_actor, load_checkpoint
 from maniskill_tomato.tasks import THESIS_IDS
 from maniskill_tomato.tasks.thesis.config import ViewpointTaskConfig, guided_task, sparse_task
 
@@ -113,12 +113,13 @@ def export_policy(path: Path | str, out: Path) -> ExportResult:
             otherwise than PyTorch.
     """
     path = Path(path)
-    policy = load_policy(path)
+    policy = load_actor(path)
     _check_layout(path)
+    config = TrainConfig.from_dict(policy.config)
     actor = DenseActor(
         act=policy.act,
         normalizer=policy.normalizer,
-        normalizer_kind=policy.config.normalize_observations,
+        normalizer_kind=config.normalize_observations,
         layers=[*policy.actor.hidden, policy.actor.output],
         activation="Relu",
         output="Tanh",
@@ -130,7 +131,7 @@ def export_policy(path: Path | str, out: Path) -> ExportResult:
         package_version=policy.package_version,
         algorithm=policy.algorithm,
         counters=policy.counters,
-        config=policy.config.to_dict(),
+        config=config.to_dict(),
     )
     return export_actor(actor, out / f"{path.stem}.onnx", name=str(path))
 

@@ -24,10 +24,10 @@ from maniskill_tomato.learning.rl.checkpoint import save_checkpoint
 from maniskill_tomato.learning.rl.export import DenseActor, export_actor
 from maniskill_tomato.learning.rl.gymnasium_env import Array, make_gymnasium_env, normalize_observation
 from maniskill_tomato.learning.rl.history import TrainingHistory
-from maniskill_tomato.learning.rl.networks import ObservationNormalizer
 from maniskill_tomato.learning.rl.ppo_config import PpoConfig
 from maniskill_tomato.learning.rl.presets import OBSERVATION_CENTRE, OBSERVATION_HALF_RANGE
 from maniskill_tomato.learning.rl.run_folder import check_run_dir
+from maniskill_tomato.policies.actor import ObservationNormalizer
 from maniskill_tomato.tasks import GENERAL_IDS
 
 try:

@@ -20,12 +20,6 @@ OBSERVATION_HALF_RANGE = (0.5, 0.5, 0.5, 1.0, 1.0, 1.0, 0.5, 0.5, 0.5)
 """What normalisation maps to 1: half the working range. The same for the end-effector and the target, so that
 their difference keeps its meaning. [m], [rad]."""
 
-EPSILON_GREEDY_LOW = (-0.07, -0.2, -0.1, -0.17, -0.17, -0.17)
-"""Lower ends of Eq. 5-6 in the order of `ACTION_NAMES`; the thesis lists pitch before roll. [m], [rad]."""
-
-EPSILON_GREEDY_HIGH = (0.1, 0.1, 0.1, 0.43, 0.17, 0.26)
-"""Upper ends of Eq. 5-6 in the order of `ACTION_NAMES`. [m], [rad]."""
-
 PresetName = Literal[
     "td3", "fast-td3", "thesis-guided", "thesis-sparse", "general-td3", "general-ddpg", "general-fast-td3"
 ]

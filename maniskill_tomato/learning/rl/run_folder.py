@@ -13,8 +13,8 @@ from typing import Any
 import maniskill_tomato
 from maniskill_tomato.errors import CheckpointError, InvalidInputError
 from maniskill_tomato.files import write_atomically
-from maniskill_tomato.learning.rl.checkpoint import load_checkpoint
 from maniskill_tomato.learning.rl.presets import MAY_CHANGE, TrainConfig
+from maniskill_tomato.policies.trained_actor import load_checkpoint
 
 logger = logging.getLogger(__name__)
 

@@ -3,7 +3,7 @@
 import torch
 from torch import Tensor, nn
 
-from maniskill_tomato.learning.rl.networks import ObservationNormalizer
+from maniskill_tomato.policies.actor import ObservationNormalizer
 
 SMALLEST_SPREAD = 0.05
 """Observed values whose standard deviation is below this, in [m] or [rad], are scaled by this instead: what never

@@ -21,7 +21,6 @@ from maniskill_tomato.learning.rl.curriculum import LeafDensityCurriculum
 from maniskill_tomato.learning.rl.env_state import seed_action_spaces
 from maniskill_tomato.learning.rl.envs import LearnerEnv
 from maniskill_tomato.learning.rl.initial_policy import begin_with, check_fits
-from maniskill_tomato.learning.rl.policy import Policy, load_policy
 from maniskill_tomato.learning.rl.presets import TrainConfig
 from maniskill_tomato.learning.rl.progress import Progress, TrainingLog
 from maniskill_tomato.learning.rl.random_state import seed_global_random_state
@@ -39,6 +38,7 @@ from maniskill_tomato.learning.rl.run_folder import (
 from maniskill_tomato.learning.rl.threshold import label_successes, success_threshold
 from maniskill_tomato.learning.rl.training_state import TrainingState
 from maniskill_tomato.learning.rl.wandb_log import import_wandb
+from maniskill_tomato.policies.trained_actor import TrainedActor, load_actor
 from maniskill_tomato.sensing.true_views import TRUE_VIEWS
 
 logger = logging.getLogger(__name__)
@@ -53,7 +53,7 @@ class TrainResult:
 
     run_dir: Path
     policy_path: Path
-    """The final policy, for `load_policy`."""
+    """The final policy, for `load_actor`."""
     steps: int
     """Environment steps taken."""
     episodes: int
@@ -109,9 +109,9 @@ class Trainer:
             )
         if config.wandb_project is not None:
             import_wandb(config.wandb_project)
-        self._given: Policy | None = None
+        self._given: TrainedActor | None = None
         if config.initial_policy is not None and not resume:
-            self._given = load_policy(config.initial_policy, env_id=env_id)
+            self._given = load_actor(config.initial_policy, env_id=env_id)
             privileged = TRUE_VIEWS if config.privileged_critic else 0
             check_fits(self._given, config, observation_space.shape[0] - privileged)
         if not resume:

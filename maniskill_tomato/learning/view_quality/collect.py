@@ -61,7 +61,7 @@ class _Wanderer(Planner):
         self._astray = rng.uniform(0.0, 0.5)
         if self._network is None or rng.uniform() < 0.25:
             config = NextBestViewConfig(move_cost=10.0 ** rng.uniform(-2.0, -0.7))
-            self._planner: Planner = NextBestView(belief.camera_position.device, config)
+            self._planner: Planner = NextBestView(config)
         else:
             patience = 10.0 ** rng.uniform(0.5, 1.2)
             self._planner = ViewQuality(self._network, ViewQualityConfig(patience=patience))
