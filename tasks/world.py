@@ -16,9 +16,9 @@ from maniskill_tomato.errors import InvalidInputError
 from maniskill_tomato.plants.spec import PlantPose, PlantSpec
 from maniskill_tomato.raycast.scene import RayScene
 from maniskill_tomato.robot.d435 import CameraIntrinsics, T_flange_camera_color_optical
-from maniskill_tomato.robot.description import link_meshes
 from maniskill_tomato.robot.inverse_kinematics import Reach
 from maniskill_tomato.robot.kinematics import link_transforms
+from maniskill_tomato.robot.robot_description import link_meshes
 from maniskill_tomato.robot.viewpoint_move import viewpoint_of
 from maniskill_tomato.sensing.belief import Belief
 from maniskill_tomato.tasks.arm_moves import ACTION_SIZES, ArmMoves, Plan

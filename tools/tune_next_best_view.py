@@ -15,9 +15,9 @@ from typing import Any
 import tyro
 
 from maniskill_tomato.errors import TomatoError
-from maniskill_tomato.experiments.benchmark_metrics import summarise_policy
-from maniskill_tomato.experiments.view_episode import ViewEpisode
-from maniskill_tomato.experiments.view_rollout import run_view_episode
+from maniskill_tomato.experiments.episode_record import EpisodeRecord
+from maniskill_tomato.experiments.metrics import summarise_policy
+from maniskill_tomato.experiments.rollout import run_episode
 from maniskill_tomato.learning.rl.envs import make_env
 from maniskill_tomato.policies.next_best_view import NextBestDirection, NextBestView, NextBestViewConfig
 
@@ -48,10 +48,10 @@ def main(args: Args) -> None:
     ]
     env: Any = make_env("TomatoViewpoint-v1", plant={"seed": "validation", "pool": None})
     planners = [kind(config) for config in configs]
-    found: list[list[ViewEpisode]] = [[] for _ in configs]
+    found: list[list[EpisodeRecord]] = [[] for _ in configs]
     for seed in range(args.first_seed, args.first_seed + args.episodes):
         for planner, episodes in zip(planners, found, strict=True):
-            episodes.append(run_view_episode(env, planner, seed))
+            episodes.append(run_episode(env, planner, seed))
     rows = []
     for config, episodes in zip(configs, found, strict=True):
         figures = summarise_policy(kind.name, episodes, int(env.unwrapped.task.max_moves))

@@ -20,8 +20,8 @@ from maniskill_tomato.tasks.world import World
 GUIDED, SPARSE = "TomatoViewpointGuided-v1", "TomatoViewpointSparse-v1"
 GENERAL, ROW = "TomatoViewpoint-v1", "TomatoViewpointRow-v1"
 
-POOL = {"plant": {"pool": 3}}
-NOISE = {
+POOL: dict[str, Any] = {"plant": {"pool": 3}}
+NOISE: dict[str, float] = {
     "depth_noise": 1.0,
     "dropout": 0.1,
     "false_target": 0.05,
@@ -166,7 +166,12 @@ def test_a_camera_measures_every_view_once() -> None:
     taken: list[Tensor] = []
     camera = game._senses._camera
     take = camera.take
-    camera.take = lambda T_w_camera, *rest: taken.append(T_w_camera.clone()) or take(T_w_camera, *rest)
+
+    def counted(T_w_camera: Tensor, *rest: Any) -> Any:
+        taken.append(T_w_camera)
+        return take(T_w_camera, *rest)
+
+    camera.take = counted
     world.reset(1)
     located, offset = 0, world.belief.target_position - world.target_position_w
     for move in actions(world, 6):
@@ -180,7 +185,7 @@ def test_a_camera_measures_every_view_once() -> None:
 
 @pytest.mark.parametrize("env_id", [GUIDED, GENERAL, ROW])
 def test_finished_environments_begin_anew_and_hand_out_what_the_step_gave(env_id: str) -> None:
-    options = {} if env_id == GUIDED else POOL
+    options: dict[str, Any] = {} if env_id == GUIDED else POOL
     env = VectorEnv(make_world(env_id, 3, **options), max_steps=4)
     alone = VectorEnv(make_world(env_id, 3, **options), max_steps=4, auto_reset=False)
     observation, _ = env.reset(seed=[1, 2, 3])

@@ -1,0 +1,272 @@
+"""The driver `sunrise`: an iiwa as an `Arm`, every reading checked, every move short, guarded by torque and verified.
+
+A point-to-point move of the controller cannot be stopped over the network: only the smartPAD or the emergency stop
+halts it. Moves are therefore sent in pieces, and `stop` keeps the next piece back.
+"""
+
+import logging
+import math
+import time
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from typing import Any, Final
+
+import numpy as np
+
+from maniskill_tomato.deploy.clock import Clock
+from maniskill_tomato.deploy.deploy_errors import (
+    DeployError,
+    DeviceTimeoutError,
+    FaultError,
+    NotConnectedError,
+    ProtocolError,
+    RefusedError,
+)
+from maniskill_tomato.deploy.drivers import DriverContext
+from maniskill_tomato.deploy.fields import parse_table
+from maniskill_tomato.deploy.interface import Arm, ArmState, Float64, JointMove
+from maniskill_tomato.deploy.sunrise.client import SunriseClient
+from maniskill_tomato.deploy.sunrise.line_connection import LineConnection
+from maniskill_tomato.deploy.sunrise.pose_agreement import pose_difference
+from maniskill_tomato.deploy.sunrise.readings import Reading, why_impossible
+from maniskill_tomato.deploy.sunrise.sunrise_config import SunriseConfig
+from maniskill_tomato.robot import iiwa14
+
+logger = logging.getLogger(__name__)
+
+ONLY_SMARTPAD: Final = "only the smartPAD or the emergency stop halts it"
+
+POLL_S: Final = 0.1
+"""Between two looks at the joints in a move, in [s]."""
+
+
+class SunriseArm(Arm):
+    """An iiwa 14 whose controller runs the Sunrise Toolbox server. Not for use from several threads, except `stop`."""
+
+    name = "sunrise"
+    simulated = False
+    can_stop = False
+
+    def __init__(self, config: SunriseConfig, clock: Clock) -> None:
+        """Touches nothing.
+
+        Args:
+            config: How to reach it.
+            clock: Where the time stamps come from.
+        """
+        self._config = config
+        self._clock = clock
+        self._client: SunriseClient | None = None
+        self._last: Reading | None = None
+        self._previous: Reading | None = None
+        self._pieces: list[Float64] = []
+        self._speed = 0.0
+        self._piece: Float64 | None = None
+        self._piece_deadline = 0.0
+        self._stop_asked = False
+        self._pose_error: tuple[float, float] | None = None
+
+    @property
+    def is_connected(self) -> bool:
+        return self._client is not None and self._client.is_open
+
+    def connect(self) -> None:
+        """Connects, mounts the tool, and compares the controller's flange with ours.
+
+        Raises:
+            NotConnectedError: The server does not take the connection.
+            FaultError: Both disagree about where the flange is, or joints read what cannot be.
+            DeviceTimeoutError: The server does not answer; it may have a client already.
+            ProtocolError: It answers nonsense.
+        """
+        if self.is_connected:
+            return
+        config = self._config
+        connection = LineConnection(config.host, config.port, config.connect_timeout_s)
+        time.sleep(config.connect_pause_s)
+        self._client = SunriseClient(connection, config.reply_timeout_s)
+        self._last = self._previous = self._piece = None
+        self._pieces, self._stop_asked = [], False
+        try:
+            if config.tool_xyzabc is not None:
+                self._client.mount_tool(config.tool_xyzabc)
+            told = self._client.tool_pose()
+            self._pose_error = pose_difference(told, self._measure().positions, config)
+        except DeployError:
+            self.disconnect()
+            raise
+
+    def disconnect(self) -> None:
+        if self._client is None:
+            return
+        if self._piece is not None:
+            logger.warning("disconnecting in a move, which goes on to its end: %s", ONLY_SMARTPAD)
+        self._client.close("the driver disconnected")
+        self._client = None
+        self._pieces, self._piece = [], None
+
+    def describe(self) -> dict[str, Any]:
+        facts: dict[str, Any] = {
+            "driver": self.name,
+            "address": f"{self._config.host}:{self._config.port}",
+            "stopping": f"a stop takes effect at the end of a piece of a move; within one {ONLY_SMARTPAD}",
+        }
+        if self._pose_error is not None:
+            facts["flange_difference_mm"] = round(1000.0 * self._pose_error[0], 3)
+            facts["flange_difference_deg"] = round(math.degrees(self._pose_error[1]), 4)
+        return facts
+
+    def read(self, max_age_s: float = 0.5) -> ArmState:
+        # Every reading is asked for, and so is never old; two of them tell the velocity.
+        del max_age_s
+        with self._telling_of_a_move():
+            return self._read()
+
+    def _read(self) -> ArmState:
+        now = self._measure()
+        if self._previous is None or not 0.005 < now.asked - self._previous.asked < 1.0:
+            time.sleep(0.02)
+            now = self._measure()
+        assert self._previous is not None
+        velocities = (now.positions - self._previous.positions) / (now.asked - self._previous.asked)
+        return ArmState(joint_positions=now.positions, joint_velocities=velocities, stamp=now.stamp)
+
+    def command(self, move: JointMove) -> JointMove:
+        client = self._connected()
+        if self._piece is not None and client.is_open:
+            raise RefusedError("another move is under way")
+        target = move.joint_positions
+        if not np.all(np.isfinite(target)) or np.any(np.abs(target) > iiwa14.JOINT_UPPER):
+            raise RefusedError(f"joint positions must be finite and within the limits, got {target}")
+        if not 0.0 < move.speed_fraction <= 1.0:
+            raise RefusedError(f"speed_fraction must be above 0 and at most 1, got {move.speed_fraction}")
+        self._stop_asked = False
+        start = self._measure().positions
+        target = np.round(target, 9)
+        count = max(1, math.ceil(float(np.max(np.abs(target - start))) / self._config.largest_segment - 1e-9))
+        self._pieces = [start + (target - start) * (i / count) for i in range(1, count)] + [target]
+        self._speed = move.speed_fraction
+        with self._telling_of_a_move():
+            self._next_piece(client)
+        if self._piece is None:
+            raise RefusedError("stopped before the move began")
+        return JointMove(joint_positions=target, speed_fraction=float(f"{self._speed:.9f}"))
+
+    def wait(self, timeout_s: float) -> bool:
+        with self._telling_of_a_move():
+            return self._wait(timeout_s)
+
+    def _wait(self, timeout_s: float) -> bool:
+        client = self._connected()
+        deadline = time.monotonic() + timeout_s
+        while self._piece is not None:
+            remaining = deadline - time.monotonic()
+            ended = client.motion_end(max(0.0, min(POLL_S, remaining)))
+            if ended is not None:
+                self._finish_piece(client, ended)
+                continue
+            # Also a controller that has fallen silent shows at the next look.
+            self._measure()
+            if time.monotonic() > self._piece_deadline:
+                self._give_up("the move takes twice as long as it should")
+                raise DeviceTimeoutError(
+                    "the move has not ended in twice its computed time; nothing more is sent"
+                )
+            if time.monotonic() >= deadline:
+                return self._piece is None
+        return True
+
+    def stop(self) -> bool:
+        self._stop_asked = True
+        return self._piece is None
+
+    def _next_piece(self, client: SunriseClient) -> None:
+        target, rest = self._pieces[0], self._pieces[1:]
+        around = client.torques(self._config.torque_kind)
+        margin = np.array(self._config.torque_margin)
+        windows = np.stack([around - margin, around + margin], axis=1)
+        start = self._measure().positions
+        self._pieces = []
+        if self._stop_asked:
+            return
+        # Until the controller refuses it, a move that was sent counts as under way, answered or not.
+        self._piece = target
+        try:
+            client.start_move(target.tolist(), self._speed, windows.tolist())
+        except RefusedError:
+            self._piece = None
+            raise
+        self._pieces = rest
+        change = np.abs(target - start)
+        seconds = float(np.max(change / (iiwa14.VELOCITY_LIMITS * self._speed)))
+        ramp = self._speed * float(np.max(iiwa14.VELOCITY_LIMITS / iiwa14.ACCELERATION_LIMITS))
+        self._piece_deadline = time.monotonic() + 2.0 * (seconds + ramp) + self._config.move_margin_s
+
+    def _finish_piece(self, client: SunriseClient, ended: str) -> None:
+        assert self._piece is not None
+        off = float(np.max(np.abs(self._measure().positions - self._piece)))
+        rest = self._pieces
+        self._piece, self._pieces = None, []
+        if ended == "nak":
+            raise FaultError(
+                "the controller broke the move off (`nak`): a limit, a stop or an error; look at the smartPAD"
+            )
+        if ended == "interrupted":
+            raise FaultError(
+                "the arm was stopped by a torque outside its window: it touched something, or arm.torque_margin or "
+                "arm.torque_kind of the profile do not fit; look before it moves again"
+            )
+        if off > self._config.arrival_tolerance:
+            raise FaultError(
+                f"the controller says that the move is done, but a joint is {math.degrees(off):.2f} degrees off"
+            )
+        if rest and not self._stop_asked:
+            self._pieces = rest
+            self._next_piece(client)
+
+    def _measure(self) -> Reading:
+        """Joint angles that can be true."""
+        client = self._connected()
+        positions = client.joint_positions()
+        reading = Reading(client.asked_at, time.monotonic(), self._clock.now(), positions)
+        what = why_impossible(reading, self._last, self._piece is not None, self._config.rest_tolerance)
+        if what is not None:
+            raise self._impossible(what)
+        self._previous, self._last = self._last, reading
+        return reading
+
+    @contextmanager
+    def _telling_of_a_move(self) -> Iterator[None]:
+        """Errors of the connection say that a move under way goes on without it."""
+        try:
+            yield
+        except (NotConnectedError, DeviceTimeoutError, ProtocolError) as error:
+            if self._piece is None:
+                raise
+            raise type(error)(f"{error}. The arm may be in a move, which goes on: {ONLY_SMARTPAD}") from error
+
+    def _connected(self) -> SunriseClient:
+        if self._client is None:
+            raise NotConnectedError("the arm is not connected; call connect()")
+        return self._client
+
+    def _impossible(self, what: str) -> FaultError:
+        self._give_up(f"its readings cannot be true: {what}")
+        return FaultError(
+            f"the arm reports {what}: guided by hand, or broken data; nothing more is sent to it, and if it moves, "
+            f"{ONLY_SMARTPAD}"
+        )
+
+    def _give_up(self, why: str) -> None:
+        self._pieces = []
+        if self._client is not None:
+            self._client.close(why)
+
+
+def make_arm(options: Mapping[str, Any], context: DriverContext) -> SunriseArm:
+    """The driver of a profile's `arm` table.
+
+    Raises:
+        ProfileError: An option is unknown or wrong.
+    """
+    return SunriseArm(parse_table(SunriseConfig, options, "arm"), context.clock)
