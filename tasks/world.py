@@ -31,7 +31,7 @@ from maniskill_tomato.tasks.numpy_streams import (
 from maniskill_tomato.tasks.planting import GROWN_PLANTS, Planting
 from maniskill_tomato.tasks.world_state import WorldState
 
-FIRST_ORGAN_ID = 17
+FIRST_ORGAN_ID = 24
 """Segmentation id of a plant's first organ in a scene of the robot's links, floor and walls."""
 
 FIRST_SEED = 2022
