@@ -12,8 +12,9 @@ from maniskill_tomato.experiments.reproduction import EVALUATION_SEED, Reproduct
 from maniskill_tomato.experiments.rollout import Episode
 from maniskill_tomato.experiments.video import make_film_options
 from maniskill_tomato.learning.rl.envs import make_env
+from maniskill_tomato.policies.adapters import as_state_policy
+from maniskill_tomato.policies.opening import open_policy
 from maniskill_tomato.policies.protocol import StatePolicy
-from maniskill_tomato.policies.trained_actor import load_actor
 from maniskill_tomato.rendering import vulkan_probe
 
 Image = NDArray[np.uint8]
@@ -33,7 +34,7 @@ def take_all(reproduction: Reproduction, seed: int, folder: Path) -> str | None:
         return LEFT_OUT.format(hint=vulkan_probe.NO_RENDERING_HINT.capitalize())
     folder.mkdir(parents=True, exist_ok=True)
     experiment = reproduction.experiment
-    policy = load_actor(reproduction.seed_folder(seed) / "training" / "policy.pt")
+    policy = open_policy(reproduction.seed_folder(seed) / "training" / "policy.pt")
     for evaluation in experiment.evaluations:
         episodes = load_episodes(reproduction.episodes_path(seed, evaluation))
         options: dict[str, Any] = {
@@ -43,7 +44,7 @@ def take_all(reproduction: Reproduction, seed: int, folder: Path) -> str | None:
         }
         env = make_env(experiment.env_id, **options)
         try:
-            views = first_and_last_view(env, policy, episode_to_show(episodes))
+            views = first_and_last_view(env, as_state_policy(policy, env), episode_to_show(episodes))
         finally:
             env.close()
         imageio.imwrite(folder / f"views_{evaluation.name}.png", np.concatenate(views, axis=1)[::2, ::2])
