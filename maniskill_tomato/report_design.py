@@ -26,7 +26,7 @@ TEN: Final = (
 )
 """Matplotlib's ten, for more lines than `SERIES` has."""
 
-PLOT_STYLE: Final[dict[str, Any]] = {
+PLOT_STYLE: Final[Any] = {
     "axes.edgecolor": "#b9c2bb",
     "axes.labelcolor": INK,
     "axes.spines.right": False,

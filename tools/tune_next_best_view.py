@@ -13,9 +13,9 @@ from typing import Any
 import tyro
 
 from maniskill_tomato.errors import TomatoError
-from maniskill_tomato.experiments.benchmark_metrics import summarise_policy
-from maniskill_tomato.experiments.view_episode import ViewEpisode
-from maniskill_tomato.experiments.view_rollout import run_view_episode
+from maniskill_tomato.experiments.episode_record import EpisodeRecord
+from maniskill_tomato.experiments.metrics import summarise_policy
+from maniskill_tomato.experiments.rollout import run_episode
 from maniskill_tomato.learning.rl.envs import make_env
 from maniskill_tomato.policies.next_best_view import NextBestDirection, NextBestView
 
@@ -41,10 +41,10 @@ def main(args: Args) -> None:
     kind = NextBestDirection if args.planner == NextBestDirection.name else NextBestView
     env: Any = make_env("TomatoViewpoint-v1", plant={"seed": "validation", "pool": None})
     planners = [kind(cost) for cost in args.move_cost]
-    found: list[list[ViewEpisode]] = [[] for _ in planners]
+    found: list[list[EpisodeRecord]] = [[] for _ in planners]
     for seed in range(args.first_seed, args.first_seed + args.episodes):
         for planner, episodes in zip(planners, found, strict=True):
-            episodes.append(run_view_episode(env, planner, seed))
+            episodes.append(run_episode(env, planner, seed))
     rows = []
     for planner, episodes in zip(planners, found, strict=True):
         figures = summarise_policy(kind.name, episodes, int(env.unwrapped.task.max_moves))

@@ -32,8 +32,8 @@ class Demo:
         if not self.minutes > 0:
             raise InvalidInputError(f"--minutes must be above 0, got {self.minutes:g}")
 
-        from maniskill_tomato.experiments.evaluate import EvaluationConfig, evaluate
-        from maniskill_tomato.policies.opening import open_policy
+        from maniskill_tomato.experiments.configs import EvaluationConfig
+        from maniskill_tomato.experiments.evaluation import evaluate
 
         env_id = "TomatoViewpointGuided-v1"
         print(f"1/2 training on {env_id}, at most {self.minutes:g} minutes")
@@ -43,6 +43,7 @@ class Demo:
         print(f"2/2 evaluating {self.episodes} episodes")
         evaluation = EvaluationConfig(
             env_id=env_id,
+            policy=str(trained.policy_path),
             episodes=self.episodes,
             seed=1000,
             out=self.out,
@@ -50,7 +51,7 @@ class Demo:
             title="Where to look: a policy that uncovers a hidden tomato",
             training_run=trained.run_dir,
         )
-        result = evaluate(evaluation, open_policy(trained.policy_path), trained.policy_path)
+        result = evaluate(evaluation)
         print(summary(result.metrics))
         if result.left_out:
             print(result.left_out)

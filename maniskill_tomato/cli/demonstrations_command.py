@@ -27,12 +27,12 @@ class Demonstrations:
         check_count("--episodes", self.episodes)
         check_count("--first-seed", self.first_seed, 0)
 
-        from maniskill_tomato.experiments.benchmark_policies import PolicySpec
+        from maniskill_tomato.experiments.policy_runs import PolicySpec, open_for
         from maniskill_tomato.learning.imitation.demonstrations import record_demonstrations
         from maniskill_tomato.learning.rl.envs import make_env
 
         env = make_env("TomatoViewpoint-v1")
-        planner = PolicySpec.parse(self.planner).make(env, self.contact_free)
+        planner = open_for(PolicySpec.parse(self.planner), env, self.contact_free)
         seeds = range(self.first_seed, self.first_seed + self.episodes)
         result = record_demonstrations(env, planner, seeds, self.out)
         print(f"{result.path}: {result.recorded} of {result.tried} episodes, {result.moves} moves")

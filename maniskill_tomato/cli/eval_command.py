@@ -7,7 +7,7 @@ from typing import Annotated, Any, Literal
 from maniskill_tomato.cli.arguments import Flat
 from maniskill_tomato.cli.early_checks import check_count, check_env_id, check_policy
 from maniskill_tomato.cli.shared_options import EnvId, PlantOptions
-from maniskill_tomato.policies.opening import open_policy, shipped_policy
+from maniskill_tomato.policies.opening import shipped_policy
 
 EpisodeList = Literal["validation", "held_out"]
 
@@ -47,34 +47,28 @@ class Eval:
         check_env_id(self.env_id)
         check_count("--episodes", self.episodes)
         env_id = None if self.allow_other_task else self.env_id
-        name_or_file = self.policy or shipped_policy(self.env_id)
-        check_policy("--policy", name_or_file, env_id)
+        check_policy("--policy", self.policy or shipped_policy(self.env_id), env_id)
 
-        from maniskill_tomato.experiments.evaluate import EvaluationConfig, evaluate
-        from maniskill_tomato.policies.adapters import origin
-        from maniskill_tomato.policies.protocol import Policy
+        from maniskill_tomato.experiments.configs import EvaluationConfig
+        from maniskill_tomato.experiments.evaluation import evaluate
 
-        path = Path(name_or_file) if Path(name_or_file).is_file() else None
-        policy: Policy | str = str(name_or_file)
-        if path is not None:
-            policy = open_policy(path, env_id=env_id)
-            print(f"policy  {origin(policy)}")
         env_options = self.plants.env_options()
         if self.episode_list is not None or (self.env_id == LISTED_ID and not env_options):
             env_options["episodes"] = self.episode_list or "held_out"
-        run_dir = path.parent if path is not None and (path.parent / "history.npz").is_file() else None
         config = EvaluationConfig(
             env_id=self.env_id,
+            policy=self.policy,
             episodes=self.episodes,
             seed=self.seed,
             out=self.out,
+            allow_other_task=self.allow_other_task,
             env_options=env_options,
             baseline=self.baseline,
             video=self.video,
             title="Where to look: evaluation",
-            training_run=run_dir,
         )
-        result = evaluate(config, policy, path)
+        result = evaluate(config)
+        print(f"policy  {result.origin}")
         print(summary(result.metrics))
         if result.left_out:
             print(result.left_out)

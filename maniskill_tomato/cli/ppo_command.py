@@ -50,8 +50,8 @@ class TrainPpo:
         if not self.seeds or len(set(self.seeds)) != len(self.seeds):
             raise InvalidInputError("--seeds must be one or more different numbers")
 
-        from maniskill_tomato.experiments.comparison import load_run
-        from maniskill_tomato.experiments.evaluate import evaluate_run
+        from maniskill_tomato.experiments.evaluation import evaluate_run
+        from maniskill_tomato.experiments.training_runs import load_run
         from maniskill_tomato.learning.rl.ppo import train_ppo
 
         for seed in self.seeds:

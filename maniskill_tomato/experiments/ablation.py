@@ -1,295 +1,209 @@
 """What each option of the learner is worth: a preset against itself with one option changed, over seeds and tasks."""
 
 import dataclasses
-import json
-import logging
-import multiprocessing
-import os
-import time
-from collections.abc import Iterator, Sequence
-from concurrent.futures import ProcessPoolExecutor, as_completed
-from dataclasses import dataclass
-from pathlib import Path
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass
 from typing import Any
 
 import numpy as np
-import torch
 
-from maniskill_tomato.errors import InvalidInputError, SeedsFailedError, TomatoError
-from maniskill_tomato.experiments.metrics import make_metrics, write_metrics
-from maniskill_tomato.experiments.reproduction import EVALUATION_SEED
-from maniskill_tomato.experiments.rollout import run_episodes
+import maniskill_tomato
+from maniskill_tomato.errors import InvalidInputError
+from maniskill_tomato.experiments.configs import AblationConfig
+from maniskill_tomato.experiments.metrics import write_json
+from maniskill_tomato.experiments.statistics import Interval, interquartile_interval, interval_text
+from maniskill_tomato.experiments.training_study import SOLVED, WINDOW, Trial, run_trials
+from maniskill_tomato.experiments.variants import Evaluation, Variant, choose_variants
 from maniskill_tomato.files import write_atomically
-from maniskill_tomato.learning.rl.envs import make_env
-from maniskill_tomato.learning.rl.history import TrainingCurves, load_history
-from maniskill_tomato.learning.rl.presets import TrainConfig, get_preset
-from maniskill_tomato.learning.rl.run import make_training_env
-from maniskill_tomato.learning.rl.run_folder import clear_run
-from maniskill_tomato.learning.rl.trainer import Trainer
-from maniskill_tomato.policies.opening import open_policy
+from maniskill_tomato.learning.rl.presets import get_preset
+from maniskill_tomato.report_design import markdown_table
 from maniskill_tomato.tasks import THESIS_IDS
 
-logger = logging.getLogger(__name__)
+JUDGED = Evaluation(name="evaluation", title="the plant and the pose of the training")
 
-RESULT_FILE = "result.json"
+HEAD = (
+    "task",
+    "variant",
+    "seeds",
+    "success",
+    "mean steps",
+    "steps to 95 %",
+    "training wall",
+    "training CPU",
+)
 
-SOLVED = 0.95
-WINDOW = 50
-"""Training episodes over which the success that counts as solved is measured."""
+METHOD = (
+    "Success and mean steps are interquartile means over the seeds with 95 % percentile intervals of a bootstrap over "
+    f"the seeds, stratified by task. Steps to {100 * SOLVED:.0f} %: median number of environment steps until that "
+    f"share of the last {WINDOW} training episodes succeeded, those included that exploration led, and in how many "
+    "runs it did. Training times are means; wall time depends on what else the machine did."
+)
+
+Result = Mapping[str, Any]
 
 
 @dataclass(frozen=True, kw_only=True)
-class LearnerVariant:
-    """A preset with one thing changed."""
+class AblationRow:
+    """One variant on one task, or on all tasks together."""
 
-    name: str
+    task: str
+    variant: str
     title: str
-    """What differs, for tables."""
-    changes: dict[str, Any]
-    """Fields of `TrainConfig` and their new values; none for the preset itself."""
-    env_ids: tuple[str, ...] = THESIS_IDS
-    """The tasks that it makes sense on."""
+    seeds: tuple[int, ...]
+    success_rate: Interval
+    mean_steps: Interval
+    steps_to_solved: float | None
+    """Median over the runs that got there; None if none did."""
+    solved_runs: int
+    runs: int
+    training_seconds: float
+    training_cpu_seconds: float
 
 
-BASE = LearnerVariant(name="base", title="the preset", changes={})
-
-VARIANTS: tuple[LearnerVariant, ...] = (
-    BASE,
-    LearnerVariant(name="n-step-3", title="returns over 3 steps", changes={"n_step": 3}),
-    LearnerVariant(
-        name="running-normalisation",
-        title="observations scaled by running statistics",
-        changes={"normalize_observations": "running"},
-    ),
-    LearnerVariant(
-        name="hindsight-targets",
-        title="hindsight: the other two tomatoes as targets",
-        changes={"hindsight_targets": 2},
-        env_ids=("TomatoViewpointSparse-v1",),  # The guided task's plant has one tomato.
-    ),
-    LearnerVariant(
-        name="rising-threshold",
-        title="success threshold rising from 0.4",
-        changes={"success_threshold_start": 0.4},
-    ),
-    LearnerVariant(
-        name="auxiliary",
-        title="auxiliary heads: distance and next V_f, weights 0.1",
-        changes={"aux_distance_weight": 0.1, "aux_visibility_weight": 0.1},
-    ),
-    LearnerVariant(
-        name="categorical-critic",
-        title="categorical critics, 101 atoms from -4 to 2",
-        changes={"critic": "categorical", "value_range": (-4.0, 2.0)},
-    ),
-    LearnerVariant(
-        name="noise-per-environment",
-        title="a noise level for every episode",
-        changes={"exploration_noise_per_env": True},
-    ),
-    LearnerVariant(name="no-smoothing", title="no target smoothing", changes={"target_noise": 0.0}),
-    LearnerVariant(name="single-critic", title="one critic, as DDPG", changes={"twin_critics": False}),
-    LearnerVariant(name="no-delay", title="no policy delay", changes={"policy_frequency": 1}),
-)
-"""One change each, the preset itself first."""
+def ablation_rows(variants: Sequence[Variant], results: Sequence[Result]) -> list[AblationRow]:
+    """A row for every task and variant, and one over all tasks for variants that were run on several."""
+    tasks = sorted({result["env_id"] for result in results})
+    rows = []
+    for task in tasks:
+        for variant in variants:
+            own = [r for r in results if (r["env_id"], r["variant"]) == (task, variant.name)]
+            if own:
+                rows.append(_row(task, variant, [own]))
+    for variant in variants:
+        strata = [
+            own
+            for t in tasks
+            if (own := [r for r in results if (r["env_id"], r["variant"]) == (t, variant.name)])
+        ]
+        if len(tasks) > 1 and len(strata) == len(tasks):
+            rows.append(_row(f"{len(tasks)} tasks", variant, strata))
+    return rows
 
 
-def choose_variants(names: Sequence[str]) -> list[LearnerVariant]:
-    """The variants of these names, all of them if there are none.
+def run_ablation(config: AblationConfig, report: Callable[[str], None] = lambda line: None) -> str:
+    """Runs what is missing, and writes ablation.json and ablation.md after every run.
+
+    Args:
+        config: What to compare.
+        report: Told one line after each run.
+
+    Returns:
+        The content of ablation.md.
 
     Raises:
-        InvalidInputError: There is no such variant; the message lists them.
+        InvalidInputError: An option cannot be used, or a folder holds a run of other settings.
+        SeedsFailedError: Some runs failed; the others are done by then.
     """
-    known = {variant.name: variant for variant in VARIANTS}
-    for name in names:
-        if name not in known:
-            raise InvalidInputError.choice("a variant", name, known)
-    return [known[name] for name in names] if names else list(VARIANTS)
+    variants = choose_variants(config.variants)
+    trials = plan_trials(config, variants)
+    results: list[Result] = []
+    text = ""
+    for number, (trial, found) in enumerate(run_trials(trials, config.jobs), start=1):
+        results.append(_result(trial, found))
+        text = write_ablation(config, variants, results)
+        report(
+            f"{number} of {len(trials)}: {trial.env_id} {trial.variant.name}, seed {trial.seed}: "
+            f"success {results[-1]['success_rate']:.0%}, {results[-1]['training_cpu_seconds']:.0f} s of CPU"
+        )
+    return text
 
 
-@dataclass(frozen=True, kw_only=True)
-class AblationRun:
-    """One training with its evaluation."""
-
-    env_id: str
-    variant: LearnerVariant
-    seed: int
-    config: TrainConfig
-    episodes: int
-    """Evaluation episodes."""
-    folder: Path
-    """Where the run lies; `scripts/compare_runs.py` reads it too."""
-
-    def finished(self) -> dict[str, Any] | None:
-        """What it gave, if it was done before with these settings."""
-        path = self.folder / RESULT_FILE
-        if not path.is_file():
-            return None
-        result: dict[str, Any] = json.loads(path.read_text())
-        same = TrainConfig.from_dict(result["config"]) == self.config and result["episodes"] == self.episodes
-        if not same:
-            raise InvalidInputError(
-                f"{self.folder} holds a run of other settings; choose another --out or remove that folder"
-            )
-        return result
-
-
-def plan(
-    preset: str,
-    variants: Sequence[LearnerVariant],
-    env_ids: Sequence[str],
-    seeds: Sequence[int],
-    out: Path,
-    episodes: int = 100,
-    total_timesteps: int | None = None,
-) -> list[AblationRun]:
+def plan_trials(config: AblationConfig, variants: Sequence[Variant]) -> list[Trial]:
     """All runs, seed by seed, so that an early look compares every variant.
 
     Raises:
-        InvalidInputError: A preset, task or seed cannot be used, or a variant does not fit the preset.
+        InvalidInputError: A preset or task cannot be used, or a variant does not fit the preset.
     """
-    if not seeds or len(set(seeds)) != len(seeds) or min(seeds) < 0:
-        raise InvalidInputError(
-            f"seeds must be one or more different numbers of 0 or more, got {tuple(seeds)}"
-        )
-    if episodes < 1:
-        raise InvalidInputError(f"episodes must be 1 or more, got {episodes}")
-    for env_id in env_ids:
+    for env_id in config.env_ids:
         if env_id not in THESIS_IDS:
             raise InvalidInputError.choice("a task", env_id, THESIS_IDS)
-    base = get_preset(preset)
-    if total_timesteps is not None:
-        base = dataclasses.replace(base, total_timesteps=total_timesteps)
+    get_preset(config.preset)
+    length: dict[str, Any] = (
+        {} if config.total_timesteps is None else {"total_timesteps": config.total_timesteps}
+    )
     return [
-        AblationRun(
+        Trial(
             env_id=env_id,
             variant=variant,
+            config=dataclasses.replace(variant.config(config.preset), **length),
             seed=seed,
-            config=dataclasses.replace(base, **variant.changes),
-            episodes=episodes,
-            folder=out / env_id / variant.name / f"seed-{seed}",
+            folder=config.out / env_id / variant.name / f"seed-{seed}",
+            evaluations=(JUDGED,),
+            episodes=config.episodes,
         )
-        for seed in seeds
-        for env_id in env_ids
+        for seed in config.seeds
+        for env_id in config.env_ids
         for variant in variants
-        if env_id in variant.env_ids
+        if env_id in variant.tasks
     ]
 
 
-def execute(run: AblationRun) -> dict[str, Any] | None:
-    """Trains, judges the policy, and keeps the result, unless that is there already; None if it was stopped.
-
-    A training that was stopped begins again, so that its processor time is that of all its steps.
-    """
-    done = run.finished()
-    if done is not None:
-        return done
-    clear_run(run.folder)
-    env = make_training_env(run.env_id, run.config, {})
-    try:
-        trainer = Trainer(env, run.env_id, run.config, run.folder, run.seed, show_progress=False)
-        before = time.process_time()
-        trained = trainer.run()
-        cpu_seconds = time.process_time() - before
-    finally:
-        env.close()
-    if trained.stop_reason != "finished":
-        return None
-    judge = make_env(run.env_id)
-    try:
-        threshold = float(judge.unwrapped.task.full_visibility)  # type: ignore[attr-defined]
-        begun = time.perf_counter()
-        episodes = run_episodes(judge, open_policy(trained.policy_path), run.episodes, EVALUATION_SEED)
-        wall = time.perf_counter() - begun
-    finally:
-        judge.close()
-    metrics = make_metrics(
-        run.env_id,
-        episodes,
-        seed=EVALUATION_SEED,
-        success_threshold=threshold,
-        policy={"path": str(trained.policy_path), "steps": trained.steps},
-        wall_seconds=wall,
-    )
-    write_metrics(run.folder / "metrics.json", metrics)
-    result = {
-        "env_id": run.env_id,
-        "variant": run.variant.name,
-        "seed": run.seed,
-        "episodes": run.episodes,
-        "success_rate": metrics["success_rate"],
-        "mean_steps": metrics["mean_steps"],
-        "training_steps": trained.steps,
-        "updates": trained.updates,
-        "training_seconds": round(trained.seconds, 2),
-        "training_cpu_seconds": round(cpu_seconds, 2),
-        "steps_to_solved": steps_to_solved(load_history(run.folder), run.config.learning_starts),
-        "config": run.config.to_dict(),
+def write_ablation(config: AblationConfig, variants: Sequence[Variant], results: Sequence[Result]) -> str:
+    """Writes ablation.json and ablation.md; returns the latter's content."""
+    rows = ablation_rows(variants, results)
+    ordered = sorted(results, key=lambda r: (r["env_id"], r["variant"], r["seed"]))
+    episodes = sorted({int(r["episodes"]) for r in results})
+    content = {
+        "package_version": maniskill_tomato.__version__,
+        "preset": config.preset,
+        "evaluation_episodes": episodes,
+        "method": METHOD,
+        "rows": [asdict(row) for row in rows],
+        "runs": ordered,
     }
-    write_atomically(run.folder / RESULT_FILE, (json.dumps(result, indent=2) + "\n").encode())
-    return result
+    write_json(config.out / "ablation.json", content)
+    table = markdown_table(HEAD, [_cells(row) for row in rows])
+    listed = " and ".join(map(str, episodes))
+    text = f"{table}\n\nPreset `{config.preset}`, {listed} evaluation episodes for each run. {METHOD}\n"
+    write_atomically(config.out / "ablation.md", text.encode())
+    return text
 
 
-def execute_all(runs: Sequence[AblationRun], jobs: int) -> Iterator[tuple[AblationRun, dict[str, Any]]]:
-    """Runs them in `jobs` processes; yields them as they end.
-
-    Raises:
-        InvalidInputError: `jobs` is not positive, or a folder holds a run of other settings.
-        SeedsFailedError: Some failed; the others are done by then.
-        KeyboardInterrupt: One of them was stopped; those that ended before stay.
-    """
-    if jobs < 1:
-        raise InvalidInputError(f"jobs must be 1 or more, got {jobs}")
-    waiting = []
-    for run in runs:
-        done = run.finished()
-        if done is None:
-            waiting.append(run)
-        else:
-            yield run, done
-    # The processes read this when they load their numerical libraries.
-    os.environ.setdefault("OMP_NUM_THREADS", "1")
-    context = multiprocessing.get_context("spawn")
-    failed: list[str] = []
-    with ProcessPoolExecutor(jobs, mp_context=context, initializer=_warm_up) as pool:
-        futures = {pool.submit(execute, run): run for run in waiting}
-        try:
-            for future in as_completed(futures):
-                run = futures[future]
-                try:
-                    result = future.result()
-                except TomatoError as error:
-                    logger.error("%s failed: %s", run.folder, error)
-                    failed.append(str(run.folder))
-                    continue
-                if result is None:
-                    raise KeyboardInterrupt
-                yield run, result
-        finally:
-            pool.shutdown(wait=True, cancel_futures=True)
-    if failed:
-        raise SeedsFailedError(f"{len(failed)} of {len(runs)} runs failed: {', '.join(failed)}")
+def _result(trial: Trial, found: Mapping[str, Any]) -> dict[str, Any]:
+    """What the tables and ablation.json say of a run."""
+    judged, training = found["evaluations"][JUDGED.name], found["training"]
+    return {
+        "env_id": trial.env_id,
+        "variant": trial.variant.name,
+        "seed": trial.seed,
+        "episodes": trial.episodes,
+        "success_rate": judged["success_rate"],
+        "mean_steps": judged["mean_steps"],
+        "training_steps": training["steps"],
+        "updates": training["updates"],
+        "training_seconds": training["seconds"],
+        "training_cpu_seconds": training["cpu_seconds"],
+        "steps_to_solved": training["steps_to_solved"],
+    }
 
 
-def _warm_up() -> None:
-    """Loads the simulator and compiles its kernels, which no run shall be charged for."""
-    torch.set_num_threads(1)
-    for env_id in THESIS_IDS:
-        env = make_env(env_id)
-        env.reset(seed=0)
-        env.close()
+def _row(task: str, variant: Variant, strata: Sequence[Sequence[Result]]) -> AblationRow:
+    results = [result for stratum in strata for result in stratum]
+    solved = [r["steps_to_solved"] for r in results if r["steps_to_solved"] is not None]
+    return AblationRow(
+        task=task,
+        variant=variant.name,
+        title=variant.title,
+        seeds=tuple(sorted({int(r["seed"]) for r in results})),
+        success_rate=interquartile_interval([[r["success_rate"] for r in stratum] for stratum in strata]),
+        mean_steps=interquartile_interval([[r["mean_steps"] for r in stratum] for stratum in strata]),
+        steps_to_solved=float(np.median(solved)) if solved else None,
+        solved_runs=len(solved),
+        runs=len(results),
+        training_seconds=float(np.mean([r["training_seconds"] for r in results])),
+        training_cpu_seconds=float(np.mean([r["training_cpu_seconds"] for r in results])),
+    )
 
 
-def steps_to_solved(history: TrainingCurves, learning_starts: int) -> int | None:
-    """Environment steps after which 95 % of the last 50 training episodes succeeded; None if that never came.
-
-    Exploration is part of them, and so are episodes led by it; only those that ended after learning started count.
-    """
-    learned = history.episodes["end_step"] > learning_starts
-    success, ends = history.episodes["success"][learned], history.episodes["end_step"][learned]
-    if len(success) < WINDOW:
-        return None
-    sums = np.concatenate(([0.0], np.cumsum(success)))
-    shares = (sums[WINDOW:] - sums[:-WINDOW]) / WINDOW
-    solved = np.flatnonzero(shares >= SOLVED - 1e-9)
-    return int(ends[solved[0] + WINDOW - 1]) if len(solved) else None
+def _cells(row: AblationRow) -> tuple[str, ...]:
+    reached = "never" if row.steps_to_solved is None else f"{row.steps_to_solved:,.0f}"
+    return (
+        row.task,
+        row.title,
+        ", ".join(map(str, row.seeds)),
+        interval_text(row.success_rate, 100.0, "{:.1f}", " %"),
+        interval_text(row.mean_steps, 1.0, "{:.2f}", ""),
+        f"{reached} ({row.solved_runs} of {row.runs})",
+        f"{row.training_seconds:.0f} s",
+        f"{row.training_cpu_seconds:.0f} s",
+    )

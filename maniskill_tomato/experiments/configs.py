@@ -31,10 +31,14 @@ class EvaluationConfig:
     """What to evaluate and what to write."""
 
     env_id: str
+    policy: str | None = None
+    """File of the policy (.pt, or .onnx), `random`, or a planner's name; by default the one that ships."""
     episodes: int
     seed: int
     out: Path
     """Folder of the results."""
+    allow_other_task: bool = False
+    """Accept a policy that was trained on another task."""
     env_options: dict[str, Any] = field(default_factory=dict)
     """Options for `gymnasium.make` beside the defaults, for instance another plant."""
     baseline: bool = True
@@ -45,7 +49,7 @@ class EvaluationConfig:
     """How many episodes to film."""
     title: str = "Evaluation"
     training_run: Path | None = None
-    """A run whose training curves the report shows."""
+    """A run whose training curves the report shows; by default the one beside the policy, if there is one."""
     show_progress: bool = True
 
 
@@ -243,25 +247,3 @@ class ReproductionConfig:
     def __post_init__(self) -> None:
         check_positive(episodes=self.episodes, jobs=self.jobs, training_episodes=self.training_episodes)
         check_seeds(self.seeds)
-
-
-@dataclass(frozen=True, kw_only=True)
-class OcclusionConfig:
-    """Judge occlusion models by their error in V_f on rendered images of plants that nothing was tuned on."""
-
-    data: Path
-    """A folder of `maniskill-tomato dataset`."""
-    out: Path = Path("runs/occlusion")
-    """Folder of the results."""
-    models: tuple[str, ...] = ("thesis", "improved", "sphere", "amodal")
-    """Which models."""
-    count: int | None = None
-    """Only the first images; all by default."""
-    categories: tuple[str, ...] = ("tomato_ripe",)
-    """Which tomatoes count; the thesis's model knows red ones only."""
-    min_visible: int = 100
-    """Tomatoes seen in fewer pixels are left out."""
-    min_total: int = 400
-    """Tomatoes whose whole silhouette has fewer pixels are left out: those of the rows behind."""
-    figure: str | None = None
-    """Draw every step on this image of the folder (steps.png, as Fig. 4-28) instead of judging."""

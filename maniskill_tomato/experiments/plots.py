@@ -1,6 +1,6 @@
 """Plots of training and evaluation, the counterparts of the thesis's Figures 5-1 to 5-8."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -11,40 +11,20 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 from numpy.typing import ArrayLike, NDArray
 
-from maniskill_tomato.experiments.rollout import Episode
+from maniskill_tomato.experiments.episode_record import EpisodeRecord
 from maniskill_tomato.learning.rl.history import TrainingCurves
+from maniskill_tomato.report_design import INK, LEAF, MUTED, PLOT_STYLE, PLUM, SKY, STRAW, TOMATO
 
-INK, MUTED, GRID = "#1f2a24", "#6b7770", "#e3e7e2"
-TOMATO, LEAF, STRAW, SKY = "#c8402c", "#3f7d4e", "#d9a441", "#3b6ea5"
-
-STYLE: Any = {
-    "axes.edgecolor": "#b9c2bb",
-    "axes.labelcolor": INK,
-    "axes.spines.right": False,
-    "axes.spines.top": False,
-    "axes.grid": True,
-    "axes.axisbelow": True,
-    "axes.titlesize": 10.5,
-    "axes.titleweight": "bold",
-    "axes.titlelocation": "left",
-    "axes.titlecolor": INK,
-    "axes.labelsize": 9,
-    "grid.color": GRID,
-    "grid.linewidth": 0.8,
-    "xtick.color": MUTED,
-    "ytick.color": MUTED,
-    "xtick.labelsize": 8.5,
-    "ytick.labelsize": 8.5,
-    "legend.frameon": False,
-    "legend.fontsize": 8.5,
-    "savefig.dpi": 150,
-    "figure.constrained_layout.use": True,
-}
-
-TRAJECTORY_COLOURS = (SKY, STRAW, LEAF, "#8a5aa5")
+_SEED_COLOURS = (SKY, STRAW, LEAF, PLUM, TOMATO, "#4aa3a2", "#7a5230", "#5b6770")
+SHOWN_TRAJECTORIES = 4
 
 ARROW_LENGTH = 0.12
 """Length of a viewing arrow, in [m]."""
+
+
+def seed_colour(index: int) -> str:
+    """One colour for each training seed, reused beyond eight."""
+    return _SEED_COLOURS[index % len(_SEED_COLOURS)]
 
 
 def moving_average(values: ArrayLike, window: int) -> NDArray[np.float64]:
@@ -68,43 +48,62 @@ def default_windows(episodes: int, steps: int) -> tuple[int, int]:
     return max(12, episodes // 20), max(75, steps // 17)
 
 
-def plot_training_curves(curves: TrainingCurves, path: Path, windows: tuple[int, int] | None = None) -> None:
+def averaged_curve(values: NDArray[Any], window: int) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+    """The moving average of a series, and the number (from 1) of the value at which each mean ends."""
+    average = moving_average(values, window)
+    return np.arange(len(values) - len(average), len(values)) + 1, average
+
+
+def plot_training_curves(
+    runs: TrainingCurves | Mapping[str, TrainingCurves],
+    path: Path,
+    windows: tuple[int, int] | None = None,
+    marks: Callable[[str], Mapping[str, float]] = lambda unit: {},
+) -> None:
     """Moving averages of episode loss and reward, step reward and step V_f (Fig. 5-1 to 5-4, 5-14 to 5-17).
 
     Args:
-        curves: The history of a run.
+        runs: The history of a run, or those of several by their labels.
         path: The picture to write.
         windows: Window sizes in episodes and in steps; the thesis used 12 and 75, or 30 and 180.
+        marks: Places to mark on the axis of `episode` or `step`, by their captions.
     """
-    episode_window, step_window = windows or default_windows(
-        len(curves.episodes["steps"]), len(curves.step_reward)
+    several = {"": runs} if isinstance(runs, TrainingCurves) else dict(runs)
+    longest = max(several.values(), key=lambda curves: len(curves.step_reward))
+    windows = windows or default_windows(len(longest.episodes["steps"]), len(longest.step_reward))
+    panels: tuple[tuple[str, Callable[[TrainingCurves], NDArray[Any]], str, str], ...] = (
+        ("Episode loss", lambda c: c.episodes["loss_sum"], "episode", MUTED),
+        ("Episode reward", lambda c: c.episodes["episodic_return"], "episode", SKY),
+        ("Step reward", lambda c: c.step_reward, "step", SKY),
+        ("Step visible fraction", lambda c: c.step_visible_fraction, "step", TOMATO),
     )
-    panels: tuple[tuple[str, NDArray[Any], int, str, str], ...] = (
-        ("Episode loss", curves.episodes["loss_sum"], episode_window, "episode", MUTED),
-        ("Episode reward", curves.episodes["episodic_return"], episode_window, "episode", SKY),
-        ("Step reward", curves.step_reward, step_window, "step", SKY),
-        ("Step visible fraction", curves.step_visible_fraction, step_window, "step", TOMATO),
-    )
-    with mpl.rc_context(STYLE):
-        figure = Figure(figsize=(9.0, 5.6))
-        for axes, (title, values, window, unit, colour) in zip(
-            figure.subplots(2, 2).flat, panels, strict=True
-        ):
-            average = moving_average(values, window)
-            axes.plot(
-                np.arange(len(values) - len(average), len(values)), average, color=colour, linewidth=1.6
-            )
+    with mpl.rc_context(PLOT_STYLE):
+        figure = Figure(figsize=(9.0, 5.6 if len(several) == 1 else 5.8))
+        for axes, (title, values_of, unit, colour) in zip(figure.subplots(2, 2).flat, panels, strict=True):
+            window = windows[0 if unit == "episode" else 1]
+            most = 1
+            for index, (label, curves) in enumerate(several.items()):
+                values = values_of(curves)
+                most = max(most, len(values))
+                if len(several) > 1:
+                    colour = seed_colour(index)
+                axes.plot(*averaged_curve(values, window), color=colour, linewidth=1.5, label=label)
+            for caption, place in marks(unit).items():
+                _mark(axes, place, caption)
             axes.set_title(title)
-            note = f"mean of {min(window, max(len(values), 1))} {unit}s"
+            note = f"mean of {min(window, most)} {unit}s"
             axes.set_title(note, loc="right", fontsize=8.5, fontweight="normal", color=MUTED)
             axes.set_xlabel(unit)
             axes.xaxis.set_major_locator(MaxNLocator(nbins=6, integer=True))
+        if len(several) > 1:
+            handles, labels = figure.axes[0].get_legend_handles_labels()
+            figure.legend(handles, labels, loc="outside lower center", ncols=len(labels))
         figure.savefig(path)
 
 
-def plot_steps(episodes: Sequence[Episode], path: Path) -> None:
+def plot_steps(episodes: Sequence[EpisodeRecord], path: Path) -> None:
     """Steps that each episode needed (Fig. 5-6)."""
-    with mpl.rc_context(STYLE):
+    with mpl.rc_context(PLOT_STYLE):
         figure = Figure(figsize=(9.0, 2.9))
         axes = figure.subplots()
         colours = [LEAF if e.success else TOMATO for e in episodes]
@@ -118,9 +117,9 @@ def plot_steps(episodes: Sequence[Episode], path: Path) -> None:
         figure.savefig(path)
 
 
-def plot_visible_fraction(episodes: Sequence[Episode], threshold: float, path: Path) -> None:
+def plot_visible_fraction(episodes: Sequence[EpisodeRecord], threshold: float, path: Path) -> None:
     """Visible fraction at the start and the largest one reached, for each episode (Fig. 5-7)."""
-    with mpl.rc_context(STYLE):
+    with mpl.rc_context(PLOT_STYLE):
         figure = Figure(figsize=(9.0, 2.9))
         axes = figure.subplots()
         index = np.arange(1, len(episodes) + 1)
@@ -150,7 +149,7 @@ def plot_visible_fraction(episodes: Sequence[Episode], threshold: float, path: P
         figure.savefig(path)
 
 
-def plot_trajectories(episodes: Sequence[Episode], path: Path, most: int = len(TRAJECTORY_COLOURS)) -> None:
+def plot_trajectories(episodes: Sequence[EpisodeRecord], path: Path, most: int = SHOWN_TRAJECTORIES) -> None:
     """Ways of the end-effector in space, with viewing arrows at the first, middle and last pose (Fig. 5-8).
 
     Args:
@@ -159,14 +158,14 @@ def plot_trajectories(episodes: Sequence[Episode], path: Path, most: int = len(T
         most: How many to draw.
     """
     shown = list(episodes[:most])
-    targets = np.stack([e.target for e in shown])
+    targets = np.stack([e.target[0] for e in shown])
     points = np.concatenate([targets, np.zeros((1, 3)), *(e.viewpoints[:, :3] for e in shown)])
     low, high = points.min(axis=0) - 0.08, points.max(axis=0) + 0.08
-    with mpl.rc_context(STYLE):
+    with mpl.rc_context(PLOT_STYLE):
         figure = Figure(figsize=(9.0, 4.9))
         space: Any = figure.add_subplot(1, 2, 1, projection="3d")
         above = figure.add_subplot(1, 2, 2)
-        for colour, episode in zip(TRAJECTORY_COLOURS, shown, strict=False):
+        for colour, episode in zip(_SEED_COLOURS, shown, strict=False):
             _draw_trajectory(space, above, episode, colour)
         space.scatter(*targets.T, s=90, color=TOMATO, label="target")
         space.scatter(0.0, 0.0, 0.0, s=60, marker="s", color=INK, label="robot base")
@@ -203,7 +202,7 @@ def viewing_direction(viewpoints: NDArray[np.float64]) -> NDArray[np.float64]:
     )
 
 
-def _draw_trajectory(space: Any, above: Axes, episode: Episode, colour: str) -> None:
+def _draw_trajectory(space: Any, above: Axes, episode: EpisodeRecord, colour: str) -> None:
     """One way in both pictures; the first, middle and last pose get arrows, later ones stronger."""
     positions = episode.viewpoints[:, :3]
     x, y, z = positions.T
@@ -235,3 +234,18 @@ def _outcome_legend(axes: Axes) -> None:
     for colour, name in ((LEAF, "target fully visible"), (TOMATO, "not")):
         axes.scatter([], [], s=28, marker="s", color=colour, label=name)
     axes.legend(loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=3, borderaxespad=0.2, handletextpad=0.3)
+
+
+def _mark(axes: Axes, x: float, text: str) -> None:
+    axes.axvline(x, color=MUTED, linewidth=0.9, linestyle=(0, (4, 3)))
+    axes.annotate(
+        text,
+        (x, 1.0),
+        xycoords=("data", "axes fraction"),
+        xytext=(-3, -2),
+        textcoords="offset points",
+        ha="right",
+        va="top",
+        fontsize=7.5,
+        color=MUTED,
+    )

@@ -1,65 +1,31 @@
-"""Episodes of a policy, each with its own seed, recorded step by step."""
+"""The loop that runs episodes of any task and records them."""
 
 import sys
-from collections.abc import Container
-from dataclasses import dataclass
-from typing import Any
+import time
+from collections.abc import Sequence
+from typing import Any, Protocol
 
 import gymnasium as gym
 import numpy as np
-import torch
-from numpy.typing import NDArray
 from torch import Tensor
 from tqdm import tqdm
 
 from maniskill_tomato.errors import InvalidInputError
+from maniskill_tomato.experiments.episode_record import EpisodeRecord, Float64, RowSearch
 from maniskill_tomato.policies.adapters import as_state_policy
 from maniskill_tomato.policies.protocol import Policy, StatePolicy
 
-Float64 = NDArray[np.float64]
 
+class Watcher(Protocol):
+    """Follows the episodes while they are run, for instance to film them."""
 
-@dataclass(frozen=True, eq=False, kw_only=True)
-class Episode:
-    """One evaluated episode of T steps, from the start view 0 to the last view T."""
+    def view(self, info: dict[str, Any], done: bool) -> None:
+        """Called at every view, the first one included.
 
-    seed: int
-    """The seed of its reset."""
-    success: bool
-    """Whether the target became fully visible."""
-    viewpoints: Float64
-    """End-effector x, y, z [m], roll, pitch, yaw [rad], world frame, at every view. Shape (T + 1, 6)."""
-    target: Float64
-    """Position of the target in the world frame, in [m]. Shape (3,)."""
-    visible_fraction: Float64
-    """V_f at every view. Shape (T + 1,)."""
-    rewards: Float64
-    """R of every step. Shape (T,)."""
-    reachability: NDArray[np.int64]
-    """0 reached, 1 neighbour pose, 2 unreachable, for every step. Shape (T,)."""
-    in_forbidden_zone: NDArray[np.bool_]
-    """Whether each step ended in the forbidden zone. Shape (T,)."""
-    plant_contact: NDArray[np.bool_] | None = None
-    """Whether each step touched a plant; None where the task does not say. Shape (T,)."""
-    targets_seen: tuple[int, int] | None = None
-    """How many tomatoes were seen, and of how many; None where the task has one target."""
-    moves: int | None = None
-    """Moves as the task counts them, those of a row's transits among them; None where it counts none."""
-
-    @property
-    def steps(self) -> int:
-        """Number of steps T."""
-        return len(self.rewards)
-
-    @property
-    def max_visible_fraction(self) -> float:
-        """Largest V_f after any step; the start view does not count."""
-        return float(self.visible_fraction[1:].max())
-
-    @property
-    def path_length(self) -> float:
-        """Sum of the straight distances between the end-effector positions of successive views, in [m]."""
-        return float(np.linalg.norm(np.diff(self.viewpoints[:, :3], axis=0), axis=1).sum())
+        Args:
+            info: Of the reset or of the step that led here.
+            done: Whether the episode ends here.
+        """
 
 
 def run_episodes(
@@ -68,11 +34,11 @@ def run_episodes(
     episodes: int,
     seed: int,
     show_progress: bool = False,
-) -> list[Episode]:
+) -> list[EpisodeRecord]:
     """Runs `episodes` episodes without exploration; episode i starts from the seed `seed + i`.
 
     Args:
-        env: A ManiSkill environment with state observations that does not reset itself.
+        env: One or several environments that do not reset themselves.
         policy: Chooses the actions.
         episodes: How many to run, 1 or more.
         seed: Seed of the first one, 0 or more.
@@ -83,22 +49,20 @@ def run_episodes(
 
     Raises:
         InvalidInputError: `episodes` or `seed` is out of range.
-        PolicyError: The policy cannot act in this task.
     """
-    acting = as_state_policy(policy, env)
     if episodes < 1:
         raise InvalidInputError(f"episodes must be 1 or more, got {episodes}")
     if not 0 <= seed <= 2**31 - 1 - episodes:
         raise InvalidInputError(f"seed must be from 0 to {2**31 - 1 - episodes}, got {seed}")
     num_envs = int(getattr(env.unwrapped, "num_envs", 1))
-    done: list[Episode] = []
+    done: list[EpisodeRecord] = []
     interval = 0.5 if sys.stderr.isatty() else 10.0
     with tqdm(
         total=episodes, desc="evaluating", unit="episode", disable=not show_progress, mininterval=interval
     ) as bar:
         while len(done) < episodes:
             first = seed + len(done)
-            batch = _run_batch(env, acting, [first + i for i in range(num_envs)])
+            batch = run_batch(env, policy, range(first, first + num_envs))
             new = batch[: episodes - len(done)]
             done += new
             bar.set_postfix_str(f"success {sum(e.success for e in done) / len(done):.0%}", refresh=False)
@@ -106,60 +70,171 @@ def run_episodes(
     return done
 
 
-def _run_batch(env: gym.Env[Any, Any], policy: StatePolicy, seeds: list[int]) -> list[Episode]:
-    """One episode in each parallel environment; those that end early wait for the others."""
-    observations, info = env.reset(seed=seeds[0] if len(seeds) == 1 else seeds)  # type: ignore[arg-type]
-    running = torch.ones(len(seeds), dtype=torch.bool, device=observations.device)
-    success = torch.zeros_like(running)
-    views = [_view(env, observations, info)]
-    steps: list[Tensor] = []
-    while bool(running.any()):
-        observations, reward, terminated, truncated, info = env.step(policy.act(observations))
-        success |= info["success"] & running
-        views.append(_view(env, observations, info))
-        nowhere = torch.zeros_like(running)
-        outcome = (
-            torch.as_tensor(reward),
-            info["reachability"],
-            info.get("in_forbidden_zone", nowhere),
-            running,
-            info.get("plant_contact", nowhere),
-            info.get("seen_count", nowhere),
-            info.get("target_count", nowhere),
-            info.get("moves", nowhere),
+def run_episode(
+    env: gym.Env[Any, Any],
+    policy: Policy | StatePolicy,
+    seed: int,
+    *,
+    oracle_moves: int | None = None,
+    watcher: Watcher | None = None,
+) -> EpisodeRecord:
+    """One episode of one environment, whatever came before it: a policy with `reseed` draws from its seed.
+
+    Args:
+        env: A single environment.
+        policy: Chooses the actions.
+        seed: Of the reset; the number of the episode where the environment has a fixed list.
+        oracle_moves: Fewest moves known for it.
+        watcher: Follows it.
+
+    Raises:
+        InvalidInputError: The environment simulates several at once.
+    """
+    num_envs = int(getattr(env.unwrapped, "num_envs", 1))
+    if num_envs != 1:
+        raise InvalidInputError(
+            f"episodes are run one at a time; make the environment with num_envs=1, not {num_envs}"
         )
-        steps.append(torch.stack([value.float() for value in outcome], dim=-1))
-        running = running & ~(terminated | truncated)
-    seen = torch.stack(views).double().cpu().numpy()
-    happened = torch.stack(steps).double().cpu().numpy()
-    return [_episode(seeds[i], bool(success[i]), seen[:, i], happened[:, i], info) for i in range(len(seeds))]
+    reseed = getattr(policy, "reseed", None)
+    if reseed is not None:
+        reseed(seed)
+    (record,) = run_batch(env, policy, [seed], oracle_moves=[oracle_moves], watcher=watcher)
+    return record
 
 
-def _view(env: gym.Env[Any, Any], observations: Tensor, info: dict[str, Tensor]) -> Tensor:
-    """Viewpoint, target and V_f of the present view. Shape (B, 10)."""
-    belief = getattr(env.unwrapped, "belief", None)
-    poses = (
-        observations[:, :9]
-        if belief is None
-        else torch.cat((belief.viewpoint, belief.target_position), dim=-1)
+def run_batch(
+    env: gym.Env[Any, Any],
+    policy: Policy | StatePolicy,
+    seeds: Sequence[int],
+    *,
+    oracle_moves: Sequence[int | None] | None = None,
+    watcher: Watcher | None = None,
+) -> list[EpisodeRecord]:
+    """One episode in each of B parallel environments; those that end early wait for the others.
+
+    Args:
+        env: B environments that do not reset themselves.
+        policy: Chooses the actions.
+        seeds: Of the resets. Length B.
+        oracle_moves: Fewest moves known for each episode. Length B.
+        watcher: Follows them.
+    """
+    world: Any = env.unwrapped
+    observations, info = env.reset(seed=seeds[0] if len(seeds) == 1 else list(seeds))  # type: ignore[arg-type]
+    acting = as_state_policy(policy, env)
+    targets = [world.open_targets(i) for i in range(len(seeds))] if hasattr(world, "open_targets") else None
+    views, steps = [_view(world, observations, info)], []
+    running = np.ones(len(seeds), dtype=np.bool_)
+    success = np.zeros_like(running)
+    if watcher is not None:
+        watcher.view(info, False)
+    while running.any():
+        start = time.perf_counter()
+        actions = acting.act(observations)
+        decision_ms = 1e3 * (time.perf_counter() - start) / len(seeds)
+        observations, reward, terminated, truncated, info = env.step(actions)
+        views.append(_view(world, observations, info))
+        steps.append(_step(reward, info, running, decision_ms))
+        success |= _array(info["success"]).astype(np.bool_) & running
+        running &= ~(_array(terminated).astype(np.bool_) | _array(truncated).astype(np.bool_))
+        if watcher is not None:
+            watcher.view(info, not running.any())
+    seen, happened = _stacked(views), _stacked(steps)
+    records = []
+    for i, seed in enumerate(seeds):
+        count = int(happened["running"][:, i].sum())
+        view = {name: values[: count + 1, i] for name, values in seen.items()}
+        step = {name: values[:count, i] for name, values in happened.items()}
+        records.append(
+            EpisodeRecord(
+                seed=int(seed),
+                success=bool(success[i]),
+                visible_fraction=view["visible_fraction"],
+                viewpoints=view["viewpoint"],
+                target=view["target"],
+                rewards=step["reward"],
+                reachability=step["reachability"].astype(np.int64),
+                decision_ms=step["decision_ms"],
+                camera=view.get("camera"),
+                qpos=view.get("qpos"),
+                in_forbidden_zone=_flags(step.get("in_forbidden_zone")),
+                contact=_flags(step.get("plant_contact")),
+                clearance=step.get("clearance"),
+                true_visible_fraction=view.get("true_visible_fraction"),
+                true_target=view.get("true_target"),
+                oracle_moves=None if oracle_moves is None else oracle_moves[i],
+                row=None if targets is None else _row_search(targets[i], view, step),
+            )
+        )
+    return records
+
+
+def _view(world: Any, observations: Any, info: dict[str, Any]) -> dict[str, Float64]:
+    """What there is to keep of the present views, a row per environment."""
+    view = {"visible_fraction": _array(info["visible_fraction"])}
+    belief = getattr(world, "belief", None)
+    if belief is None:
+        view["viewpoint"], view["target"] = _array(observations[:, :6]), _array(observations[:, 6:9])
+    else:
+        view["viewpoint"], view["target"] = _array(belief.viewpoint), _array(belief.target_position)
+        view["camera"] = _array(belief.camera_position)
+    if (agent := getattr(world, "agent", None)) is not None:
+        view["qpos"] = _array(agent.robot.get_qpos())
+    if (true := info.get("true_visible_fraction")) is not None:
+        view["true_visible_fraction"] = _array(true)
+        view["true_target"] = _array(world.target_position_w)
+    if (fruit := getattr(world, "target_fruit", None)) is not None:
+        view["target_fruit"] = _array(fruit)
+    return view
+
+
+STEP_FACTS = (
+    "reachability",
+    "in_forbidden_zone",
+    "plant_contact",
+    "clearance",
+    "target_done",
+    "transits",
+    "moves",
+    "path_length",
+    "joint_path_length",
+)
+"""Entries of a task's info that are kept of every step, where it has them."""
+
+
+def _step(reward: Any, info: dict[str, Any], running: Any, decision_ms: float) -> dict[str, Float64]:
+    facts = {name: _array(info[name]) for name in STEP_FACTS if name in info}
+    count = len(running)
+    return {
+        "reward": np.broadcast_to(_array(reward), (count,)),
+        "running": running.copy(),
+        "decision_ms": np.full(count, decision_ms),
+        **facts,
+    }
+
+
+def _row_search(targets: Sequence[int], view: dict[str, Float64], step: dict[str, Float64]) -> RowSearch:
+    seen = view["target_fruit"][:-1][step["target_done"].astype(np.bool_)]
+    return RowSearch(
+        targets=tuple(int(fruit) for fruit in targets),
+        seen=tuple(sorted(int(fruit) for fruit in seen)),
+        moves=int(step["moves"][-1]),
+        transits=int(step["transits"].sum()),
+        path_m=float(step["path_length"][-1]),
+        joint_path_rad=float(step["joint_path_length"][-1]),
     )
-    return torch.cat((poses, info["visible_fraction"][:, None]), dim=-1)
 
 
-def _episode(seed: int, success: bool, seen: Float64, happened: Float64, told: Container[str]) -> Episode:
-    """The part of one environment's record until its episode ended; `told` says what the task tells."""
-    steps = int(happened[:, 3].sum())
-    found, wanted = (int(v) for v in happened[steps - 1, 5:7])
-    return Episode(
-        seed=seed,
-        success=success,
-        viewpoints=seen[: steps + 1, :6],
-        target=seen[0, 6:9],
-        visible_fraction=seen[: steps + 1, 9],
-        rewards=happened[:steps, 0],
-        reachability=happened[:steps, 1].astype(np.int64),
-        in_forbidden_zone=happened[:steps, 2].astype(np.bool_),
-        plant_contact=happened[:steps, 4].astype(np.bool_) if "plant_contact" in told else None,
-        targets_seen=(found, wanted) if "seen_count" in told else None,
-        moves=int(happened[steps - 1, 7]) if "moves" in told else None,
-    )
+def _stacked(parts: Sequence[dict[str, Float64]]) -> dict[str, Float64]:
+    return {name: np.stack([part[name] for part in parts]) for name in parts[0]}
+
+
+def _flags(values: Float64 | None) -> Any:
+    return None if values is None else values.astype(np.bool_)
+
+
+def _array(values: Any) -> Float64:
+    """A copy as an array of numbers, whatever device they are on."""
+    if isinstance(values, Tensor):
+        values = values.detach().double().cpu().numpy()
+    return np.atleast_1d(np.array(values, dtype=np.float64))

@@ -1,20 +1,34 @@
 """Rows searched by policies: which tomatoes were seen, which can be seen at all, and what it cost."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from itertools import combinations
 from typing import Any
 
 import gymnasium as gym
 import torch
-from torch import Tensor
 
+import maniskill_tomato
+from maniskill_tomato.errors import InvalidInputError
+from maniskill_tomato.experiments.configs import RowBenchmarkConfig
+from maniskill_tomato.experiments.episode_record import EpisodeRecord, RowSearch
+from maniskill_tomato.experiments.metrics import write_json
+from maniskill_tomato.experiments.policy_runs import Condition, parse_policies, run_policies
+from maniskill_tomato.experiments.result_store import ResultStore
 from maniskill_tomato.experiments.statistics import mean_interval, sign_flip_p
+from maniskill_tomato.files import write_atomically
+from maniskill_tomato.learning.rl.envs import make_env
 from maniskill_tomato.policies.oracle import FARTHEST, SHOULDER, shell_points
-from maniskill_tomato.policies.protocol import Policy, reseed
+from maniskill_tomato.report_design import markdown_table
 from maniskill_tomato.robot.iiwa14 import READY_QPOS
 from maniskill_tomato.robot.inverse_kinematics import Reach
 from maniskill_tomato.robot.look_at_move import MIN_DISTANCE, LookAtMover
 from maniskill_tomato.sensing.view_lattice import ViewLattice
+from maniskill_tomato.worker_pool import run_jobs
+
+ENV_ID = "TomatoViewpointRow-v1"
+
+SEEABLE = "seeable"
+"""Name under which the store keeps the tomatoes of each row that can be seen."""
 
 SAMPLES = 4096
 """Places round a tomato from which it is looked at, beside the lattice's candidates, before it counts as hidden."""
@@ -25,81 +39,75 @@ FARTHEST_VIEW = 0.75
 _BLOCK = 128
 
 
-@dataclass(frozen=True, kw_only=True)
-class RowResult:
-    """One policy's search of one row."""
-
-    seed: int
-    targets: tuple[int, ...]
-    """The tomatoes in reach, as indices in `Plant.fruits`."""
-    seen: tuple[int, ...]
-    """Those that were fully visible while they were the target."""
-    finished: bool
-    """Whether all were."""
-    moves: int
-    """Moves, each transit counted as `TRANSIT_MOVES`."""
-    asked: int
-    """Moves that the policy asked for."""
-    refused: int
-    """Those that the arm did not make."""
-    contacts: int
-    """Those on whose way, transits included, the arm touched a plant."""
-    transits: int
-    path_m: float
-    """Way of the camera, transits included, in [m]."""
-    joint_path_rad: float
-    """Way of all joints together, in [rad]."""
-
-    @classmethod
-    def from_json(cls, content: Mapping[str, Any]) -> "RowResult":
-        """The result whose fields were written as JSON."""
-        lists = {name: tuple(content[name]) for name in ("targets", "seen")}
-        return cls(**{**content, **lists})
+HEAD = (
+    "policy",
+    "seen of the seeable",
+    "seen of all",
+    "moves per tomato seen",
+    "rows finished",
+    "moves",
+    "way of the camera [m]",
+    "joints [rad]",
+    "transits",
+    "refused moves",
+    "moves with contact",
+)
 
 
-def search_row(env: gym.Env[Any, Any], policy: Policy, seed: int) -> RowResult:
-    """One episode of `TomatoViewpointRow-v1`, without exploration.
+def run_row_benchmark(config: RowBenchmarkConfig) -> str:
+    """Searches the rows that are not in the folder yet; writes rows-SPLIT-TRANSITS.json and .md.
 
-    Args:
-        env: The task, with one environment.
-        policy: Chooses the moves.
-        seed: Of the reset.
+    Returns:
+        The table and the comparison of every two policies, as Markdown.
+
+    Raises:
+        InvalidInputError: An option cannot be used, or the folder holds another benchmark.
     """
-    world: Any = env.unwrapped
-    reseed(policy, seed)
-    env.reset(seed=seed)
-    targets = tuple(world.open_targets(0))
-    first = torch.zeros(1, dtype=torch.int64, device=world.device)
-    policy.begin(world.belief, first)
-    seen: list[int] = []
-    asked = refused = contacts = transits = 0
-    info: dict[str, Tensor] = {}
-    done = False
-    while not done:
-        target = int(world.target_fruit[0])
-        _, _, terminated, truncated, info = env.step(policy.act(world.belief))
-        asked += 1
-        refused += int(info["reachability"][0]) == int(Reach.UNREACHABLE)
-        contacts += bool(info["plant_contact"][0])
-        transits += int(info["transits"][0])
-        if bool(info["target_done"][0]):
-            seen.append(target)
-        done = bool(terminated) or bool(truncated)
-        if not done and int(world.target_fruit[0]) != target:
-            policy.begin(world.belief, first)
-    return RowResult(
-        seed=seed,
-        targets=targets,
-        seen=tuple(sorted(seen)),
-        finished=bool(info["success"][0]),
-        moves=int(info["moves"][0]),
-        asked=asked,
-        refused=refused,
-        contacts=contacts,
-        transits=transits,
-        path_m=float(info["path_length"][0]),
-        joint_path_rad=float(info["joint_path_length"][0]),
-    )
+    specs = parse_policies(config.policies)
+    name = f"{config.split}-{config.transits}"
+    options = {"plant": {"seed": config.split, "pool": None}, "transits": config.transits}
+    condition = Condition(name=name, env_id=ENV_ID, env_options=options)
+    settings = {"env_id": ENV_ID, "package_version": maniskill_tomato.__version__}
+    store = ResultStore(config.out, settings, {f"policy {spec.label}": spec.fingerprint for spec in specs})
+    seeds = range(config.seed, config.seed + config.rows)
+    jobs = [(condition, seed) for seed in store.missing(SEEABLE, config.split, seeds)]
+    for (_, seed), fruits in run_jobs(_seeable_in_row, jobs, config.jobs):
+        store.add(SEEABLE, config.split, {seed: {"fruits": fruits}})
+    run_policies(store, [(condition, specs, seeds)], config.jobs)
+    results = {spec.label: store.episodes(name, spec.label, seeds) for spec in specs}
+    known = store.read(SEEABLE, config.split)
+    # What was seen can be seen, even where the samples missed the view.
+    seeable = {
+        seed: set(known[seed]["fruits"]).union(*(searched(rows[i]).seen for rows in results.values()))
+        for i, seed in enumerate(seeds)
+    }
+    path = config.out / f"rows-{name}.json"
+    write_json(path, _content(results, seeable))
+    text = rows_table(results, seeable) + "\n" + "\n".join(compare_rows(results, seeable)) + "\n"
+    write_atomically(path.with_suffix(".md"), text.encode())
+    return text
+
+
+def searched(record: EpisodeRecord) -> RowSearch:
+    """What an episode of a row came to.
+
+    Raises:
+        InvalidInputError: It is an episode of another task.
+    """
+    if record.row is None:
+        raise InvalidInputError(f"episode {record.seed} is not the search of a row")
+    return record.row
+
+
+def _seeable_in_row(job: tuple[Condition, int]) -> list[int]:
+    condition, seed = job
+    env = make_env(condition.env_id, **condition.env_options)
+    try:
+        env.reset(seed=seed)
+        world: Any = env.unwrapped
+        return SeeableTomatoes(env).among(world.open_targets(0))
+    finally:
+        env.close()
 
 
 class SeeableTomatoes:
@@ -149,7 +157,7 @@ class SeeableTomatoes:
         return best
 
 
-def rows_table(results: Mapping[str, Sequence[RowResult]], seeable: Mapping[int, set[int]]) -> str:
+def rows_table(results: Mapping[str, Sequence[EpisodeRecord]], seeable: Mapping[int, set[int]]) -> str:
     """The policies' figures as Markdown.
 
     Args:
@@ -157,50 +165,78 @@ def rows_table(results: Mapping[str, Sequence[RowResult]], seeable: Mapping[int,
         seeable: The tomatoes that can be seen, by the row's seed.
     """
     first = next(iter(results.values()))
-    wanted = sum(len(r.targets) for r in first)
-    possible = sum(len(seeable[r.seed]) for r in first)
-    lines = [
-        f"{len(first)} rows, {wanted} tomatoes in reach, {possible} of them seeable.",
-        "",
-        "| policy | seen of the seeable | seen of all | moves per tomato seen | rows finished | moves | way of the "
-        "camera [m] | joints [rad] | transits | refused moves | moves with contact |",
-        "|---" * 11 + "|",
-    ]
-    for name, rows in results.items():
-        count, asked = len(rows), sum(r.asked for r in rows)
-        seen = sum(len(r.seen) for r in rows)
-        low, high = mean_interval([_seen_share(r, seeable) for r in rows])
-        lines.append(
-            f"| {name} | {sum(len(seeable[r.seed] & set(r.seen)) for r in rows) / possible:.1%} "
-            f"(rows: {low:.1%} to {high:.1%}) | {seen / wanted:.1%} "
-            f"| {sum(r.moves for r in rows) / max(seen, 1):.2f} | {sum(r.finished for r in rows) / count:.0%} "
-            f"| {sum(r.moves for r in rows) / count:.1f} | {sum(r.path_m for r in rows) / count:.1f} "
-            f"| {sum(r.joint_path_rad for r in rows) / count:.0f} | {sum(r.transits for r in rows) / count:.1f} "
-            f"| {sum(r.refused for r in rows) / asked:.0%} | {sum(r.contacts for r in rows) / asked:.0%} |"
-        )
-    return "\n".join(lines) + "\n"
-
-
-def compare_rows(results: Mapping[str, Sequence[RowResult]], seeable: Mapping[int, set[int]]) -> list[str]:
-    """One line for every two policies: paired differences over the rows, each row counting once."""
-    names = list(results)
+    wanted = sum(len(searched(e).targets) for e in first)
+    possible = sum(len(seeable[e.seed]) for e in first)
     lines = []
-    for i, a in enumerate(names):
-        for b in names[i + 1 :]:
-            pairs = list(zip(results[a], results[b], strict=True))
-            parts = []
-            for what, values in (
-                ("share seen", [_seen_share(x, seeable) - _seen_share(y, seeable) for x, y in pairs]),
-                ("moves", [float(x.moves - y.moves) for x, y in pairs]),
-            ):
-                low, high = mean_interval(values)
-                mean = sum(values) / len(values)
-                parts.append(f"{what} {mean:+.3f} ({low:+.3f} to {high:+.3f}, p = {sign_flip_p(values):.3f})")
-            lines.append(f"{a} less {b}: {', '.join(parts)}")
+    for name, episodes in results.items():
+        rows = [searched(e) for e in episodes]
+        count, asked = len(rows), sum(e.steps for e in episodes)
+        seen = sum(len(r.seen) for r in rows)
+        both = sum(len(seeable[e.seed] & set(searched(e).seen)) for e in episodes)
+        low, high = mean_interval([_seen_share(e, seeable) for e in episodes])
+        touched = sum(int(e.contact.sum()) for e in episodes if e.contact is not None)
+        lines.append(
+            (
+                name,
+                f"{both / possible:.1%} (rows: {low:.1%} to {high:.1%})",
+                f"{seen / wanted:.1%}",
+                f"{sum(r.moves for r in rows) / max(seen, 1):.2f}",
+                f"{sum(e.success for e in episodes) / count:.0%}",
+                f"{sum(r.moves for r in rows) / count:.1f}",
+                f"{sum(r.path_m for r in rows) / count:.1f}",
+                f"{sum(r.joint_path_rad for r in rows) / count:.0f}",
+                f"{sum(r.transits for r in rows) / count:.1f}",
+                f"{sum(int(e.refused.sum()) for e in episodes) / asked:.0%}",
+                f"{touched / asked:.0%}",
+            )
+        )
+    head = f"{len(first)} rows, {wanted} tomatoes in reach, {possible} of them seeable."
+    return f"{head}\n\n{markdown_table(HEAD, lines)}\n"
+
+
+def compare_rows(
+    results: Mapping[str, Sequence[EpisodeRecord]], seeable: Mapping[int, set[int]]
+) -> list[str]:
+    """One line for every two policies: paired differences over the rows, each row counting once."""
+    lines = []
+    for a, b in combinations(results, 2):
+        pairs = list(zip(results[a], results[b], strict=True))
+        parts = []
+        for what, values in (
+            ("share seen", [_seen_share(x, seeable) - _seen_share(y, seeable) for x, y in pairs]),
+            ("moves", [float(searched(x).moves - searched(y).moves) for x, y in pairs]),
+        ):
+            low, high = mean_interval(values)
+            mean = sum(values) / len(values)
+            parts.append(f"{what} {mean:+.3f} ({low:+.3f} to {high:+.3f}, p = {sign_flip_p(values):.3f})")
+        lines.append(f"{a} less {b}: {', '.join(parts)}")
     return lines
 
 
-def _seen_share(result: RowResult, seeable: Mapping[int, set[int]]) -> float:
+def _seen_share(record: EpisodeRecord, seeable: Mapping[int, set[int]]) -> float:
     """Share of a row's seeable tomatoes that were seen; 1 where there is none."""
-    possible = seeable[result.seed]
-    return len(possible & set(result.seen)) / len(possible) if possible else 1.0
+    possible = seeable[record.seed]
+    return len(possible & set(searched(record).seen)) / len(possible) if possible else 1.0
+
+
+def _content(
+    results: Mapping[str, Sequence[EpisodeRecord]], seeable: Mapping[int, set[int]]
+) -> dict[str, Any]:
+    """The content of rows-SPLIT-TRANSITS.json."""
+    return {
+        "seeable": {str(seed): sorted(fruits) for seed, fruits in seeable.items()},
+        "rows": {
+            label: {
+                str(e.seed): {
+                    "seed": e.seed,
+                    "finished": e.success,
+                    "asked": e.steps,
+                    "refused": int(e.refused.sum()),
+                    "contacts": 0 if e.contact is None else int(e.contact.sum()),
+                    **vars(searched(e)),
+                }
+                for e in episodes
+            }
+            for label, episodes in results.items()
+        },
+    }

@@ -137,6 +137,23 @@ def interquartile_band(runs: Float64, resamples: int = 1000) -> tuple[Float64, F
     return low, high
 
 
+def interval_text(interval: Interval | None, factor: float, form: str, unit: str) -> str:
+    """An interquartile mean with its interval, as `97.5 [95.0, 99.0] %`.
+
+    Args:
+        interval: None for runs that were not evaluated.
+        factor: What the numbers are multiplied by.
+        form: Format of each number.
+        unit: What follows them.
+    """
+    if interval is None:
+        return "not evaluated"
+    text = form.format(factor * interval.estimate)
+    if interval.low is None or interval.high is None:
+        return text + unit
+    return f"{text} [{form.format(factor * interval.low)}, {form.format(factor * interval.high)}]{unit}"
+
+
 def mcnemar_p(only_a: int, only_b: int) -> float:
     """Two-sided exact McNemar test: under the null each discordant episode is a fair coin's throw.
 

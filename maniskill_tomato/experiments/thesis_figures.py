@@ -4,8 +4,10 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+import imageio.v2 as imageio
 import matplotlib as mpl
 import numpy as np
+import torch
 from matplotlib.axes import Axes
 from matplotlib.collections import PolyCollection
 from matplotlib.figure import Figure
@@ -15,19 +17,25 @@ from mpl_toolkits.mplot3d.art3d import Poly3DCollection  # type: ignore[import-u
 from numpy.typing import NDArray
 
 from maniskill_tomato.errors import InvalidInputError
-from maniskill_tomato.experiments.camera_frustum import frustum_faces, frustum_points
-from maniskill_tomato.experiments.plots import INK, MUTED, STYLE, TOMATO, moving_average
-from maniskill_tomato.experiments.reproduction import Reproduction, load_episodes, success_threshold
-from maniskill_tomato.experiments.rollout import Episode
-from maniskill_tomato.experiments.thesis_experiments import THESIS_EPISODES, Experiment
-from maniskill_tomato.learning.rl.history import TrainingCurves, load_history
+from maniskill_tomato.experiments.episode_record import EpisodeRecord
+from maniskill_tomato.experiments.plots import plot_training_curves, seed_colour
+from maniskill_tomato.experiments.training_study import Trial
+from maniskill_tomato.experiments.variants import Experiment
+from maniskill_tomato.learning.rl.envs import make_env
+from maniskill_tomato.learning.rl.history import load_history
 from maniskill_tomato.plants.organs import SemanticClass
 from maniskill_tomato.plants.spec import PlantPose, PlantSpec
+from maniskill_tomato.rendering import vulkan_probe
+from maniskill_tomato.report_design import INK, MUTED, PLOT_STYLE, TOMATO
+from maniskill_tomato.robot.d435 import T_flange_camera_color_optical, color_intrinsics
+from maniskill_tomato.robot.kinematics import viewpoint_transform
 from maniskill_tomato.tasks.maniskill.planting import grow
 from maniskill_tomato.tasks.thesis.config import ViewpointTaskConfig, guided_task, sparse_task
 
-SEED_COLOURS = ("#3b6ea5", "#d9a441", "#3f7d4e", "#8a5aa5", "#c8402c", "#4aa3a2", "#7a5230", "#5b6770")
-"""One colour per training seed, reused beyond eight."""
+THESIS_EPISODES = 6
+"""Length of the thesis's evaluations, in episodes."""
+
+LEFT_OUT = "Left out because this machine cannot render: the first and last views of the target. {hint}."
 
 PLANT_COLOURS = {
     SemanticClass.STEM: "#6d8f5a",
@@ -41,71 +49,70 @@ FRUSTUM_DEPTH = 0.11
 SHOWN_TRAJECTORIES = 3
 
 
-def draw_all(reproduction: Reproduction, seeds: Sequence[int], folder: Path) -> list[Path]:
+def draw_all(experiment: Experiment, trials: Sequence[Trial], folder: Path) -> list[Path]:
     """Draws every figure that needs no renderer; returns the files.
 
     Args:
-        reproduction: Its seeds must be finished.
-        seeds: Which of them to show.
+        experiment: What was tried.
+        trials: Finished trainings of one variant over seeds.
         folder: Where to write.
     """
     folder.mkdir(parents=True, exist_ok=True)
-    experiment = reproduction.experiment
-    threshold = success_threshold(experiment.env_id)
-    curves = {seed: load_history(reproduction.seed_folder(seed) / "training") for seed in seeds}
     files = [folder / "training.png", folder / "plants.png"]
-    plot_training(curves, experiment, files[0])
+    plot_training_curves(
+        {f"seed {trial.seed}": load_history(trial.folder) for trial in trials},
+        files[0],
+        experiment.windows,
+        lambda unit: _thesis_marks(experiment, unit),
+    )
     plot_plant_positions(experiment, files[1])
     for evaluation in experiment.evaluations:
-        runs = {seed: load_episodes(reproduction.episodes_path(seed, evaluation)) for seed in seeds}
+        runs = {trial.seed: trial.records(evaluation) for trial in trials}
         files.append(folder / f"evaluation_{evaluation.name}.png")
-        plot_evaluation(runs, threshold, evaluation.title, files[-1])
+        plot_evaluation(runs, _task(experiment).full_visibility, evaluation.title, files[-1])
         best = most_successful(runs)
         files.append(folder / f"trajectories_{evaluation.name}.png")
         plot_camera_ways(runs[best], f"{evaluation.title}, training seed {best}", files[-1])
     return files
 
 
-def most_successful(runs: Mapping[int, Sequence[Episode]]) -> int:
+def take_views(experiment: Experiment, trial: Trial, folder: Path) -> str | None:
+    """Takes `views_<evaluation>.png` for every evaluation: first view, last view, and the scene at the end.
+
+    The episode is the first that the trial's policy solved, or the first one if it solved none (Fig. 5-9, 5-13, 5-21).
+
+    Returns:
+        A message if this machine cannot render, else None.
+    """
+    if not vulkan_probe.rendering_available():
+        return LEFT_OUT.format(hint=vulkan_probe.NO_RENDERING_HINT.capitalize())
+    from maniskill_tomato.experiments.film import make_film_options, photograph
+
+    folder.mkdir(parents=True, exist_ok=True)
+    for evaluation in experiment.evaluations:
+        env = make_env(experiment.env_id, **{**make_film_options(), **evaluation.env_options})
+        try:
+            film = photograph(env, trial.policy(), episode_to_show(trial.records(evaluation)))
+        finally:
+            env.close()
+        views = (film.first.wrist, film.last.wrist, film.last.outside)
+        imageio.imwrite(folder / f"views_{evaluation.name}.png", np.concatenate(views, axis=1)[::2, ::2])
+    return None
+
+
+def episode_to_show(episodes: Sequence[EpisodeRecord]) -> int:
+    """Seed of the first solved episode, else of the first one."""
+    return next((e.seed for e in episodes if e.success), episodes[0].seed)
+
+
+def most_successful(runs: Mapping[int, Sequence[EpisodeRecord]]) -> int:
     """The seed whose policy solved the most episodes; the first of equals."""
     return max(runs, key=lambda seed: sum(e.success for e in runs[seed]))
 
 
-def plot_training(curves: Mapping[int, TrainingCurves], experiment: Experiment, path: Path) -> None:
-    """Moving averages of episode loss and reward, step reward and step V_f (Fig. 5-1 to 5-4, 5-14 to 5-17)."""
-    panels = (
-        ("Episode loss", "loss_sum", "episode"),
-        ("Episode reward", "episodic_return", "episode"),
-        ("Step reward", "step_reward", "step"),
-        ("Step V_f", "step_visible_fraction", "step"),
-    )
-    with mpl.rc_context(STYLE):
-        figure = Figure(figsize=(9.0, 5.8))
-        for axes, (title, name, unit) in zip(figure.subplots(2, 2).flat, panels, strict=True):
-            window = experiment.windows[0 if unit == "episode" else 1]
-            for index, (seed, run) in enumerate(curves.items()):
-                values = run.episodes[name] if unit == "episode" else getattr(run, name)
-                ends, average = averaged_curve(values, window)
-                axes.plot(ends, average, color=_colour(index), linewidth=1.3, label=f"seed {seed}")
-            _mark_thesis(axes, experiment, unit)
-            axes.set_title(title)
-            axes.set_title(
-                f"mean of {window} {unit}s", loc="right", fontsize=8.5, fontweight="normal", color=MUTED
-            )
-            axes.set_xlabel(unit)
-            axes.xaxis.set_major_locator(MaxNLocator(nbins=6, integer=True))
-        handles, labels = figure.axes[0].get_legend_handles_labels()
-        figure.legend(handles, labels, loc="outside lower center", ncols=len(labels))
-        figure.savefig(path)
-
-
-def averaged_curve(values: NDArray[Any], window: int) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-    """The moving average of a series, and the number (from 1) of the value at which each mean ends."""
-    average = moving_average(values, window)
-    return np.arange(len(values) - len(average), len(values)) + 1, average
-
-
-def plot_evaluation(runs: Mapping[int, Sequence[Episode]], threshold: float, title: str, path: Path) -> None:
+def plot_evaluation(
+    runs: Mapping[int, Sequence[EpisodeRecord]], threshold: float, title: str, path: Path
+) -> None:
     """Steps and largest V_f per episode (Fig. 5-6, 5-7): the thesis's six episodes, and all that were run.
 
     Args:
@@ -114,7 +121,7 @@ def plot_evaluation(runs: Mapping[int, Sequence[Episode]], threshold: float, tit
         title: What is evaluated.
         path: The picture to write.
     """
-    with mpl.rc_context(STYLE):
+    with mpl.rc_context(PLOT_STYLE):
         figure = Figure(figsize=(9.0, 5.4))
         grid = figure.subplots(2, 2)
         offsets = np.linspace(-0.25, 0.25, len(runs)) if len(runs) > 1 else np.zeros(1)
@@ -129,8 +136,8 @@ def plot_evaluation(runs: Mapping[int, Sequence[Episode]], threshold: float, tit
                     np.arange(1, len(first) + 1) + offsets[index],
                     [getattr(e, attribute) for e in first],
                     s=30,
-                    facecolors=[_colour(index) if e.success else "white" for e in first],
-                    edgecolors=_colour(index),
+                    facecolors=[seed_colour(index) if e.success else "white" for e in first],
+                    edgecolors=seed_colour(index),
                     linewidths=1.3,
                     zorder=3,
                 )
@@ -138,7 +145,7 @@ def plot_evaluation(runs: Mapping[int, Sequence[Episode]], threshold: float, tit
                 many.plot(
                     np.arange(1, len(episodes) + 1),
                     sorted(getattr(e, attribute) for e in episodes),
-                    color=_colour(index),
+                    color=seed_colour(index),
                     linewidth=1.5,
                     label=f"seed {seed}: {solved} of {len(episodes)} solved",
                 )
@@ -159,7 +166,7 @@ def plot_evaluation(runs: Mapping[int, Sequence[Episode]], threshold: float, tit
         figure.savefig(path)
 
 
-def plot_camera_ways(episodes: Sequence[Episode], title: str, path: Path) -> None:
+def plot_camera_ways(episodes: Sequence[EpisodeRecord], title: str, path: Path) -> None:
     """Ways of the end-effector with the camera at the first, middle and last pose (Fig. 5-8).
 
     As in the thesis the first camera is opaque, the middle one transparent and the last one between.
@@ -173,12 +180,12 @@ def plot_camera_ways(episodes: Sequence[Episode], title: str, path: Path) -> Non
     if not shown:
         raise InvalidInputError("a figure of trajectories needs at least one episode")
     frusta = [[frustum_points(v, FRUSTUM_DEPTH) for v in e.viewpoints[marked_views(e)]] for e in shown]
-    targets = np.stack([e.target for e in shown])
+    targets = np.stack([e.target[0] for e in shown])
     points = np.concatenate(
         [targets, *(e.viewpoints[:, :3] for e in shown), *(f for cameras in frusta for f in cameras)]
     )
     low, high = points.min(axis=0) - 0.05, points.max(axis=0) + 0.05
-    with mpl.rc_context(STYLE):
+    with mpl.rc_context(PLOT_STYLE):
         figure = Figure(figsize=(9.0, 5.0))
         for column, (elevation, azimuth) in enumerate(((22, -128), (62, -100)), start=1):
             space: Any = figure.add_subplot(1, 2, column, projection="3d")
@@ -188,14 +195,21 @@ def plot_camera_ways(episodes: Sequence[Episode], title: str, path: Path) -> Non
                     "solved" if episode.success else "not solved"
                 )
                 space.plot(
-                    x, y, z, color=_colour(index), linewidth=1.4, marker="o", markersize=2.5, label=label
+                    x,
+                    y,
+                    z,
+                    color=seed_colour(index),
+                    linewidth=1.4,
+                    marker="o",
+                    markersize=2.5,
+                    label=label,
                 )
                 for camera, opacity in zip(cameras, camera_opacities(len(cameras)), strict=True):
                     space.add_collection3d(
                         Poly3DCollection(
                             frustum_faces(camera),
-                            facecolors=_colour(index),
-                            edgecolors=_colour(index),
+                            facecolors=seed_colour(index),
+                            edgecolors=seed_colour(index),
                             linewidths=0.7,
                             alpha=opacity,
                         )
@@ -212,7 +226,7 @@ def plot_camera_ways(episodes: Sequence[Episode], title: str, path: Path) -> Non
         figure.savefig(path)
 
 
-def marked_views(episode: Episode) -> list[int]:
+def marked_views(episode: EpisodeRecord) -> list[int]:
     """The first, the middle and the last view of an episode, each once."""
     return sorted({0, episode.steps // 2, episode.steps})
 
@@ -224,8 +238,8 @@ def camera_opacities(count: int) -> list[float]:
 
 def plot_plant_positions(experiment: Experiment, path: Path) -> None:
     """Where the plant stands in the training and in each evaluation (Fig. 5-5, 5-10, 5-18)."""
-    task = guided_task() if experiment.name == "guided" else sparse_task()
-    with mpl.rc_context(STYLE):
+    task = _task(experiment)
+    with mpl.rc_context(PLOT_STYLE):
         figure = Figure(figsize=(3.1 * len(experiment.evaluations), 5.6))
         grid = figure.subplots(2, len(experiment.evaluations), sharex="row", sharey="row")
         for (front, above), evaluation in zip(grid.T, experiment.evaluations, strict=True):
@@ -280,29 +294,43 @@ def _draw_starts(axes: Axes, task: ViewpointTaskConfig, shown: tuple[int, int]) 
     axes.add_patch(Rectangle((x0, y0), x1 - x0, y1 - y0, fill=False, edgecolor=INK, linestyle=(0, (3, 2))))
 
 
-def _mark_thesis(axes: Axes, experiment: Experiment, unit: str) -> None:
-    """Where the thesis's own training or exploration ended."""
-    thesis = experiment.thesis
-    if unit == "step" and thesis.total_steps is not None:
-        _mark(axes, thesis.total_steps, "thesis:\nlast step")
-    if thesis.exploration_ends is not None:
-        _mark(axes, thesis.exploration_ends[0 if unit == "episode" else 1], "thesis:\nexploration over")
+def _thesis_marks(experiment: Experiment, unit: str) -> dict[str, float]:
+    """Where the thesis's own training or exploration ended, in episodes or steps."""
+    marks: dict[str, float] = {}
+    if unit == "step" and experiment.total_steps is not None:
+        marks["thesis:\nlast step"] = experiment.total_steps
+    if experiment.exploration_ends is not None:
+        marks["thesis:\nexploration over"] = experiment.exploration_ends[0 if unit == "episode" else 1]
+    return marks
 
 
-def _mark(axes: Axes, x: float, text: str) -> None:
-    axes.axvline(x, color=MUTED, linewidth=0.9, linestyle=(0, (4, 3)))
-    axes.annotate(
-        text,
-        (x, 1.0),
-        xycoords=("data", "axes fraction"),
-        xytext=(-3, -2),
-        textcoords="offset points",
-        ha="right",
-        va="top",
-        fontsize=7.5,
-        color=MUTED,
-    )
+def frustum_points(viewpoint: NDArray[np.float64], depth: float) -> NDArray[np.float64]:
+    """Apex and base of the colour camera's viewing pyramid in the world frame, in [m].
+
+    Args:
+        viewpoint: End-effector x, y, z [m], roll, pitch, yaw [rad], world frame. Shape (6,).
+        depth: Distance of the base from the camera, in [m].
+
+    Returns:
+        The optical centre, then the corners of the 640 x 480 picture: top left, top right, bottom right,
+        bottom left. Shape (5, 3).
+    """
+    camera = color_intrinsics()
+    w, h = float(camera.width), float(camera.height)
+    corners = camera.ray_directions([(0.0, 0.0), (w, 0.0), (w, h), (0.0, h)]) * depth
+    points = np.concatenate([np.zeros((1, 3)), corners])
+    T_world_ee = viewpoint_transform(torch.as_tensor(viewpoint, dtype=torch.float64)[None])[0].numpy()
+    T_world_optical = T_world_ee @ np.asarray(T_flange_camera_color_optical)
+    world: NDArray[np.float64] = points @ T_world_optical[:3, :3].T + T_world_optical[:3, 3]
+    return world
 
 
-def _colour(index: int) -> str:
-    return SEED_COLOURS[index % len(SEED_COLOURS)]
+def frustum_faces(points: NDArray[np.float64]) -> list[NDArray[np.float64]]:
+    """The four sides and the base of `frustum_points` as polygons, each of shape (3 or 4, 3)."""
+    apex, corners = points[0], points[1:]
+    sides = [np.stack((apex, corners[i], corners[(i + 1) % 4])) for i in range(4)]
+    return [*sides, corners]
+
+
+def _task(experiment: Experiment) -> ViewpointTaskConfig:
+    return guided_task() if experiment.name == "guided" else sparse_task()

@@ -5,8 +5,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from maniskill_tomato.errors import InvalidInputError
-from maniskill_tomato.segmentation.instances import FRUIT_CATEGORIES, Image, Instances
-from maniskill_tomato.segmentation.segmenter import check_image
+from maniskill_tomato.segmentation.instances import FRUIT_CATEGORIES, Image, Instances, check_image
 
 RIPE_HUES = ((0, 14), (168, 180))
 """Hues of red and orange fruit, as OpenCV counts them: half degrees."""

@@ -1,4 +1,4 @@
-"""Fruits in image files, as a list that any tool can read."""
+"""Fruits in image files, as a JSON list in COCO's form."""
 
 import json
 from collections.abc import Callable
@@ -18,10 +18,10 @@ IMAGE_SUFFIXES = (".jpg", ".jpeg", ".png", ".bmp", ".tif", ".tiff", ".webp")
 
 @dataclass(frozen=True, kw_only=True)
 class DetectionSummary:
-    """What became of the images."""
+    """How many images were searched and what was found."""
 
     images: int
-    """Images that were looked at."""
+    """Images that were searched."""
     detections: int
     """Fruits found in them."""
     skipped: tuple[str, ...]
@@ -52,10 +52,10 @@ def detect(
     out: Path,
     seen: Callable[[str, Image, Instances], None] | None = None,
 ) -> DetectionSummary:
-    """Looks at an image or at each image of a folder and writes a JSON list with one object a fruit.
+    """Finds the fruits in an image, or in each image of a folder, and writes a JSON list with one object a fruit.
 
     Each object has `file_name`, `bbox` (x, y, w, h in [px]), `score`, `category` and `segmentation` (COCO's run-length
-    encoding, `counts` as text). Files that cannot be read are left out, unless none can.
+    encoding, `counts` as text). Files that cannot be read are left out. If none can be read, that is an error.
 
     Args:
         place: An image or a folder.

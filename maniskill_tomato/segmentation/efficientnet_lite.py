@@ -1,4 +1,4 @@
-"""EfficientNet-Lite0 without its classifier: features at strides 4 to 32 that know ImageNet before a fruit is seen.
+"""EfficientNet-Lite0 without its classifier: features at strides 4 to 32, with ImageNet weights to begin with.
 
 Tan and Le, 2019, EfficientNet: Rethinking Model Scaling for Convolutional Neural Networks; the Lite variants of
 TensorFlow's TPU repository (Apache-2.0) have no squeeze-and-excitation and clip at 6 instead of swish.
@@ -128,8 +128,8 @@ class EfficientNetLite0(nn.Module):
     def keep_fixed(self, blocks: int) -> None:
         """Training leaves the stem, the first blocks and all statistics of the batch normalisations alone.
 
-        Fruits are drawn from too few pictures to improve on edges and colours, and the first layers, whose maps are
-        the largest, take half of a step's time.
+        The training pictures of fruits are too few to improve edge and colour filters. The first layers have the
+        largest maps and would take half of a step's time.
         """
         for module in (self.stem, *self.blocks[:blocks]):
             module.requires_grad_(False)

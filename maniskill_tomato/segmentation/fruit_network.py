@@ -26,7 +26,7 @@ SIZE_MULTIPLE = 32
 
 
 class FruitMaps(NamedTuple):
-    """What the network says at every place; places are `STRIDE` pixels apart, h = H / STRIDE, w = W / STRIDE."""
+    """The network's output at every place; places are `STRIDE` pixels apart, h = H / STRIDE, w = W / STRIDE."""
 
     centre: Tensor
     """Logit that a fruit is centred here. Shape (B, 1, h, w)."""
@@ -39,7 +39,7 @@ class FruitMaps(NamedTuple):
     fruit: Tensor
     """Logit that this is a fruit's visible pixel. Shape (B, 1, h, w)."""
     vote: Tensor
-    """Way right and down to the centre of the visible box of its fruit, in [px]. Shape (B, 2, h, w)."""
+    """Offset right and down to the centre of the visible box of its fruit, in [px]. Shape (B, 2, h, w)."""
 
 
 def _conv(inputs: int, outputs: int, size: int = 3, stride: int = 1) -> nn.Sequential:

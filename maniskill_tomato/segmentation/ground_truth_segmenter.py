@@ -6,8 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from maniskill_tomato.errors import InvalidInputError
-from maniskill_tomato.segmentation.instances import Image, Instances
-from maniskill_tomato.segmentation.segmenter import check_image
+from maniskill_tomato.segmentation.instances import Image, Instances, check_image
 
 
 class GroundTruthSegmenter:

@@ -30,8 +30,8 @@ class Instances:
     masks: NDArray[np.bool_]
     """Visible pixels of each. Shape (N, H, W)."""
     amodal_boxes: NDArray[np.float32] | None = None
-    """Boxes of the whole fruits as if nothing stood in front, in [px], or None if the segmenter does not tell. They
-    may reach beyond the image. Shape (N, 4)."""
+    """Boxes of the whole fruits as if nothing stood in front, in [px]; they may reach beyond the image. None if the
+    segmenter does not predict them. Shape (N, 4)."""
 
     def __post_init__(self) -> None:
         count = len(self.boxes)
@@ -102,7 +102,7 @@ class Instances:
         A tomato is close to a spheroid, whose outline is an ellipse. Shape (N, H, W).
 
         Raises:
-            InvalidInputError: The segmenter does not tell amodal boxes.
+            InvalidInputError: The segmenter does not predict amodal boxes.
         """
         if self.amodal_boxes is None:
             raise InvalidInputError(
@@ -118,7 +118,7 @@ class Instances:
         T is the area of the ellipse in the amodal box. Shape (N,).
 
         Raises:
-            InvalidInputError: The segmenter does not tell amodal boxes.
+            InvalidInputError: The segmenter does not predict amodal boxes.
         """
         if self.amodal_boxes is None:
             raise InvalidInputError(
@@ -130,7 +130,7 @@ class Instances:
 
 
 def joined(parts: Sequence[Instances]) -> Instances:
-    """What several looks at one image found, best score first; whole boxes only if all tell them."""
+    """The instances of several passes over one image, best score first; whole boxes only if all passes have them."""
     whole = [part.amodal_boxes for part in parts if part.amodal_boxes is not None]
     together = Instances(
         boxes=np.concatenate([part.boxes for part in parts]),
@@ -140,6 +140,29 @@ def joined(parts: Sequence[Instances]) -> Instances:
         amodal_boxes=np.concatenate(whole) if len(whole) == len(parts) else None,
     )
     return together.chosen(np.argsort(-together.scores, kind="stable"))
+
+
+def check_image(image: Image, depth_m: NDArray[np.float32] | None = None) -> None:
+    """Accepts an image that a segmenter can work on.
+
+    Raises:
+        InvalidInputError: A shape or a type differs from what `Segmenter` documents.
+    """
+    if not isinstance(image, np.ndarray) or image.ndim != 3 or image.shape[2] != 3 or image.dtype != np.uint8:
+        shape = getattr(image, "shape", None)
+        raise InvalidInputError(
+            "an image must have shape (H, W, 3), red, green, blue, as uint8 from 0 to 255; "
+            f"got shape {shape} of {getattr(image, 'dtype', type(image).__name__)}"
+        )
+    if image.size == 0:
+        raise InvalidInputError(f"an image must have pixels; got shape {image.shape}")
+    if depth_m is not None and (
+        depth_m.shape != image.shape[:2] or not np.issubdtype(depth_m.dtype, np.floating)
+    ):
+        raise InvalidInputError(
+            f"depth must be floats in [m] of the image's shape {image.shape[:2]}; "
+            f"got shape {depth_m.shape} of {depth_m.dtype}"
+        )
 
 
 def mask_box(mask: NDArray[np.bool_]) -> tuple[int, int, int, int]:

@@ -27,24 +27,26 @@ from maniskill_tomato.segmentation.instances import (
     Image,
     Instances,
     box_ellipse,
+    check_image,
     joined,
 )
-from maniskill_tomato.segmentation.segmenter import check_image
 from maniskill_tomato.segmentation.weights import load_weights
 
 SHIPPED_WEIGHTS = "perception/light_segmenter.pt"
 
 MOST_FRUITS = 300
-"""Fruits that are looked at in one image, the best ones."""
+"""Most fruits that are returned for one image; the best ones are kept."""
 
 PADDING_COLOUR = 110.0
 
 THOROUGH: dict[str, Any] = {"scales": (1.5, 0.75, 0.4), "mirrored": True}
-"""Options for those who have time: finds more of the small fruits in 4.5 times the time."""
+"""Options that find more of the small fruits, in 4.5 times the time."""
 
 COARSE_SIDES = (32.0, 192.0)
-"""Fruits with a side longer than the second, in [px] of the network's input, are left to the next smaller image, where
-those with a side shorter than the first are left out."""
+"""Bounds on a fruit's sides where one image is searched at several sizes, in [px] of the network's input.
+
+Fruits with a side longer than the second bound are taken from the next smaller size instead. At that size fruits with a
+side shorter than the first bound are left out."""
 
 
 class LightSegmenter:
@@ -63,15 +65,15 @@ class LightSegmenter:
         """Takes a trained network.
 
         Args:
-            network: As it is now; it is set to evaluation mode.
-            boxes_only: It was trained on boxes alone: its masks are the ellipses in its boxes, its fruits are all
-                `tomato`, and it tells no whole boxes.
+            network: Its present weights are used; it is set to evaluation mode.
+            boxes_only: The network was trained on boxes alone. Then masks are the ellipses in the boxes, all
+                fruits have the category `tomato`, and there are no whole boxes.
             score_threshold: Fruits below this are left out.
             overlap_threshold: Of two boxes with a larger intersection over union only the better one stays.
             longest_side: Larger images are made smaller first, in [px].
-            scales: Factors on the image's size at which it is looked at, falling: the network was trained on fruits of
-                limited size, so that a fruit close to the camera is found in a smaller image.
-            mirrored: Look at each mirror image too, in twice the time, and take the mean of what the network says.
+            scales: Factors on the image's size, falling; the network runs once for each. It was trained on fruits of
+                limited size, so a fruit close to the camera is found in a smaller image.
+            mirrored: Run on the mirror images too and average the outputs, in twice the time.
 
         Raises:
             InvalidInputError: A threshold is not between 0 and 1, or the side is too short.
@@ -98,23 +100,23 @@ class LightSegmenter:
         height, width = image.shape[:2]
         largest = min(1.0, self.longest_side / max(height, width))
         x = torch.from_numpy(np.ascontiguousarray(image)).permute(2, 0, 1)[None].float()
-        looks = []
+        parts = []
         with torch.inference_mode():
             for number, scale in enumerate(self.scales):
-                found = self._look(x, largest * scale)
+                found = self._found_at(x, largest * scale)
                 sides = (found.boxes[:, 2:] - found.boxes[:, :2]) * largest * scale
                 kept = np.ones(len(found), bool)
                 if number > 0:
                     kept &= sides.min(axis=1, initial=np.inf) >= COARSE_SIDES[0]
                 if number + 1 < len(self.scales):
                     kept &= sides.max(axis=1, initial=0) <= COARSE_SIDES[1]
-                looks.append(found.chosen(kept))
-        together = joined(looks)
+                parts.append(found.chosen(kept))
+        together = joined(parts)
         boxes, scores = torch.from_numpy(together.boxes), torch.from_numpy(together.scores)
         return together.chosen(nms(boxes, scores, self.overlap_threshold).numpy())
 
-    def _look(self, x: Tensor, factor: float) -> Instances:
-        """The fruits in an image (1, 3, H, W), seen at a factor of its size."""
+    def _found_at(self, x: Tensor, factor: float) -> Instances:
+        """The fruits in an image (1, 3, H, W) that is scaled by a factor."""
         height, width = x.shape[2:]
         size = max(round(height * factor), 1), max(round(width * factor), 1)
         if size != (height, width):
@@ -147,7 +149,7 @@ class LightSegmenter:
 
 
 def mirror(maps: FruitMaps) -> FruitMaps:
-    """What the network says about the mirror image of an image, as of the image itself."""
+    """The output for a mirror image, mapped back to the image itself."""
     centre, box, whole, category, fruit, vote = (part.flip(3) for part in maps)
     sides = [2, 1, 0, 3]  # Left and right change places.
     return FruitMaps(
@@ -161,7 +163,7 @@ def mirror(maps: FruitMaps) -> FruitMaps:
 
 
 def mean_of(a: FruitMaps, b: FruitMaps) -> FruitMaps:
-    """The mean of two opinions about one image."""
+    """The mean of two outputs for one image."""
     return FruitMaps(*((one + other) / 2 for one, other in zip(a, b, strict=True)))
 
 
@@ -171,7 +173,7 @@ def full_maps(
     """Fruit pixels (H, W) and the centres they vote for (2, H, W), in the image's pixels.
 
     Args:
-        maps: What the network says about the image made to `size` and padded.
+        maps: The network's output for the image scaled to `size` and padded.
         size: Height and width without the padding, in [px].
         full: Height and width of the image, in [px].
     """

@@ -1,4 +1,4 @@
-"""Binary masks in few bytes: COCO's run-length encoding, read with care and written by pycocotools.
+"""Binary masks in COCO's run-length encoding; what is read is checked, pycocotools writes.
 
 COCO counts runs of 0 and 1 in turn down the columns, from the left one. A mask here is a boolean array of shape
 (height, width), True where the thing is.

@@ -1,7 +1,4 @@
-"""Segmenters: an image goes in, fruits come out.
-
-`make_segmenter` opens one by its name or by the file of its weights.
-"""
+"""The interface of a segmenter, which finds fruits in an image, and the opener by name or by file of weights."""
 
 import importlib
 from collections.abc import Callable
@@ -46,11 +43,12 @@ def make_segmenter(name_or_path: str | Path = DEFAULT_SEGMENTER, **options: Any)
     """Opens a segmenter.
 
     Args:
-        name_or_path: A name from `SEGMENTERS`, or a file of weights (`.pt`), which says what it is for.
-        **options: What this kind of segmenter takes, for instance `score_threshold`.
+        name_or_path: A name from `SEGMENTERS`, or a file of weights (`.pt`), which names its segmenter.
+        **options: Options of this kind of segmenter, for instance `score_threshold`.
 
     Raises:
-        InvalidInputError: There is no segmenter of this name, and no such file, or an option is not one of its.
+        InvalidInputError: There is neither a segmenter nor a file of this name, or the segmenter has no such
+            option.
         CheckpointError: The file of weights is missing or damaged.
         MissingPackageError: It needs a package that is not installed.
     """
@@ -76,12 +74,12 @@ def make_segmenter(name_or_path: str | Path = DEFAULT_SEGMENTER, **options: Any)
 
 
 def open_for_files(name: str, score_threshold: float, thorough: bool) -> Segmenter:
-    """Opens a segmenter that looks at images in files, where there is no hurry.
+    """Opens a segmenter for images in files, where time matters less than on a robot.
 
     Args:
         name: Name of a segmenter, or a file of weights.
-        score_threshold: Least score, of segmenters that give scores.
-        thorough: Whether the light segmenter looks at each image more often.
+        score_threshold: Least score; ignored by segmenters without scores.
+        thorough: Run the light segmenter on more sizes and on mirror images (`THOROUGH`).
 
     Raises:
         InvalidInputError: There is no such segmenter, or the threshold is out of its range.
@@ -96,26 +94,3 @@ def open_for_files(name: str, score_threshold: float, thorough: bool) -> Segment
         if name == "light" or (Path(name).is_file() and read_kind(Path(name)) == "light"):
             options |= THOROUGH
     return make_segmenter(name, **options)
-
-
-def check_image(image: Image, depth_m: NDArray[np.float32] | None = None) -> None:
-    """Accepts an image that a segmenter can work on.
-
-    Raises:
-        InvalidInputError: A shape or a type is another one than `Segmenter` documents.
-    """
-    if not isinstance(image, np.ndarray) or image.ndim != 3 or image.shape[2] != 3 or image.dtype != np.uint8:
-        shape = getattr(image, "shape", None)
-        raise InvalidInputError(
-            "an image must have shape (H, W, 3), red, green, blue, as uint8 from 0 to 255; "
-            f"got shape {shape} of {getattr(image, 'dtype', type(image).__name__)}"
-        )
-    if image.size == 0:
-        raise InvalidInputError(f"an image must have pixels; got shape {image.shape}")
-    if depth_m is not None and (
-        depth_m.shape != image.shape[:2] or not np.issubdtype(depth_m.dtype, np.floating)
-    ):
-        raise InvalidInputError(
-            f"depth must be floats in [m] of the image's shape {image.shape[:2]}; "
-            f"got shape {depth_m.shape} of {depth_m.dtype}"
-        )

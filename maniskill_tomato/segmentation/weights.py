@@ -1,4 +1,4 @@
-"""Files of segmenter weights: what they are for, how they were trained, and half-precision tensors."""
+"""Files of segmenter weights: name of the segmenter, configuration, training, tensors in half precision."""
 
 import io
 from pathlib import Path

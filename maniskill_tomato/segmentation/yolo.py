@@ -17,8 +17,7 @@ from maniskill_tomato.errors import CheckpointError, InvalidInputError, MissingP
 from maniskill_tomato.files import write_atomically
 from maniskill_tomato.segmentation.datasets.annotations import AnnotatedImage, ignored_fruit
 from maniskill_tomato.segmentation.datasets.picture_files import write_picture
-from maniskill_tomato.segmentation.instances import TOMATO, Image, Instances, box_ellipse
-from maniskill_tomato.segmentation.segmenter import check_image
+from maniskill_tomato.segmentation.instances import TOMATO, Image, Instances, box_ellipse, check_image
 from maniskill_tomato.segmentation.training.detector_presets import YOLO_PRESET, YoloConfig
 
 

@@ -9,16 +9,11 @@ import numpy as np
 import pytest
 
 from maniskill_tomato.errors import InvalidInputError, SeedsFailedError
-from maniskill_tomato.experiments.ablation import (
-    VARIANTS,
-    choose_variants,
-    execute,
-    execute_all,
-    plan,
-    steps_to_solved,
-)
-from maniskill_tomato.experiments.ablation_report import ablation_rows, write_ablation
-from maniskill_tomato.experiments.comparison import find_runs, load_run
+from maniskill_tomato.experiments.ablation import ablation_rows, plan_trials, run_ablation, write_ablation
+from maniskill_tomato.experiments.configs import AblationConfig
+from maniskill_tomato.experiments.training_runs import find_runs, load_run
+from maniskill_tomato.experiments.training_study import run_trials, steps_to_solved
+from maniskill_tomato.experiments.variants import choose_variants, learner_variants
 from maniskill_tomato.learning.rl.history import TrainingCurves
 from maniskill_tomato.learning.rl.presets import get_preset
 from maniskill_tomato.tasks import THESIS_IDS
@@ -28,53 +23,65 @@ GUIDED, SPARSE = THESIS_IDS
 
 def test_every_variant_changes_what_it_says_and_nothing_else() -> None:
     base = get_preset("td3").to_dict()
-    assert VARIANTS[0].changes == {}
-    for variant in VARIANTS:
-        config = replace(get_preset("td3"), **variant.changes).to_dict()
+    variants = learner_variants()
+    assert variants[0].changes == {}
+    for variant in variants:
+        config = variant.config("td3").to_dict()
         changed = {name for name in base if config[name] != base[name]}
         assert changed == set(variant.changes), variant.name
-    assert len({variant.name for variant in VARIANTS}) == len(VARIANTS)
+    assert len({variant.name for variant in variants}) == len(variants)
 
 
 def test_the_plan_leaves_out_what_makes_no_sense_and_names_what_it_does_not_know(tmp_path: Path) -> None:
-    runs = plan("td3", VARIANTS, THESIS_IDS, (0, 1), tmp_path)
-    assert len(runs) == 2 * (2 * len(VARIANTS) - 1)
-    assert len({run.folder for run in runs}) == len(runs)
-    assert all(run.env_id == SPARSE for run in runs if run.variant.name == "hindsight-targets")
-    assert [run.seed for run in runs] == sorted(run.seed for run in runs)
+    variants = learner_variants()
+    trials = plan_trials(AblationConfig(seeds=(0, 1), out=tmp_path), variants)
+    assert len(trials) == 2 * (2 * len(variants) - 1)
+    assert len({trial.folder for trial in trials}) == len(trials)
+    assert all(trial.env_id == SPARSE for trial in trials if trial.variant.name == "hindsight-targets")
+    assert [trial.seed for trial in trials] == sorted(trial.seed for trial in trials)
     with pytest.raises(InvalidInputError, match="a variant must be one of 'base'.*; got 'her'"):
         choose_variants(["her"])
-    with pytest.raises(InvalidInputError, match="seeds must be one or more different numbers"):
-        plan("td3", VARIANTS, THESIS_IDS, (1, 1), tmp_path)
+    with pytest.raises(InvalidInputError, match="--seeds must be one or more different numbers"):
+        AblationConfig(seeds=(1, 1))
+    with pytest.raises(InvalidInputError, match="--episodes must be 1 or more"):
+        AblationConfig(episodes=0)
     with pytest.raises(InvalidInputError, match="a task must be one of"):
-        plan("td3", VARIANTS, ["Reach-v0"], (1,), tmp_path)
+        plan_trials(AblationConfig(env_ids=("Reach-v0",)), variants)
+
+
+def short(out: Path, *variants: str, **changes: Any) -> AblationConfig:
+    options = {"env_ids": (GUIDED,), "seeds": (3,), "episodes": 2, "total_timesteps": 60, **changes}
+    return AblationConfig(variants=variants, out=out, **options)
 
 
 def test_a_run_is_done_once_and_kept(tmp_path: Path) -> None:
-    variants = choose_variants(["base"])
-    (run,) = plan("td3", variants, [GUIDED], [3], tmp_path, episodes=2, total_timesteps=60)
-    result = execute(run)
-    assert result is not None and result["training_steps"] == 60 and result["updates"] == 0
+    config = short(tmp_path, "base")
+    lines: list[str] = []
+    text = run_ablation(config, lines.append)
+    assert text == (tmp_path / "ablation.md").read_text()
+    assert lines[0].startswith(f"1 of 1: {GUIDED} base, seed 3: success ")
+    (result,) = json.loads((tmp_path / "ablation.json").read_text())["runs"]
+    assert result["training_steps"] == 60 and result["updates"] == 0
     assert result["training_cpu_seconds"] > 0.0 and 0.0 <= result["success_rate"] <= 1.0
-    written = (run.folder / "policy.pt").stat().st_mtime_ns
-    assert list(execute_all([run], jobs=1)) == [(run, json.loads((run.folder / "result.json").read_text()))]
-    assert execute(run) == result and (run.folder / "policy.pt").stat().st_mtime_ns == written
+    (trial,) = plan_trials(config, choose_variants(["base"]))
+    written = (trial.folder / "policy.pt").stat().st_mtime_ns
+    assert run_ablation(config) == text and (trial.folder / "policy.pt").stat().st_mtime_ns == written
     (found,) = [load_run(path) for path in find_runs([tmp_path / GUIDED / "base"])]
     assert found.metrics is not None and found.metrics["success_rate"] == result["success_rate"]
-    for other in (replace(run, episodes=3), replace(run, config=replace(run.config, gamma=0.5))):
-        with pytest.raises(InvalidInputError, match="holds a run of other settings"):
-            execute(other)
+    with pytest.raises(InvalidInputError, match=r"another experiment \(config differ\)"):
+        run_ablation(short(tmp_path, "base", total_timesteps=50))
 
 
 @pytest.mark.slow
 def test_a_run_that_fails_does_not_stop_the_others(tmp_path: Path) -> None:
-    good, bad = plan("td3", choose_variants(["base", "no-delay"]), [GUIDED], [0], tmp_path, 1, 40)
+    config = short(tmp_path, "base", "no-delay", seeds=(0,), episodes=1, total_timesteps=40)
+    good, bad = plan_trials(config, choose_variants(config.variants))
     bad = replace(bad, config=replace(bad.config, action_scale=(0.1, 0.1)))
     done = []
     with pytest.raises(SeedsFailedError, match="1 of 2 runs failed: .*no-delay"):
-        for run, _ in execute_all([bad, good], jobs=2):
-            done.append(run)
-    assert done == [good] and good.finished() is not None
+        for trial, _ in run_trials([bad, good], 2):
+            done.append(trial)
+    assert done == [good] and good.result() is not None
 
 
 def curves(success: list[float], lengths: list[int]) -> TrainingCurves:
@@ -136,8 +143,8 @@ def test_the_table_has_interquartile_means_over_seeds_and_over_tasks(tmp_path: P
     assert guided.success_rate.low is not None and guided.success_rate.low < 0.9
     assert (guided.steps_to_solved, guided.solved_runs, guided.runs) == (3000.0, 3, 4)
     assert (sparse.steps_to_solved, both.training_cpu_seconds) == (None, 31.5)
-    table = write_ablation("td3", variants, results, tmp_path)
-    assert "| never (0 of 4) |" in table and "3,000 (3 of 4)" in table
+    text = write_ablation(AblationConfig(out=tmp_path), variants, results)
+    assert "| never (0 of 4) |" in text and "3,000 (3 of 4)" in text
     content = json.loads((tmp_path / "ablation.json").read_text())
     assert len(content["rows"]) == 4 and len(content["runs"]) == 9
-    assert (tmp_path / "ablation.md").read_text().startswith(table)
+    assert (tmp_path / "ablation.md").read_text() == text

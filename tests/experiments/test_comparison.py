@@ -1,4 +1,4 @@
-"""The comparison of runs: statistics against hand values, runs made by hand, the report and both scripts."""
+"""The comparison of runs: statistics against hand values, runs made by hand, the report and PPO."""
 
 import json
 import os
@@ -16,17 +16,18 @@ from torch.utils.tensorboard import SummaryWriter
 
 from maniskill_tomato.cli import main
 from maniskill_tomato.errors import InvalidInputError
-from maniskill_tomato.experiments.comparison import (
+from maniskill_tomato.experiments.configs import RunComparisonConfig
+from maniskill_tomato.experiments.evaluation import evaluate_run
+from maniskill_tomato.experiments.run_comparison import (
     Group,
-    find_runs,
+    compare_runs,
     group_runs,
-    load_run,
-    read_clock,
+    make_rows,
     trailing_mean,
     training_curve,
+    write_comparison,
 )
-from maniskill_tomato.experiments.comparison_report import make_rows, markdown_table, write_comparison
-from maniskill_tomato.experiments.evaluate import evaluate_run
+from maniskill_tomato.experiments.training_runs import find_runs, load_run, read_clock
 from maniskill_tomato.learning.rl.agent import make_agent
 from maniskill_tomato.learning.rl.checkpoint import make_checkpoint, save_checkpoint
 from maniskill_tomato.learning.rl.envs import make_env
@@ -75,7 +76,7 @@ def groups_of(*paths: Path) -> list[Group]:
     return group_runs([load_run(path) for path in paths])
 
 
-def run_script(*arguments: str) -> subprocess.CompletedProcess[str]:
+def run_python(*arguments: str) -> subprocess.CompletedProcess[str]:
     environment = {**os.environ, "PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1"}
     command = [sys.executable, *arguments]
     return subprocess.run(command, capture_output=True, text=True, cwd=ROOT, env=environment, timeout=300)
@@ -216,8 +217,8 @@ def test_the_report_needs_no_other_file_and_says_what_was_not_evaluated(tmp_path
     ]
     paths.append(make_run(tmp_path / "<x>", config={"algorithm": "<PPO>"}, success=None))
     groups = groups_of(*paths)
-    report = write_comparison(groups, tmp_path / "out")
-    page = report.read_text()
+    comparison = write_comparison(groups, tmp_path / "out")
+    page = comparison.report.read_text()
     assert re.findall(r'src="(?!data:)', page) == []
     assert "&lt;PPO&gt;" in page and "<PPO>" not in page
     assert "95.0 [90.0, 100.0] %" in page
@@ -225,21 +226,21 @@ def test_the_report_needs_no_other_file_and_says_what_was_not_evaluated(tmp_path
     content = json.loads((tmp_path / "out" / "comparison.json").read_text())
     assert content["rows"][0]["success_rate"] == {"estimate": pytest.approx(0.95), "low": 0.9, "high": 1.0}
     assert content["rows"][1]["success_rate"] is None
-    table = markdown_table(make_rows(groups)).splitlines()
+    table = comparison.table.splitlines()
     assert (
         table[2] == f"| {GUIDED} | td3 | 0, 1 | 95.0 [90.0, 100.0] % | 2.00 [2.00, 2.00] | 14 | not logged |"
     )
     assert (tmp_path / "out" / "comparison.md").read_text().startswith(table[0])
 
 
-def test_the_script_compares_and_refuses_with_one_line(tmp_path: Path) -> None:
+def test_a_comparison_reads_folders_and_refuses_what_is_no_run(tmp_path: Path) -> None:
     run = make_run(tmp_path / "run")
-    done = run_script("scripts/compare_runs.py", str(run), "--out", str(tmp_path / "out"))
-    assert done.returncode == 0, done.stderr
-    assert (tmp_path / "out" / "report.html").is_file()
-    refused = run_script("scripts/compare_runs.py", str(tmp_path / "nothing"), "--out", str(tmp_path / "out"))
-    assert refused.returncode == 2
-    assert "holds no run" in refused.stderr and "Traceback" not in refused.stderr
+    comparison = compare_runs(RunComparisonConfig(runs=(run,), out=tmp_path / "out"))
+    assert comparison.report == tmp_path / "out" / "report.html" and comparison.report.is_file()
+    with pytest.raises(InvalidInputError, match="holds no run"):
+        compare_runs(RunComparisonConfig(runs=(tmp_path / "nothing",), out=tmp_path / "out"))
+    with pytest.raises(InvalidInputError, match="--evaluate must be 1 or more"):
+        RunComparisonConfig(runs=(run,), evaluate=0)
 
 
 def test_runs_without_an_evaluation_get_one_on_the_plants_of_their_training(tmp_path: Path) -> None:
@@ -252,9 +253,9 @@ def test_runs_without_an_evaluation_get_one_on_the_plants_of_their_training(tmp_
     )
     save_checkpoint(new / "policy.pt", checkpoint)
     kept = make_run(tmp_path / "runs" / "old", success=0.25)
-    arguments = ("--evaluate", "2", "--eval-seed", "7", "--out", str(tmp_path / "out"))
-    done = run_script("scripts/compare_runs.py", str(tmp_path / "runs"), *arguments)
-    assert done.returncode == 0, done.stderr
+    compare_runs(
+        RunComparisonConfig(runs=(tmp_path / "runs",), evaluate=2, eval_seed=7, out=tmp_path / "out")
+    )
     metrics = json.loads((new / "eval" / "metrics.json").read_text())
     assert (metrics["episodes"], metrics["per_episode"]["seed"]) == (2, [7, 8])
     assert metrics["policy"]["trained_with"] == options
@@ -285,7 +286,7 @@ def test_ppo_trains_evaluates_and_can_be_compared(tmp_path: Path, capsys: pytest
         "--n-steps",
         "100",
     )
-    done = run_script(*arguments)
+    done = run_python(*arguments)
     assert done.returncode == 0, done.stderr
     run = load_run(tmp_path / "seed-3")
     assert run.metrics is not None
@@ -305,5 +306,5 @@ def test_ppo_trains_evaluates_and_can_be_compared(tmp_path: Path, capsys: pytest
     largest = metrics["per_episode"]["max_visible_fraction"]
     np.testing.assert_allclose(largest, run.metrics["per_episode"]["max_visible_fraction"], atol=0.02)
     assert "Training" in (evaluated / "report.html").read_text()
-    again = run_script(*arguments)
+    again = run_python(*arguments)
     assert again.returncode == 2 and "already holds a run" in again.stderr

@@ -15,9 +15,12 @@ import torch
 from torch import Tensor
 
 from maniskill_tomato.errors import InvalidInputError
-from maniskill_tomato.experiments import evaluate as evaluation
-from maniskill_tomato.experiments.evaluate import EvaluationConfig, write_trajectories
-from maniskill_tomato.experiments.metrics import make_metrics, summarise, write_metrics
+from maniskill_tomato.experiments import evaluation
+from maniskill_tomato.experiments.configs import EvaluationConfig
+from maniskill_tomato.experiments.episode_record import EpisodeRecord
+from maniskill_tomato.experiments.evaluation import write_trajectories
+from maniskill_tomato.experiments.evaluation_report import Picture, ReportInput, write_report
+from maniskill_tomato.experiments.metrics import make_metrics, summarise, write_json
 from maniskill_tomato.experiments.plots import (
     default_windows,
     moving_average,
@@ -27,9 +30,9 @@ from maniskill_tomato.experiments.plots import (
     plot_visible_fraction,
     viewing_direction,
 )
-from maniskill_tomato.experiments.report import Picture, ReportInput, write_report
-from maniskill_tomato.experiments.rollout import Episode, run_episodes
+from maniskill_tomato.experiments.rollout import run_episodes
 from maniskill_tomato.learning.rl.history import TrainingHistory, load_history
+from maniskill_tomato.policies.adapters import as_policy
 
 HORIZON = 6
 
@@ -82,25 +85,26 @@ class Forward:
         return torch.tensor([0.2, 0, 0, 0, 0, 0]).expand(len(observations), 6)
 
 
-def run(num_envs: int, episodes: int, seed: int = 3) -> list[Episode]:
+def run(num_envs: int, episodes: int, seed: int = 3) -> list[EpisodeRecord]:
     return run_episodes(cast(gym.Env[Any, Any], SeededTask(num_envs)), Forward(), episodes, seed)
 
 
-def episode(visible: list[float], success: bool, seed: int = 0, reach: int = 0) -> Episode:
+def episode(visible: list[float], success: bool, seed: int = 0, reach: int = 0) -> EpisodeRecord:
     """An episode that walks along x by 0.1 m a step."""
     steps = len(visible) - 1
     viewpoints = np.zeros((steps + 1, 6))
     viewpoints[:, 0] = 0.1 * np.arange(steps + 1)
     viewpoints[:, 4] = math.pi / 2
-    return Episode(
+    return EpisodeRecord(
         seed=seed,
         success=success,
         viewpoints=viewpoints,
-        target=np.array([0.8, 0.2, 0.7]),
+        target=np.tile([0.8, 0.2, 0.7], (steps + 1, 1)),
         visible_fraction=np.array(visible),
         rewards=np.array(visible[1:]) - 0.1,
         reachability=np.full(steps, reach),
         in_forbidden_zone=np.zeros(steps, dtype=np.bool_),
+        decision_ms=np.ones(steps),
     )
 
 
@@ -119,11 +123,12 @@ def test_episode_i_starts_from_seed_plus_i_and_is_recorded_until_it_ends() -> No
     np.testing.assert_allclose(first.viewpoints[:, 0], [0.3, 0.5, 0.7, 0.9], atol=1e-6)
     np.testing.assert_allclose(first.rewards, [0.0, 0.2, 0.4], atol=1e-6)
     assert first.reachability.tolist() == [1, 2, 0]
+    assert first.in_forbidden_zone is not None
     assert first.in_forbidden_zone.tolist() == [False, True, False]
     assert (first.steps, first.success) == (3, True)
     assert first.max_visible_fraction == pytest.approx(0.9)
     assert first.path_length == pytest.approx(0.6)
-    np.testing.assert_allclose(first.target, [0.8, 0.2, 0.7], atol=1e-6)
+    np.testing.assert_allclose(first.target, np.tile([0.8, 0.2, 0.7], (4, 1)), atol=1e-6)
 
 
 def test_parallel_environments_give_the_same_episodes() -> None:
@@ -158,7 +163,7 @@ def test_metrics_by_hand(tmp_path: Path) -> None:
         wall_seconds=1.0,
         baseline=EPISODES[2:],
     )
-    write_metrics(tmp_path / "deep/metrics.json", metrics)
+    write_json(tmp_path / "deep/metrics.json", metrics)
     read = json.loads((tmp_path / "deep/metrics.json").read_text())
     assert (read["env_id"], read["episodes"], read["seed"]) == ("Task-v1", 3, 5)
     assert read["success_rate"] == pytest.approx(2 / 3)
@@ -286,9 +291,14 @@ def test_without_vulkan_an_evaluation_still_reports_and_names_the_remedy(
         task = SimpleNamespace(full_visibility=0.85)
 
     monkeypatch.setattr(evaluation, "make_env", lambda env_id, **options: Task(1))
+    monkeypatch.setattr(evaluation, "find_policy", lambda policy, env_id: "forward")
+    monkeypatch.setattr(evaluation, "open_policy", lambda policy, **options: as_policy(Forward()))
     monkeypatch.setattr("maniskill_tomato.rendering.vulkan_probe.rendering_available", lambda: False)
-    config = EvaluationConfig(env_id="Task-v1", episodes=4, seed=0, out=tmp_path, show_progress=False)
-    result = evaluation.evaluate(config, Forward())
+    config = EvaluationConfig(
+        env_id="Task-v1", policy="forward", episodes=4, seed=0, out=tmp_path, show_progress=False
+    )
+    result = evaluation.evaluate(config)
+    assert result.origin == "Forward"
     assert result.video is None
     assert result.left_out is not None and "make vulkan" in result.left_out
     assert "make vulkan" in result.report.read_text()

@@ -1,10 +1,8 @@
-"""The thesis's experiments over seeds: definitions, resuming, tables, figure data, the script from end to end."""
+"""The thesis's experiments over seeds: definitions, resuming, tables, figure data, all from end to end."""
 
 import dataclasses
 import json
 import math
-import subprocess
-import sys
 from pathlib import Path
 from typing import Any
 
@@ -15,57 +13,47 @@ import torch
 from torch import Tensor
 
 from maniskill_tomato.errors import InvalidInputError
-from maniskill_tomato.experiments.camera_frustum import frustum_faces, frustum_points
-from maniskill_tomato.experiments.reproduction import (
-    SATURATED,
-    ReachCounter,
-    Reproduction,
-    load_episodes,
-    saturated_share,
-    save_episodes,
-    untrained_first_steps,
-)
-from maniskill_tomato.experiments.rollout import Episode
-from maniskill_tomato.experiments.thesis_experiments import (
-    EXPERIMENTS,
-    IDEAS,
-    PARTS_OF_TD3,
-    SINGLE_CHANGES,
-    Experiment,
-    find_variant,
-    variants_of,
-)
+from maniskill_tomato.experiments.configs import ReproductionConfig
+from maniskill_tomato.experiments.episode_record import EpisodeRecord
+from maniskill_tomato.experiments.plots import averaged_curve
+from maniskill_tomato.experiments.reproduction import plan_trials, run_reproduction, untrained_first_steps
 from maniskill_tomato.experiments.thesis_figures import (
-    averaged_curve,
     camera_opacities,
+    episode_to_show,
+    frustum_faces,
+    frustum_points,
     marked_views,
     most_successful,
     plot_camera_ways,
     plot_evaluation,
     plot_plant_positions,
 )
-from maniskill_tomato.experiments.thesis_views import episode_to_show
+from maniskill_tomato.experiments.training_runs import find_runs, load_run
+from maniskill_tomato.experiments.training_study import SATURATED, ReachCounter, Trial, saturated_share
+from maniskill_tomato.experiments.variants import Experiment, experiments, find_variant, variants_of
 from maniskill_tomato.learning.rl.agent import make_actor, make_normalizer
-from maniskill_tomato.learning.rl.presets import PRESETS
+from maniskill_tomato.learning.rl.presets import PRESETS, get_preset
 from maniskill_tomato.policies.trained_actor import TrainedActor
 
-ROOT = Path(__file__).resolve().parents[2]
+EXPERIMENTS = experiments()
 GUIDED = EXPERIMENTS["guided"]
+PARTS_OF_TD3 = [name for name, variant in variants_of(GUIDED).items() if variant.part_of_td3]
 
 
-def make_episode(seed: int, steps: int, success: bool) -> Episode:
+def make_episode(seed: int, steps: int, success: bool) -> EpisodeRecord:
     """An episode whose V_f climbs evenly to 0.9 if it is a success, to 0.4 otherwise."""
     rng = np.random.default_rng(seed)
     viewpoints = rng.uniform(-0.2, 0.2, (steps + 1, 6)) + np.array([0.1, 0.0, 0.9, 0.0, math.pi / 2, 0.0])
-    return Episode(
+    return EpisodeRecord(
         seed=seed,
         success=success,
         viewpoints=viewpoints,
-        target=np.array([0.8, 0.1, 0.8]),
+        target=np.tile([0.8, 0.1, 0.8], (steps + 1, 1)),
         visible_fraction=np.linspace(0.0, 0.9 if success else 0.4, steps + 1),
         rewards=rng.uniform(size=steps),
         reachability=np.array([2] + [0] * (steps - 1)),
         in_forbidden_zone=np.array([False] * (steps - 1) + [True]),
+        decision_ms=np.ones(steps),
     )
 
 
@@ -74,38 +62,39 @@ def differing_fields(a: Any, b: Any) -> set[str]:
 
 
 @pytest.mark.parametrize("experiment", EXPERIMENTS.values(), ids=lambda e: e.name)
-def test_the_exact_variant_is_the_preset_and_every_single_change_changes_one_field(
-    experiment: Experiment,
-) -> None:
-    preset = PRESETS[experiment.preset]
-    assert find_variant(experiment, "exact").config(experiment) == preset
-    for variant in SINGLE_CHANGES:
-        if experiment.name in variant.experiments:
-            assert differing_fields(variant.config(experiment), preset) == set(variant.changes)
-            assert len(variant.changes) == 1, variant.name
+def test_every_variant_changes_what_it_says_and_nothing_else(experiment: Experiment) -> None:
+    preset = get_preset(experiment.preset)
+    variants = variants_of(experiment)
+    assert len(variants) >= 20
+    assert find_variant(experiment, "exact").config(experiment.preset) == preset
+    for name, variant in variants.items():
+        if variant.preset is None:
+            changed = differing_fields(variant.config(experiment.preset), preset)
+            assert changed <= set(variant.changes), name
+            assert changed or name == "exact", name
 
 
-@pytest.mark.parametrize("experiment", EXPERIMENTS.values(), ids=lambda e: e.name)
-def test_variant_names_are_unique(experiment: Experiment) -> None:
-    changes = [v for v in (*SINGLE_CHANGES, *IDEAS) if experiment.name in v.experiments]
-    assert len(variants_of(experiment)) == len(changes) + 2  # The exact settings and td3.
+def test_some_variants_are_for_one_experiment_only() -> None:
+    own = [set(variants_of(experiment)) for experiment in EXPERIMENTS.values()]
+    assert own[0] - own[1] == {"slow-exploration", "double-episodes"}
+    assert own[1] - own[0] == {"slow-exploration-sparse", "wide-noise", "six-fold-episodes"}
 
 
 @pytest.mark.parametrize("experiment", EXPERIMENTS.values(), ids=lambda e: e.name)
 def test_the_parts_lead_from_the_exact_settings_to_td3_and_back(experiment: Experiment) -> None:
-    exact, td3 = PRESETS[experiment.preset], PRESETS["td3"]
-    there = find_variant(experiment, "+".join(PARTS_OF_TD3)).config(experiment)
+    exact, td3 = get_preset(experiment.preset), PRESETS["td3"]
+    there = find_variant(experiment, "+".join(PARTS_OF_TD3)).config(experiment.preset)
     assert differing_fields(there, td3) == {"step_cost", "pre_tanh_penalty"}
-    back = find_variant(experiment, "td3-without-" + "+".join(PARTS_OF_TD3)).config(experiment)
+    back = find_variant(experiment, "td3-without-" + "+".join(PARTS_OF_TD3)).config(experiment.preset)
     assert differing_fields(back, exact) == {"step_cost"}
-    assert find_variant(experiment, "td3").config(experiment) == td3
+    assert find_variant(experiment, "td3").config(experiment.preset) == td3
 
 
 def test_changes_can_be_made_together_and_parts_of_td3_left_out() -> None:
-    both = find_variant(GUIDED, "small-actions+gamma-0.9").config(GUIDED)
+    both = find_variant(GUIDED, "small-actions+gamma-0.9").config(GUIDED.preset)
     assert differing_fields(both, PRESETS["thesis-guided"]) == {"action_scale", "gamma"}
     assert (both.gamma, both.action_scale[0]) == (0.9, 0.35)
-    less = find_variant(GUIDED, "td3-without-gamma-0.9+15000-steps").config(GUIDED)
+    less = find_variant(GUIDED, "td3-without-gamma-0.9+15000-steps").config(GUIDED.preset)
     assert differing_fields(less, PRESETS["td3"]) == {"gamma", "total_episodes", "total_timesteps"}
     assert (less.gamma, less.total_episodes, less.total_timesteps) == (0.99, 240, None)
 
@@ -117,7 +106,7 @@ def test_changes_can_be_made_together_and_parts_of_td3_left_out() -> None:
         ("gamma-0.9+exact", "exact changes nothing"),
         ("gamma-0.9+td3", "td3 changes nothing"),
         ("gamma-0.9+nonsense", "variant of guided must be one of 'exact'"),
-        ("td3-without-double-episodes", "part of td3 must be one of 'look-at-goals'"),
+        ("td3-without-double-episodes", "part of td3 must be one of 'small-actions'"),
     ],
 )
 def test_variants_that_contradict_themselves_are_refused(name: str, problem: str) -> None:
@@ -128,7 +117,7 @@ def test_variants_that_contradict_themselves_are_refused(name: str, problem: str
 def test_the_experiments_have_the_numbers_of_the_thesis() -> None:
     guided, sparse = EXPERIMENTS["guided"], EXPERIMENTS["sparse"]
     for experiment, episodes, buffer, exploration in ((guided, 240, 1000, 1200), (sparse, 500, 1500, 1800)):
-        config = find_variant(experiment, "exact").config(experiment)
+        config = find_variant(experiment, "exact").config(experiment.preset)
         assert (config.total_episodes, config.buffer_size) == (episodes, buffer)
         assert config.exploration_steps == exploration
         assert (config.gamma, config.batch_size, config.tau) == (0.99, 32, 0.001)
@@ -136,8 +125,8 @@ def test_the_experiments_have_the_numbers_of_the_thesis() -> None:
     assert guided.windows == (12, 75)
     assert sparse.windows == (30, 180)
     # The thesis's last epsilon, 0.6195, follows from its 1278 steps (Eq. 5-5).
-    assert guided.thesis.total_steps is not None
-    assert 0.3 + 0.3 * guided.thesis.total_steps / 1200 == pytest.approx(0.6195)
+    assert guided.total_steps is not None
+    assert 0.3 + 0.3 * guided.total_steps / 1200 == pytest.approx(0.6195)
 
 
 def test_an_unknown_variant_is_refused_with_the_known_ones() -> None:
@@ -145,17 +134,6 @@ def test_an_unknown_variant_is_refused_with_the_known_ones() -> None:
         find_variant(GUIDED, "big-actions")
     with pytest.raises(InvalidInputError, match="wide-noise"):
         find_variant(EXPERIMENTS["sparse"], "slow-exploration")
-
-
-def test_episodes_survive_saving(tmp_path: Path) -> None:
-    episodes = [make_episode(3, 2, True), make_episode(4, 5, False), make_episode(5, 1, True)]
-    save_episodes(tmp_path / "folder" / "episodes.npz", episodes)
-    loaded = load_episodes(tmp_path / "folder" / "episodes.npz")
-    assert len(loaded) == 3
-    for before, after in zip(episodes, loaded, strict=True):
-        for field in dataclasses.fields(Episode):
-            np.testing.assert_array_equal(getattr(before, field.name), getattr(after, field.name))
-    assert [p.name for p in (tmp_path / "folder").iterdir()] == ["episodes.npz"]
 
 
 @pytest.mark.parametrize("window", [1, 4, 12, 50])
@@ -276,62 +254,52 @@ def test_untrained_actors_of_small_scale_move_less() -> None:
     assert calm["saturated_output_share"] == 0.0
 
 
+def reproduction(out: Path, **changes: Any) -> ReproductionConfig:
+    short = {"seeds": (3,), "episodes": 2, "training_episodes": 2, "untrained": 2, "progress": False}
+    return ReproductionConfig(**{"experiment": "guided", "out": out, **short, "views": False, **changes})
+
+
+def plan(out: Path, variant: str = "small-actions", **changes: Any) -> Trial:
+    (trial,) = plan_trials(reproduction(out, **changes), GUIDED, find_variant(GUIDED, variant))
+    return trial
+
+
 def test_a_finished_seed_is_kept_and_other_settings_are_refused(tmp_path: Path) -> None:
-    reproduction = Reproduction(
-        experiment=GUIDED,
-        variant=find_variant(GUIDED, "small-actions"),
-        folder=tmp_path,
-        evaluation_episodes=2,
-        training_episodes=2,
-        show_progress=False,
-    )
-    first = reproduction.run_seed(3, GUIDED.evaluations[:1])
+    short = plan(tmp_path, ablate=True)
+    assert short.result() is None
+    first = short.run()
     assert first["training"]["episodes"] == 2
     assert set(first["evaluations"]) == {"training-pose"}
-    policy = reproduction.seed_folder(3) / "training" / "policy.pt"
-    written = policy.stat().st_mtime_ns
-    again = reproduction.run_seed(3, GUIDED.evaluations[:2])
-    assert policy.stat().st_mtime_ns == written
+    written = (short.folder / "policy.pt").stat().st_mtime_ns
+    again = plan(tmp_path, episodes=3).run()
+    assert (short.folder / "policy.pt").stat().st_mtime_ns == written
     assert again["training"] == first["training"]
-    assert again["evaluations"]["training-pose"] == first["evaluations"]["training-pose"]
-    assert set(again["evaluations"]) == {"training-pose", "one-tomato"}
-    other = dataclasses.replace(reproduction, training_episodes=3)
-    with pytest.raises(InvalidInputError, match="other settings"):
-        other.run_seed(3, GUIDED.evaluations[:1])
+    assert set(again["evaluations"]) == {"training-pose", "one-tomato", "three-tomatoes"}
+    assert again["evaluations"]["training-pose"]["episodes"] == 3
+    assert short.run() == short.result() == first
+    with pytest.raises(InvalidInputError, match=r"another experiment \(config differ\)"):
+        plan(tmp_path, training_episodes=3).run()
 
 
 def test_a_training_that_was_cut_off_starts_anew(tmp_path: Path) -> None:
-    reproduction = Reproduction(
-        experiment=GUIDED,
-        variant=find_variant(GUIDED, "exact"),
-        folder=tmp_path,
-        evaluation_episodes=1,
-        training_episodes=1,
-        show_progress=False,
-    )
-    first = reproduction.run_seed(0, GUIDED.evaluations[:1])
-    (reproduction.seed_folder(0) / "training.json").unlink()
-    again = reproduction.run_seed(0, GUIDED.evaluations[:1])
-    first["training"].pop("seconds")
-    again["training"].pop("seconds")
+    trial = plan(tmp_path, "exact", ablate=True, episodes=1, training_episodes=1)
+    first = trial.run()
+    (figures,) = (trial.folder / "results" / "training").iterdir()
+    figures.unlink()
+    assert trial.result() is None
+    again = trial.run()
+    for result in (first, again):
+        for name in ("seconds", "cpu_seconds"):
+            result["training"].pop(name)
     assert again == first
 
 
-def run_script(*arguments: str) -> subprocess.CompletedProcess[str]:
-    return subprocess.run(
-        [sys.executable, str(ROOT / "scripts" / "reproduce.py"), *arguments],
-        capture_output=True,
-        text=True,
-        timeout=300,
-        check=False,
-    )
-
-
-def test_the_script_runs_from_end_to_end(tmp_path: Path) -> None:
-    tiny = ("--training-episodes", "2", "--episodes", "2", "--untrained", "2", "--no-views")
-    result = run_script("sparse", "--seeds", "0", "1", "--out", str(tmp_path), *tiny)
-    assert result.returncode == 0, result.stderr
+def test_a_reproduction_runs_from_end_to_end_and_its_runs_can_be_compared(tmp_path: Path) -> None:
+    lines: list[str] = []
+    run_reproduction(reproduction(tmp_path, experiment="sparse", seeds=(0, 1)), lines.append)
     folder = tmp_path / "sparse" / "exact"
+    assert lines[-2:] == [f"summary {folder / 'summary.json'}", f"figures {folder / 'figures'}"]
+    assert "exactly Table 5-1 / 5-2" in lines[0]
     figures = {path.name for path in (folder / "figures").iterdir()}
     assert figures == {
         "training.png",
@@ -344,9 +312,18 @@ def test_the_script_runs_from_end_to_end(tmp_path: Path) -> None:
     summaries = json.loads((folder / "summary.json").read_text())
     assert [s["seed"] for s in summaries] == [0, 1]
     assert set(summaries[0]["evaluations"]) == {"training-pose", "three-tomatoes"}
+    for path, summary in zip(find_runs([folder]), summaries, strict=True):
+        metrics = load_run(path).metrics
+        assert metrics is not None and metrics["policy"]["kind"] == "DDPG"
+        assert metrics["success_rate"] == summary["evaluations"]["training-pose"]["success_rate"]
 
 
-def test_the_script_names_unknown_variants(tmp_path: Path) -> None:
-    result = run_script("guided", "--variant", "nonsense", "--out", str(tmp_path))
-    assert result.returncode == 2
-    assert result.stderr.splitlines()[-1].startswith("error: variant of guided must be one of 'exact'")
+def test_an_ablation_writes_a_table_and_names_unknown_variants(tmp_path: Path) -> None:
+    variants = ("exact", "tau-0.01+gamma-0.9")
+    run_reproduction(reproduction(tmp_path, ablate=True, variant=variants))
+    table = (tmp_path / "guided" / "ablation.md").read_text().splitlines()
+    assert len(table) == 4
+    assert table[3].startswith("| tau 0.01, not 0.001; gamma 0.9, not 0.99 | ")
+    assert not list(tmp_path.rglob("*.png"))
+    with pytest.raises(InvalidInputError, match="variant of guided must be one of 'exact'"):
+        run_reproduction(reproduction(tmp_path, variant=("nonsense",)))

@@ -11,7 +11,7 @@ from torch import nn
 from torch.nn.utils.rnn import pack_sequence, unpack_sequence
 
 from maniskill_tomato.errors import InvalidInputError, PolicyError
-from maniskill_tomato.experiments.view_rollout import run_view_episode
+from maniskill_tomato.experiments.rollout import run_episode
 from maniskill_tomato.learning.imitation.collect import ImitationData, collect_demonstrations
 from maniskill_tomato.learning.imitation.fit import (
     direction_loss,
@@ -59,8 +59,8 @@ def test_the_lattice_oracle_goes_to_the_nearest_candidate_that_shows_the_target(
                 best, fewest = k, needed
     oracle.act(belief)
     assert int(oracle.tried.chosen[0]) == best
-    episode = run_view_episode(env, oracle, 3)
-    assert episode.success and episode.moves <= fewest[0] + 1
+    episode = run_episode(env, oracle, 3)
+    assert episode.success and episode.steps <= fewest[0] + 1
 
 
 def test_what_is_collected_is_what_was_seen_and_what_the_teacher_does(env: Any) -> None:
@@ -193,9 +193,9 @@ def test_a_training_goes_on_where_it_was(student: Any, tmp_path: Path) -> None:
     assert not any("blocks)" in line for line in lines)
     env = make_env("TomatoViewpoint-v1", **options)
     try:
-        episode = run_view_episode(env, open_policy(path, env_id="TomatoViewpoint-v1"), 0)
+        episode = run_episode(env, open_policy(path, env_id="TomatoViewpoint-v1"), 0)
     finally:
         env.close()
-    assert 1 <= episode.moves <= 20
+    assert 1 <= episode.steps <= 20
     with pytest.raises(InvalidInputError, match="other settings"):
         train_imitation(tmp_path / "run", ImitationConfig(), env_options=options)

@@ -14,7 +14,8 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 
 from maniskill_tomato.cli import main
 from maniskill_tomato.errors import InvalidInputError
-from maniskill_tomato.experiments.comparison import group_runs, load_run
+from maniskill_tomato.experiments.run_comparison import group_runs
+from maniskill_tomato.experiments.training_runs import load_run
 from maniskill_tomato.learning.rl.envs import make_learner_env
 from maniskill_tomato.learning.rl.presets import TrainConfig, get_preset
 from maniskill_tomato.learning.rl.run import train

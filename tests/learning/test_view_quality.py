@@ -13,8 +13,7 @@ from torch import Tensor
 from maniskill_tomato.cli import main
 from maniskill_tomato.errors import CheckpointError, InvalidInputError, PolicyError
 from maniskill_tomato.experiments.metrics import summarise
-from maniskill_tomato.experiments.rollout import run_episodes
-from maniskill_tomato.experiments.view_rollout import run_view_episode
+from maniskill_tomato.experiments.rollout import run_episode, run_episodes
 from maniskill_tomato.learning.rl.envs import make_env
 from maniskill_tomato.learning.view_quality.collect import QualityData, collect_episodes
 from maniskill_tomato.learning.view_quality.fit import fit, judge, mirrored
@@ -345,12 +344,14 @@ def test_eval_runs_the_same_episodes_as_the_benchmark(
     metrics = json.loads((tmp_path / "metrics.json").read_text())
     env = make_env("TomatoViewpoint-v1", episodes="validation")
     try:
-        episodes = [run_view_episode(env, NextBestView(), i) for i in (4, 5)]
+        episodes = [run_episode(env, NextBestView(), i) for i in (4, 5)]
     finally:
         env.close()
-    assert metrics["per_episode"]["steps"] == [e.moves for e in episodes]
+    assert metrics["per_episode"]["steps"] == [e.steps for e in episodes]
     assert metrics["per_episode"]["success"] == [e.success for e in episodes]
-    contacts = sum(int(e.contact.sum()) for e in episodes) / sum(e.moves for e in episodes)
+    contacts = sum(int(e.contact.sum()) for e in episodes if e.contact is not None) / sum(
+        e.steps for e in episodes
+    )
     assert metrics["plant_contact_step_share"] == pytest.approx(contacts)
 
 
@@ -384,11 +385,11 @@ def test_the_evaluation_of_a_row_counts_the_tomatoes_that_were_seen() -> None:
             steps, done = steps + 1, bool(terminated) or bool(truncated)
     finally:
         env.close()
-    assert episode.targets_seen is not None
-    assert episode.targets_seen == (int(info["seen_count"]), int(info["target_count"]))
+    assert episode.row is not None
+    seen, wanted = len(episode.row.seen), len(episode.row.targets)
+    assert (seen, wanted) == (int(info["seen_count"]), int(info["target_count"]))
     figures = summarise([episode, episode])
-    seen, wanted = episode.targets_seen
     assert 0 < seen <= wanted and figures["target_seen_share"] == pytest.approx(seen / wanted)
     moves = int(info["moves"])
-    assert episode.moves == moves >= steps == episode.steps
+    assert episode.row.moves == moves >= steps == episode.steps
     assert figures["moves_per_seen_target"] == pytest.approx(moves / seen)

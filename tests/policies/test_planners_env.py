@@ -12,8 +12,8 @@ import pytest
 import torch
 
 from maniskill_tomato.errors import InvalidInputError
-from maniskill_tomato.experiments.benchmark_policies import PolicySpec
-from maniskill_tomato.experiments.view_rollout import run_view_episode
+from maniskill_tomato.experiments.policy_runs import PolicySpec, open_for
+from maniskill_tomato.experiments.rollout import run_episode
 from maniskill_tomato.learning.imitation.demonstrations import record_demonstrations
 from maniskill_tomato.learning.rl.envs import make_env
 from maniskill_tomato.policies.oracle import Oracle, OracleSearch
@@ -37,43 +37,45 @@ def test_the_oracle_needs_as_many_moves_as_it_says(env: gym.Env[Any, Any]) -> No
         env.reset(seed=seed)
         belief = world.belief
         solution = search.solve(belief.camera_position[0], belief.target_position[0])
-        episode = run_view_episode(env, Oracle(search), seed)
+        episode = run_episode(env, Oracle(search), seed)
         assert episode.success == (solution is not None)
         if solution is not None:
             solved += 1
             # An earlier stop may happen to be good as well.
-            assert episode.moves <= solution.moves
+            assert episode.steps <= solution.moves
             assert not episode.refused.any()
-            if episode.moves == solution.moves:
+            if episode.steps == solution.moves:
                 last = solution.stops[-1].double().numpy()
+                assert episode.camera is not None
                 np.testing.assert_allclose(episode.camera[-1], last, atol=1e-3)
                 assert episode.visible_fraction[-1] > truth.threshold
     assert solved >= 3
 
 
 def test_a_contact_free_oracle_touches_nothing(env: gym.Env[Any, Any]) -> None:
-    free = PolicySpec.parse("oracle").make(env, contact_free=True)
-    episodes = [run_view_episode(env, free, seed) for seed in range(4)]
+    free = open_for(PolicySpec.parse("oracle"), env, contact_free=True)
+    episodes = [run_episode(env, free, seed) for seed in range(4)]
     assert sum(e.success for e in episodes) >= 2
     for episode in episodes:
         if episode.success:
-            assert not episode.contact.any()
-            assert episode.clearance.min() > 0.0
+            assert episode.contact is not None and not episode.contact.any()
+            assert episode.clearance is not None and episode.clearance.min() > 0.0
 
 
 def test_planners_act_on_the_real_arm(env: gym.Env[Any, Any]) -> None:
     for name in ("nbv", "gradient_nbv", "3dmts", "random_viewpoint"):
-        policy = PolicySpec.parse(name).make(env)
-        first, again = (run_view_episode(env, policy, 1) for _ in range(2))
+        policy = open_for(PolicySpec.parse(name), env)
+        first, again = (run_episode(env, policy, 1) for _ in range(2))
+        assert first.camera is not None and again.camera is not None and first.clearance is not None
         np.testing.assert_allclose(first.camera, again.camera, atol=1e-6)
-        assert first.path_length > 0.05
+        assert first.camera_path_length > 0.05
         assert np.all(np.linalg.norm(np.diff(first.camera, axis=0), axis=1) < 0.1201)
         assert np.isfinite(first.clearance).all()
 
 
 def test_demonstrations_can_be_replayed(tmp_path: Path) -> None:
     made: Any = make_env("TomatoViewpoint-v1", plant=PLANTS)
-    planner = PolicySpec.parse("nbv").make(made)
+    planner = open_for(PolicySpec.parse("nbv"), made)
     result = record_demonstrations(made, planner, range(4), tmp_path)
     assert result.tried == 4 and result.recorded >= 2
     description = json.loads(result.path.with_suffix(".json").read_text())

@@ -1,7 +1,6 @@
 """Transits by the ready posture: where they end, what they pass, what they are counted as in a row."""
 
 from collections.abc import Iterator
-from types import SimpleNamespace
 from typing import Any
 
 import gymnasium as gym
@@ -13,13 +12,6 @@ from torch import Tensor
 import maniskill_tomato  # noqa: F401
 from maniskill_tomato.deploy.collision import CollisionChecker
 from maniskill_tomato.errors import InvalidInputError
-from maniskill_tomato.experiments.row_benchmark import (
-    RowResult,
-    SeeableTomatoes,
-    compare_rows,
-    rows_table,
-    search_row,
-)
 from maniskill_tomato.policies.adapters import BeliefFollower
 from maniskill_tomato.policies.opening import open_policy
 from maniskill_tomato.robot.iiwa14 import JOINT_UPPER, READY_QPOS
@@ -203,70 +195,6 @@ def test_a_row_without_moves_left_fails(row: Any) -> None:
 def test_transits_can_be_left_out_and_bad_ones_are_refused() -> None:
     with pytest.raises(InvalidInputError, match="refused"):
         gym.make("TomatoViewpointRow-v1", render_backend="none", transits="always")
-
-
-def test_what_a_policy_sees_in_a_row_is_seeable(row: Any) -> None:
-    result = search_row(row, open_policy("nbv"), 2)
-    assert len(result.seen) >= 2 and set(result.seen) <= set(result.targets)
-    row.reset(seed=2)
-    assert row.unwrapped.open_targets(0) == list(result.targets)
-    assert set(SeeableTomatoes(row).among(result.seen)) == set(result.seen)
-
-
-def test_a_tomato_is_seeable_only_from_where_the_arm_can_stand() -> None:
-    target = TARGET.float()
-    asked: list[Tensor] = []
-
-    def fraction(poses: Tensor, env_index: int, qpos: Tensor, fruit: int) -> Tensor:
-        asked.append(poses)
-        torch.testing.assert_close(flange_to_camera(forward_kinematics(qpos)), poses, atol=1e-9, rtol=0)
-        # Only views from the left and below show it.
-        away = poses[:, :3, 3] - target
-        return torch.where((away[:, 1] > 0.1) & (away[:, 2] < -0.1), 0.9, 0.3)
-
-    world = SimpleNamespace(
-        device=torch.device("cpu"),
-        task=SimpleNamespace(full_visibility=0.8),
-        ground_truth=SimpleNamespace(visible_fraction=fraction),
-        fruit_position_w=lambda env_index, fruit: target + (5.0 if fruit == 1 else 0.0),
-    )
-    truth = SeeableTomatoes(SimpleNamespace(unwrapped=world))  # type: ignore[arg-type]
-    assert truth.among([0, 1]) == [0]
-    assert truth.best_view(1) == 0.0 and truth.best_view(0) == pytest.approx(0.9)
-    world.task.full_visibility = 0.95
-    before = sum(len(poses) for poses in asked)
-    assert truth.among([0]) == []
-    # All samples were tried before it counted as hidden, some 4,500 less those out of reach.
-    assert sum(len(poses) for poses in asked) - before > 800
-
-
-def test_rows_are_told_by_hand_counts() -> None:
-    def result(seed: int, seen: tuple[int, ...], moves: int) -> RowResult:
-        return RowResult(
-            seed=seed,
-            targets=(0, 1, 2, 3),
-            seen=seen,
-            finished=len(seen) == 4,
-            moves=moves,
-            asked=10,
-            refused=1,
-            contacts=2,
-            transits=3,
-            path_m=1.0,
-            joint_path_rad=5.0,
-        )
-
-    runs = {
-        "a": [result(0, (0, 1), 20), result(1, (0, 1, 2), 30)],
-        "b": [result(0, (0,), 40), result(1, (0,), 50)],
-    }
-    seeable = {0: {0, 1}, 1: {0, 1, 2, 3}}
-    table = rows_table(runs, seeable)
-    assert "2 rows, 8 tomatoes in reach, 6 of them seeable" in table
-    assert "| a | 83.3% " in table and "| 62.5% | 10.00 |" in table
-    (line,) = compare_rows(runs, seeable)
-    # Row 0: 1 against 1/2; row 1: 3/4 against 1/4.
-    assert line.startswith("a less b: share seen +0.500") and "moves -20.000" in line
 
 
 def _legs(waypoints: Tensor) -> list[tuple[Tensor, Tensor]]:

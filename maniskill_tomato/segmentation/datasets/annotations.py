@@ -1,4 +1,4 @@
-"""Annotated images: what stands where in a picture, read from and written to the usual formats.
+"""Annotated images: which things are where in a picture.
 
 Image coordinates are continuous: (0, 0) is the top-left corner of the first pixel. A box is (x, y, width, height) in
 pixels. A category whose name begins with `tomato` is a fruit.
@@ -29,7 +29,7 @@ def is_fruit(category: str) -> bool:
 
 
 BEHIND = "behind_"
-"""How the names of fruits of the rows behind begin in rendered images; an arm in front of its row cannot reach them."""
+"""Prefix of the names of fruits of the rows behind in rendered images; the arm cannot reach them."""
 
 
 LEAST_VISIBLE = 0.1

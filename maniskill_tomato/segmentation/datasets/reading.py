@@ -1,4 +1,4 @@
-"""Any folder of annotated images, whichever of the known formats it has."""
+"""Reads a folder of annotated images in COCO's or Pascal VOC's format."""
 
 from pathlib import Path
 

@@ -1,7 +1,7 @@
 """Pascal VOC: one XML file of boxes for each image.
 
-Boxes are taken as today's tools write them, (xmin, ymin) the first pixel and (xmax, ymax) the end, counted from 0. The
-challenge itself counted from 1 and included the last pixel, which shifts a box by a pixel at most.
+Boxes are read and written as today's tools do: (xmin, ymin) is the first pixel and (xmax, ymax) the end, counted from
+0. The challenge itself counted from 1 and included the last pixel, which shifts a box by a pixel at most.
 """
 
 import xml.etree.ElementTree as ElementTree

@@ -26,7 +26,7 @@ Overlap = Literal["box", "mask"]
 
 @dataclass(frozen=True, kw_only=True)
 class ImageTruth:
-    """The fruits that really are in an image."""
+    """The annotated fruits of an image."""
 
     boxes: NDArray[np.float64]
     """Left, top, right, bottom in [px]. Shape (N, 4)."""
@@ -35,7 +35,7 @@ class ImageTruth:
     masks: NDArray[np.bool_] | None = None
     """Visible pixels; None where only boxes are annotated. Shape (N, H, W)."""
     least_side: float = 0.0
-    """Fruits of a narrower box were set aside, or not even annotated, in [px]."""
+    """Width of a box below which fruits are ignored or not even annotated, in [px]."""
 
 
 def image_truth(
@@ -72,7 +72,7 @@ def image_truth(
 
 
 def without_narrow(found: Instances, truth: ImageTruth, threshold: float = 0.5) -> Instances:
-    """The detections but those too narrow to be asked for which overlap no fruit that counts.
+    """The detections without those that are too narrow and overlap no fruit that counts.
 
     A renderer's image shows fruits too small to be annotated at all. COCO treats detections outside a range of areas in
     the same way.
@@ -89,7 +89,7 @@ def without_narrow(found: Instances, truth: ImageTruth, threshold: float = 0.5) 
 
 @dataclass(frozen=True, kw_only=True)
 class PrecisionRecall:
-    """How precision and recall go as the score threshold falls."""
+    """Precision and recall as the score threshold falls."""
 
     scores: NDArray[np.float64]
     """Scores of the counted detections, falling. Shape (D,)."""

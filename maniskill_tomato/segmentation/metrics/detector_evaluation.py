@@ -1,4 +1,4 @@
-"""How good a segmenter is on annotated images: numbers, curves, pictures."""
+"""Evaluation of a segmenter on annotated images: metrics, curves, pictures."""
 
 import time
 from collections.abc import Sequence
@@ -45,7 +45,7 @@ def evaluate_segmenter(
         segmenter: What to judge.
         images: Annotated images.
         out: Folder of the figures.
-        limit: Look at this many images only, spread evenly.
+        limit: Use this many images only, spread evenly.
         smallest_share: Rendered fruits narrower than this share of the image's longer side are set aside, and
             narrower detections where there is no other fruit.
 

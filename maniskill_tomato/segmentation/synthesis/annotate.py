@@ -1,4 +1,4 @@
-"""From what each pixel shows to annotations: masks, amodal masks, boxes, visible fractions."""
+"""Annotations from the thing that each pixel shows: masks, amodal masks, boxes, visible fractions."""
 
 from collections.abc import Sequence
 from typing import Final

@@ -1,4 +1,4 @@
-"""How a rendered scene looks: everything that is drawn anew so that a detector meets more greenhouses than one.
+"""Appearance of a rendered scene: everything that varies between scenes.
 
 Domain randomisation after Tobin et al. 2017 (Domain randomization for transferring deep neural networks from
 simulation to the real world); ranges set by comparing renders with photos from greenhouses.

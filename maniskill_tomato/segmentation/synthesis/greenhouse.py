@@ -1,4 +1,4 @@
-"""A rendered scene: a row of plants with its surroundings, and what a camera sees of it, as numbers for every pixel."""
+"""A rendered scene: a row of plants with its surroundings, and light, depth and thing of every pixel of a view."""
 
 import tempfile
 from collections.abc import Sequence

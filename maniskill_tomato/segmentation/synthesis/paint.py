@@ -1,4 +1,4 @@
-"""Materials of a rendered scene: the plants' own textures in other colours, and those of what stands around."""
+"""Materials of a rendered scene: the plants' textures in varied colours, and materials of the surroundings."""
 
 from functools import lru_cache
 from typing import Any
@@ -153,7 +153,7 @@ def far_greenery(light: tuple[float, float, float], rng: Generator) -> sapien.re
     gaps = np.clip((leaves - rng.uniform(0.1, 0.45)) / 0.25, 0, 1)[..., None]
     picture = picture * (1 - gaps) + gaps
     for _ in range(int(rng.integers(0, 30))):
-        # Too far to be asked for: a fruit here is narrower than those that count.
+        # A fruit here is narrower than those that count.
         spot = np.exp(-((x - rng.random()) ** 2 + (y - rng.random()) ** 2) / float(rng.uniform(5e-6, 1.5e-5)))
         colour = np.array([0.4, 0.06, 0.03]) if rng.random() < 0.6 else np.array([0.3, 0.36, 0.14])
         picture = picture * (1 - spot[..., None]) + colour * spot[..., None]

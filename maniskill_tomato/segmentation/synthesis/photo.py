@@ -1,4 +1,4 @@
-"""From light to a photo: exposure, white balance, lens, motion, noise and tone of a small colour camera."""
+"""Turns rendered light into a photo: exposure, white balance, lens, motion, noise and tone of a small camera."""
 
 from dataclasses import dataclass
 
@@ -80,7 +80,7 @@ def develop(
     picture = _defocused(picture, depth_m, settings, scale)
     if settings.motion != (0.0, 0.0):
         picture = _moved(picture, (settings.motion[0] * scale, settings.motion[1] * scale))
-    # The metering weights the middle and gives up on what is much brighter.
+    # The exposure metering weights the middle and saturates.
     y, x = np.mgrid[:height, :width].astype(np.float32)
     aside = ((x / width - 0.5) ** 2 + (y / height - 0.5) ** 2).astype(np.float32)
     weight = np.exp(-aside / 0.15)

@@ -1,4 +1,4 @@
-"""What stands around the row in a rendered scene: gutters, slabs, pipes, strings, the next rows, walls, an arm."""
+"""Surroundings of the row in a rendered scene: gutters, slabs, pipes, strings, walls, an arm."""
 
 from collections.abc import Callable
 

@@ -1,4 +1,4 @@
-"""What the light network should say about an annotated picture, and how far it is from that.
+"""Targets of the light network for an annotated picture, and the loss of its output.
 
 Heat map, sampling weights and box loss are those of TTFNet (Liu et al., 2020): Gaussians of 0.54 of the box, focal
 loss of CornerNet (Law and Deng, 2018), generalised IoU weighted by the logarithm of the box's area.
@@ -22,11 +22,12 @@ LOSS_WEIGHTS = {"centre": 1.0, "box": 5.0, "whole": 2.0, "category": 0.5, "fruit
 """Weight of each term; the first two are TTFNet's."""
 
 EVEN_SIDE = 32.0
-"""Fruits of smaller boxes, by the root of their area in [px], have places that weigh more in the mask terms, in
-proportion, so that large fruits with their many places do not decide alone."""
+"""Side below which a fruit weighs more in the mask terms, as the root of its box's area in [px].
+
+The weight is this over the side. Without it the many places of large fruits would decide alone."""
 
 MOST_WEIGHT = 4.0
-"""Most that such a place weighs."""
+"""Largest such weight."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -36,7 +37,7 @@ class FruitTargets:
     heat: Tensor
     """1 at centres, falling off around them. Shape (B, 1, h, w)."""
     heat_weight: Tensor
-    """0 where the centre term does not count. Shape (B, 1, h, w)."""
+    """0 where the centre term is left out. Shape (B, 1, h, w)."""
     box: Tensor
     """Left, top, right, bottom of the fruit that a place belongs to, in [px]. Shape (B, 4, h, w)."""
     whole: Tensor
@@ -46,7 +47,7 @@ class FruitTargets:
     whole_weight: Tensor
     """Weight of the whole-box term, 0 where it is not known. Shape (B, 1, h, w)."""
     category: Tensor
-    """Kind, -1 where it does not count. Shape (B, h, w)."""
+    """Kind, -1 where it is left out. Shape (B, h, w)."""
     fruit: Tensor
     """Share of fruit pixels. Shape (B, 1, h, w)."""
     fruit_weight: Tensor
@@ -58,10 +59,10 @@ class FruitTargets:
     vote_weight: Tensor
     """The same weight on fruit, 0 elsewhere. Shape (B, 1, h, w)."""
     inside_place: Tensor
-    """Places in the boxes of fruits with masks, without those of other fruits, as indices of the flattened batch.
+    """Places in the boxes of fruits with masks, except places on other fruits, as indices of the flattened batch.
     Shape (M,)."""
     inside_fruit: Tensor
-    """Which fruit of the batch each of them is for. Shape (M,)."""
+    """The fruit of the batch that each of these places belongs to. Shape (M,)."""
 
 
 def make_targets(pictures: list[TrainingPicture]) -> FruitTargets:
@@ -160,7 +161,7 @@ def _mask_targets(picture: TrainingPicture, rows: int, columns: int) -> dict[str
 
 
 def _inside(picture: TrainingPicture) -> list[NDArray[np.int64]]:
-    """For each fruit that is asked for and has a mask: the places in its box, without those of other fruits."""
+    """For each fruit that is not ignored and has a mask: the places in its box, except places on other fruits."""
     if picture.labels is None:
         return []
     rows, columns = picture.image.shape[0] // STRIDE, picture.image.shape[1] // STRIDE
@@ -207,7 +208,7 @@ def _to_corners(distances: Tensor, x: Tensor, y: Tensor) -> Tensor:
 
 
 def _focal(logits: Tensor, heat: Tensor, weight: Tensor) -> Tensor:
-    """Focal loss of CornerNet, a fruit on average."""
+    """Focal loss of CornerNet, the mean over the fruits."""
     centre = (heat == 1).float()
     probability = logits.sigmoid().clamp(1e-4, 1 - 1e-4)
     found = centre * (1 - probability) ** 2 * functional.logsigmoid(logits)
@@ -243,7 +244,7 @@ def _category_term(logits: Tensor, category: Tensor) -> Tensor:
 def _fruit_term(logits: Tensor, targets: FruitTargets) -> Tensor:
     """Binary cross entropy over the pictures with masks, plus one minus the Dice coefficient, the mean of all fruits.
 
-    Whether a mask counts as right is asked of each fruit by itself, so a sliver counts as much as a whole fruit.
+    Each fruit has one Dice coefficient, so a sliver counts as much as a whole fruit.
     """
     weight = targets.fruit_weight
     if weight.sum() == 0:

@@ -33,9 +33,9 @@ class AugmentationConfig:
     noise_probability: float = 0.3
     """How often each pixel gets Gaussian noise, of up to 10 of 255."""
     smallest_side: float = 5.0
-    """Fruits narrower than this in [px] are neither asked for nor punished."""
+    """Fruits narrower than this in [px] are ignored: they need not be found, and finding them is no error."""
     smallest_share: float = 0.2
-    """Nor are those of which less than this is left in the picture."""
+    """Fruits of which less than this share is left in the picture are ignored too."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -63,7 +63,7 @@ class LightTrainConfig:
     fixed_blocks: int = FIXED_BLOCKS
     """First blocks of a backbone with ImageNet weights that stay as they are, with the stem."""
     plain_share: float = 0.0
-    """Last share of the steps without mosaics, so that the last pictures look like those to come."""
+    """Last share of the steps, without mosaics, so that the last pictures resemble real ones."""
     seed: int = 0
     """Of the weights and the pictures."""
     log_every: int = 50

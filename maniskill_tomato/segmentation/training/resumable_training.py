@@ -22,7 +22,7 @@ HISTORY = "history.json"
 
 
 class ResumableTraining(ABC):
-    """What trainings of segmenters share: the loop, its history and its checkpoints.
+    """The loop, history and checkpoints of a segmenter's training.
 
     Attributes:
         step: Steps done.
@@ -75,7 +75,7 @@ class ResumableTraining(ABC):
 
         Args:
             out: Folder of checkpoints, history and weights; those of each checkpoint can be used already.
-            report: Takes a line now and then.
+            report: Called with a line of progress every `log_every` steps.
             stopped: Asked after every step; if true, the state is saved and the training ends early.
 
         Returns:

@@ -1,0 +1,259 @@
+"""An evaluation from policy to report: episodes, metrics, plots, pictures, film, page."""
+
+import logging
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, cast
+
+import gymnasium as gym
+import imageio.v2 as imageio
+import numpy as np
+
+from maniskill_tomato.errors import InvalidInputError
+from maniskill_tomato.experiments import plots
+from maniskill_tomato.experiments.configs import EvaluationConfig
+from maniskill_tomato.experiments.episode_record import EpisodeRecord
+from maniskill_tomato.experiments.evaluation_report import Picture, ReportInput, write_report
+from maniskill_tomato.experiments.metrics import make_metrics, write_json
+from maniskill_tomato.experiments.rollout import run_episodes
+from maniskill_tomato.experiments.training_runs import Run
+from maniskill_tomato.learning.rl.envs import make_env
+from maniskill_tomato.learning.rl.history import load_history
+from maniskill_tomato.policies.adapters import origin
+from maniskill_tomato.policies.opening import RANDOM, find_policy, open_policy, shipped_policy
+from maniskill_tomato.policies.protocol import Planner, Policy
+from maniskill_tomato.rendering import vulkan_probe
+
+logger = logging.getLogger(__name__)
+
+LEFT_OUT = (
+    "Left out because this machine cannot render: the film, and the first and last views of the camera. {hint}. "
+    "Then run this evaluation again."
+)
+
+
+@dataclass(frozen=True, kw_only=True)
+class EvaluationResult:
+    """What an evaluation wrote."""
+
+    metrics: dict[str, Any]
+    report: Path
+    video: Path | None
+    left_out: str | None
+    """Which pictures are missing and how to get them; None if none are."""
+    origin: str
+    """What the policy is and where it was trained, in one line."""
+
+
+def evaluate(config: EvaluationConfig) -> EvaluationResult:
+    """Evaluates a policy and writes metrics.json, trajectories.npz, plots, pictures, a film and report.html.
+
+    Raises:
+        PolicyError: The policy cannot be used.
+    """
+    start = time.perf_counter()
+    found = find_policy(config.policy or shipped_policy(config.env_id), _required_task(config))
+    path = found if isinstance(found, Path) else None
+    episodes, baseline, threshold, policy = _run(config, found)
+    description = {
+        "path": None if path is None else str(path),
+        **(policy.describe() if isinstance(policy, Planner) else {"kind": policy.name}),
+    }
+    metrics = make_metrics(
+        config.env_id,
+        episodes,
+        seed=config.seed,
+        success_threshold=threshold,
+        policy=description,
+        wall_seconds=time.perf_counter() - start,
+        baseline=baseline,
+    )
+    write_json(config.out / "metrics.json", metrics)
+    write_trajectories(config.out / "trajectories.npz", episodes)
+    views: list[Picture] = []
+    video = left_out = None
+    if config.video:
+        if vulkan_probe.rendering_available():
+            video, views = _film(config, found)
+        else:
+            left_out = LEFT_OUT.format(hint=vulkan_probe.NO_RENDERING_HINT)
+    facts = {key.replace("_", " "): str(value) for key, value in description.items() if key != "path"}
+    facts["evaluation time"] = f"{metrics['wall_seconds']:.0f} s"
+    content = ReportInput(
+        title=config.title,
+        metrics=metrics,
+        facts=facts,
+        training=_plot_training(config, path),
+        evaluation=_plot_episodes(config, episodes, threshold),
+        views=views,
+        video=video,
+        policy=path,
+        left_out=left_out,
+    )
+    report = config.out / "report.html"
+    write_report(report, content)
+    return EvaluationResult(
+        metrics=metrics, report=report, video=video, left_out=left_out, origin=origin(policy)
+    )
+
+
+def evaluate_run(run: Run, episodes: int, seed: int) -> EvaluationResult:
+    """Evaluates the policy of a run on the task and plants of its training; the results go into its folder `eval`.
+
+    Args:
+        run: Its folder holds `policy.pt`, or `policy.onnx` if another learner trained it.
+        episodes: How many episodes.
+        seed: Seed of the first; the others follow.
+
+    Raises:
+        InvalidInputError: The folder holds neither.
+        PolicyError: Its policy cannot be read.
+    """
+    policies = [path for name in ("policy.pt", "policy.onnx") if (path := run.path / name).is_file()]
+    if not policies:
+        raise InvalidInputError(
+            f"{run.path} holds no policy to evaluate (policy.pt or policy.onnx); finish the run with "
+            f"`maniskill-tomato train --resume {run.path}`, or compare without evaluating"
+        )
+    logger.info("evaluating %s", run.path)
+    return evaluate(
+        EvaluationConfig(
+            env_id=run.env_id,
+            policy=str(policies[0]),
+            episodes=episodes,
+            seed=seed,
+            out=run.path / "eval",
+            env_options=run.config.get("env_options", {}),
+            baseline=False,
+            video=False,
+            title=f"Evaluation of {run.path.name}",
+        )
+    )
+
+
+def write_trajectories(path: Path, episodes: Sequence[EpisodeRecord]) -> None:
+    """Writes every view of every episode as arrays.
+
+    `first_view[i]` is the row of episode i's start view in `viewpoints` (x, y, z [m], roll, pitch, yaw [rad])
+    and `visible_fraction`; `target[i]` is its target's position [m].
+    """
+    lengths = np.array([len(e.visible_fraction) for e in episodes])
+    np.savez_compressed(
+        path,
+        seed=np.array([e.seed for e in episodes]),
+        first_view=np.concatenate(([0], np.cumsum(lengths)[:-1])),
+        target=np.stack([e.target[0] for e in episodes]),
+        viewpoints=np.concatenate([e.viewpoints for e in episodes]),
+        visible_fraction=np.concatenate([e.visible_fraction for e in episodes]),
+    )
+
+
+def _required_task(config: EvaluationConfig) -> str | None:
+    return None if config.allow_other_task else config.env_id
+
+
+def _open(config: EvaluationConfig, policy: str | Path, env: gym.Env[Any, Any]) -> Policy:
+    world: Any = env.unwrapped
+    return open_policy(
+        policy,
+        env_id=config.env_id if policy == RANDOM else _required_task(config),
+        ground_truth=getattr(world, "ground_truth", None),
+        seed=config.seed if policy == RANDOM else 0,
+        device=getattr(world, "device", "cpu"),
+    )
+
+
+def _run(
+    config: EvaluationConfig, found: str | Path
+) -> tuple[list[EpisodeRecord], list[EpisodeRecord] | None, float, Policy]:
+    """The policy's episodes, the baseline's if wanted, the task's threshold of V_f, and the policy."""
+    env = make_env(config.env_id, **config.env_options)
+    try:
+        threshold = float(cast(Any, env.unwrapped).task.full_visibility)
+        policy = _open(config, found, env)
+        episodes = run_episodes(env, policy, config.episodes, config.seed, config.show_progress)
+        baseline = None
+        if config.baseline:
+            logger.info("the same episodes with random actions, to compare")
+            random = _open(config, RANDOM, env)
+            baseline = run_episodes(env, random, config.episodes, config.seed, config.show_progress)
+    finally:
+        env.close()
+    return episodes, baseline, threshold, policy
+
+
+def _plot_episodes(
+    config: EvaluationConfig, episodes: Sequence[EpisodeRecord], threshold: float
+) -> list[Picture]:
+    out = config.out
+    plots.plot_steps(episodes, out / "steps.png")
+    plots.plot_visible_fraction(episodes, threshold, out / "visible_fraction.png")
+    plots.plot_trajectories(episodes, out / "trajectories.png")
+    return [
+        Picture(path=out / "steps.png", caption="Steps that each episode took (thesis Fig. 5-6)."),
+        Picture(
+            path=out / "visible_fraction.png",
+            caption="Visible fraction of the target at the start and at its best in each episode (thesis Fig. 5-7).",
+        ),
+        Picture(
+            path=out / "trajectories.png",
+            caption="Way of the end-effector in the first episodes, with the viewing direction at the first, "
+            "middle and last pose (thesis Fig. 5-8).",
+        ),
+    ]
+
+
+def _plot_training(config: EvaluationConfig, policy: Path | None) -> list[Picture]:
+    """Curves of the training that the configuration names, or of the one beside the policy."""
+    run = config.training_run
+    if run is None and policy is not None and (policy.parent / "history.npz").is_file():
+        run = policy.parent
+    if run is None:
+        return []
+    path = config.out / "training_curves.png"
+    plots.plot_training_curves(load_history(run), path)
+    return [
+        Picture(
+            path=path,
+            caption="Loss and reward of each episode, reward and visible fraction of each step (thesis Fig. 5-1 to "
+            "5-4).",
+        )
+    ]
+
+
+def _film(config: EvaluationConfig, found: str | Path) -> tuple[Path, list[Picture]]:
+    """Films the first episodes; returns the film and the first and last view of the first one."""
+    from maniskill_tomato.experiments.film import film_episodes, make_film_options
+
+    count = min(config.films, config.episodes)
+    logger.info("filming %d episodes", count)
+    env = make_env(config.env_id, **{**make_film_options(), **config.env_options})
+    path = config.out / "video.mp4"
+    try:
+        seeds = [config.seed + i for i in range(count)]
+        films = film_episodes(env, _open(config, found, env), seeds, path)
+    finally:
+        env.close()
+    first = films[0]
+    steps = "1 step" if first.steps == 1 else f"{first.steps} steps"
+    pictures: list[Picture] = []
+    for name, image, caption in (
+        (
+            "first_view",
+            first.first.wrist,
+            f"First view of the wrist camera, V_f {first.first.visible_fraction:.2f}.",
+        ),
+        (
+            "last_view",
+            first.last.wrist,
+            f"Last view, after {steps}, V_f {first.last.visible_fraction:.2f} (thesis Fig. 5-9).",
+        ),
+        ("first_pose", first.first.outside, "The robot and the plant at the start."),
+        ("last_pose", first.last.outside, "At the end of the episode."),
+    ):
+        picture = config.out / f"{name}.png"
+        imageio.imwrite(picture, image)
+        pictures.append(Picture(path=picture, caption=caption))
+    return path, pictures

@@ -1,0 +1,185 @@
+"""Episodes in pictures: the first and last views, and a film of the scene beside what the wrist camera sees."""
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import imageio.v2 as imageio
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from maniskill_tomato.experiments.overlay import annotate
+from maniskill_tomato.experiments.rollout import run_batch
+from maniskill_tomato.policies.protocol import Policy, StatePolicy
+from maniskill_tomato.rendering import vulkan_probe
+
+Image = NDArray[np.uint8]
+
+FRAMES_PER_SECOND = 20
+VIEW_SIZE = (640, 480)
+"""Width and height of each of the two pictures, in [px]."""
+
+JOINT_SPEED = 0.9
+"""Speed of the fastest joint between two viewpoints as shown, in [rad/s]; the film only, not the task."""
+
+HOLD_SECONDS = 0.8
+"""How long the film rests at a viewpoint."""
+
+MAX_MOVE_FRAMES = 60
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Snapshot:
+    """Both pictures at one view."""
+
+    outside: Image
+    """The scene. Shape (480, 640, 3)."""
+    wrist: Image
+    """What the wrist camera sees. Shape (480, 640, 3)."""
+    visible_fraction: float
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Film:
+    """What was recorded of one episode."""
+
+    seed: int
+    success: bool
+    steps: int
+    first: Snapshot
+    last: Snapshot
+
+
+def make_film_options() -> dict[str, Any]:
+    """Options for `gymnasium.make` under which an environment can be filmed on this machine."""
+    width, height = VIEW_SIZE
+    return {
+        "render_backend": vulkan_probe.render_backend(),
+        "render_mode": "rgb_array",
+        "sensor_configs": {"width": width, "height": height},
+        "human_render_camera_configs": {"width": width, "height": height},
+    }
+
+
+def film_episodes(
+    env: gym.Env[Any, Any], policy: Policy | StatePolicy, seeds: list[int], path: Path
+) -> list[Film]:
+    """Films one episode after the other into one mp4 file.
+
+    Args:
+        env: One environment made with `make_film_options`.
+        policy: Chooses the actions.
+        seeds: Seed of each episode.
+        path: The file to write.
+
+    Returns:
+        One entry per episode.
+    """
+    path.parent.mkdir(parents=True, exist_ok=True)
+    writer: Any = imageio.get_writer(
+        path, fps=FRAMES_PER_SECOND, codec="libx264", quality=7, macro_block_size=16, ffmpeg_log_level="error"
+    )
+    try:
+        return [
+            photograph(env, policy, seed, _Camera(env, f"episode {number} of {len(seeds)}", writer))
+            for number, seed in enumerate(seeds, start=1)
+        ]
+    finally:
+        writer.close()
+
+
+def photograph(
+    env: gym.Env[Any, Any], policy: Policy | StatePolicy, seed: int, camera: "Photographer | None" = None
+) -> Film:
+    """Runs an episode and keeps pictures of its first and last view.
+
+    Args:
+        env: One environment made with `make_film_options`.
+        policy: Chooses the actions.
+        seed: Seed of the episode.
+        camera: What takes the pictures; a `Photographer` if None.
+    """
+    camera = camera or Photographer(env)
+    (record,) = run_batch(env, policy, [seed], watcher=camera)
+    first, last = camera.snapshots
+    return Film(seed=seed, success=record.success, steps=record.steps, first=first, last=last)
+
+
+class Photographer:
+    """A `Watcher` that takes pictures of the first and last view."""
+
+    def __init__(self, env: gym.Env[Any, Any]) -> None:
+        """Follows one environment made with `make_film_options`."""
+        self._world: Any = env.unwrapped
+        self.snapshots: list[Snapshot] = []
+
+    def view(self, info: dict[str, Any], done: bool) -> None:
+        if done or not self.snapshots:
+            self.snapshots.append(self._snapshot(float(info["visible_fraction"])))
+
+    def _snapshot(self, visible_fraction: float) -> Snapshot:
+        outside = self._world.render_rgb_array()[0].cpu().numpy()
+        return Snapshot(outside=outside, wrist=wrist_picture(self._world), visible_fraction=visible_fraction)
+
+
+class _Camera(Photographer):
+    """Also films every move and rests at every view."""
+
+    def __init__(self, env: gym.Env[Any, Any], title: str, writer: Any) -> None:
+        super().__init__(env)
+        self._title, self._writer = title, writer
+        self._threshold = float(self._world.task.full_visibility)
+        self._qpos: torch.Tensor | None = None
+        self._steps = -1
+        self._success = False
+
+    def view(self, info: dict[str, Any], done: bool) -> None:
+        qpos = self._world.agent.robot.get_qpos().clone()
+        if self._qpos is not None:
+            self._move(self._qpos, qpos)
+        self._qpos = qpos
+        self._steps += 1
+        self._success = self._success or (self._steps > 0 and bool(info["success"]))
+        frame = self._frame(float(info["visible_fraction"]), moving=False)
+        self._append([frame] * int((3.0 if done else 1.0) * HOLD_SECONDS * FRAMES_PER_SECOND))
+        super().view(info, done)
+
+    def _move(self, before: torch.Tensor, after: torch.Tensor) -> None:
+        """The arm on its way from the joints `before` to the present ones, which are put back at the end."""
+        robot = self._world.agent.robot
+        frames = int(float((after - before).abs().max()) / JOINT_SPEED * FRAMES_PER_SECOND)
+        count = min(frames, MAX_MOVE_FRAMES)
+        try:
+            for k in range(1, count):
+                robot.set_qpos(torch.lerp(before, after, 0.5 - 0.5 * float(np.cos(np.pi * k / count))))
+                seen = float(self._world.evaluate()["visible_fraction"])
+                self._append([self._frame(seen, moving=True)])
+        finally:
+            robot.set_qpos(after)
+
+    def _frame(self, visible_fraction: float, moving: bool) -> Image:
+        shown = self._snapshot(visible_fraction)
+        return annotate(
+            shown.outside,
+            shown.wrist,
+            title=self._title,
+            step=self._steps,
+            visible_fraction=visible_fraction,
+            threshold=self._threshold,
+            moving=moving,
+            success=self._success,
+        )
+
+    def _append(self, frames: Iterable[Image]) -> None:
+        for frame in frames:
+            self._writer.append_data(frame)
+
+
+def wrist_picture(world: Any) -> Image:
+    """What the wrist camera of an environment sees. Shape (H, W, 3)."""
+    (sensor,) = world.get_sensor_images().values()
+    picture: Image = sensor["rgb"][0].cpu().numpy()
+    return picture

@@ -1,0 +1,213 @@
+"""Policies on the same episodes under several conditions, in several processes, to be stopped and gone on with."""
+
+import logging
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+
+from maniskill_tomato.errors import InvalidInputError
+from maniskill_tomato.experiments.episode_record import EpisodeRecord
+from maniskill_tomato.experiments.result_store import ResultStore, fingerprint
+from maniskill_tomato.experiments.rollout import run_episode
+from maniskill_tomato.learning.rl.envs import make_env
+from maniskill_tomato.policies.opening import find_policy, open_policy
+from maniskill_tomato.policies.protocol import Policy
+from maniskill_tomato.policies.registry import policy_names
+from maniskill_tomato.worker_pool import run_jobs
+
+logger = logging.getLogger(__name__)
+
+BLOCK = 5
+"""Episodes that one process runs before it hands them over, each with every policy: a plant grows once for all."""
+
+LINE_SECONDS = 15.0
+"""How often progress is told."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class PolicySpec:
+    """One policy as the command line names it."""
+
+    label: str
+    """Its name in tables and files."""
+    source: str
+    """What `open_policy` opens: a name or a file."""
+
+    @classmethod
+    def parse(cls, text: str) -> "PolicySpec":
+        """Reads `NAME`, `FILE` or `LABEL=FILE`.
+
+        Raises:
+            PolicyError: There is no such name and no such file.
+        """
+        label, _, source = text.rpartition("=")
+        found = find_policy(source)
+        if isinstance(found, str):
+            return cls(label=label or found, source=found)
+        by_file = found.parent.name if found.stem == "policy" and found.parent.name else found.stem
+        return cls(label=label or by_file, source=str(found.resolve()))
+
+    @property
+    def fingerprint(self) -> str:
+        """Says whether stored episodes are of this policy: its name, or the hash of its file."""
+        path = Path(self.source)
+        return f"file:{fingerprint(path)}" if path.is_file() else self.source
+
+
+def parse_policies(text: str) -> list[PolicySpec]:
+    """Reads a list with commas.
+
+    Raises:
+        InvalidInputError: It is empty, or two have the same label.
+        PolicyError: There is no such policy.
+    """
+    specs = [PolicySpec.parse(part.strip()) for part in text.split(",") if part.strip()]
+    if not specs:
+        raise InvalidInputError(
+            f"give one policy or more, with commas between them, such as {', '.join(policy_names())}"
+        )
+    labels = [spec.label for spec in specs]
+    for label in labels:
+        if labels.count(label) > 1:
+            raise InvalidInputError(f"two policies are called {label!r}; name them as LABEL=FILE")
+    return specs
+
+
+@dataclass(frozen=True, kw_only=True)
+class Condition:
+    """What some episodes have in common."""
+
+    name: str
+    env_id: str = "TomatoViewpoint-v1"
+    env_options: dict[str, Any] = field(default_factory=dict)
+    """Options for `gymnasium.make` beside the defaults; plain JSON values."""
+    contact_free: bool = False
+    """Whether the oracle avoids the plant."""
+    axis: str | None = None
+    """Which sweep it belongs to."""
+    value: float | None = None
+    """Where it stands on that axis."""
+    episode_list: str | None = None
+    """Name of a fixed list; None draws each episode from its seed."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Block:
+    """Some episodes under one condition, for a process to run by itself."""
+
+    condition: Condition
+    missing: tuple[tuple[PolicySpec, tuple[int, ...]], ...]
+    """The episodes that each policy still has to run."""
+
+    @property
+    def episodes(self) -> int:
+        return sum(len(numbers) for _, numbers in self.missing)
+
+
+def run_policies(
+    store: ResultStore,
+    plan: Sequence[tuple[Condition, Sequence[PolicySpec], range]],
+    processes: int,
+) -> None:
+    """Runs all episodes that the store does not have yet.
+
+    Stopped at any time, a second call goes on; at most `BLOCK` episodes of each process are run again.
+
+    Args:
+        store: Where the episodes go: the condition's name is the part, the policy's label the name.
+        plan: Policies and numbers of episodes under each condition.
+        processes: How many at a time.
+    """
+    blocks = [block for part in plan for block in _missing_blocks(store, *part)]
+    total = sum(block.episodes for block in blocks)
+    if not total:
+        return
+    logger.info("%d episodes to run", total)
+    started, told, done = time.monotonic(), 0.0, 0
+    for block, results in run_jobs(run_block, blocks, processes):
+        for label, episodes in results.items():
+            store.add_episodes(block.condition.name, label, episodes)
+        done += block.episodes
+        if time.monotonic() - told > LINE_SECONDS:
+            told = time.monotonic()
+            left = (told - started) / done * (total - done)
+            logger.info("%d of %d episodes, about %.0f minutes left", done, total, left / 60.0)
+
+
+def run_block(block: Block) -> dict[str, list[EpisodeRecord]]:
+    """Runs some episodes with some policies, in whatever process this is; the episodes by policy."""
+    env = _environment(block.condition)
+    oracle = known_moves(block.condition.episode_list)
+    return {
+        spec.label: [
+            run_episode(env, _policy(spec, env, block.condition), number, oracle_moves=oracle(number))
+            for number in numbers
+        ]
+        for spec, numbers in block.missing
+    }
+
+
+def open_for(spec: PolicySpec, env: gym.Env[Any, Any], contact_free: bool = False) -> Policy:
+    """The policy for an environment.
+
+    Raises:
+        PolicyError: It cannot be used there.
+    """
+    world: Any = env.unwrapped
+    return open_policy(
+        spec.source,
+        env_id=None if world.spec is None else world.spec.id,
+        ground_truth=getattr(world, "ground_truth", None),
+        contact_free=contact_free,
+        device=getattr(world, "device", "cpu"),
+    )
+
+
+def known_moves(episode_list: str | None) -> Callable[[int], int | None]:
+    """The oracle's moves by number of the episode."""
+    if episode_list is None:
+        return lambda number: None
+    from maniskill_tomato.plants.episode_list import load_episodes
+
+    episodes = load_episodes(episode_list)
+    return lambda number: episodes[number % len(episodes)].oracle_moves
+
+
+def _missing_blocks(
+    store: ResultStore, condition: Condition, specs: Sequence[PolicySpec], numbers: range
+) -> list[Block]:
+    missing = {spec: set(store.missing(condition.name, spec.label, numbers)) for spec in specs}
+    blocks = []
+    for first in range(numbers.start, numbers.stop, BLOCK):
+        some = range(first, min(first + BLOCK, numbers.stop))
+        wanted = tuple((spec, tuple(n for n in some if n in missing[spec])) for spec in specs)
+        if any(left for _, left in wanted):
+            blocks.append(Block(condition=condition, missing=tuple(part for part in wanted if part[1])))
+    return blocks
+
+
+_kept: dict[str, Any] = {}
+"""The environment of this process and its policies; a new condition replaces them."""
+
+
+def _environment(condition: Condition) -> gym.Env[Any, Any]:
+    key = repr((condition.env_id, sorted(condition.env_options.items(), key=str)))
+    if _kept.get("key") != key:
+        if "env" in _kept:
+            _kept["env"].close()
+        _kept.clear()
+        _kept.update(key=key, env=make_env(condition.env_id, **condition.env_options), policies={})
+    env: gym.Env[Any, Any] = _kept["env"]
+    return env
+
+
+def _policy(spec: PolicySpec, env: gym.Env[Any, Any], condition: Condition) -> Policy:
+    policies: dict[Any, Policy] = _kept["policies"]
+    key = (spec, condition.contact_free)
+    if key not in policies:
+        policies[key] = open_for(spec, env, condition.contact_free)
+    return policies[key]

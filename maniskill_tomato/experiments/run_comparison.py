@@ -1,0 +1,419 @@
+"""Runs compared: grouped by configuration over seeds, with interquartile means, intervals, curves and a page."""
+
+import json
+import textwrap
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import matplotlib as mpl
+import numpy as np
+import torch
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+
+import maniskill_tomato
+from maniskill_tomato.errors import InvalidInputError
+from maniskill_tomato.experiments.configs import RunComparisonConfig
+from maniskill_tomato.experiments.evaluation import evaluate_run
+from maniskill_tomato.experiments.metrics import write_json
+from maniskill_tomato.experiments.statistics import (
+    Interval,
+    interquartile_band,
+    interquartile_interval,
+    interquartile_mean,
+    interval_text,
+)
+from maniskill_tomato.experiments.training_runs import Float64, Run, find_runs, load_run
+from maniskill_tomato.files import write_atomically
+from maniskill_tomato.learning.rl.presets import PRESETS, TrainConfig, modernise
+from maniskill_tomato.report_design import (
+    MUTED,
+    PLOT_STYLE,
+    SERIES,
+    figure,
+    markdown_table,
+    page,
+    paragraph,
+    section,
+    table,
+)
+
+CURVE_POINTS = 120
+CURVE_WINDOW = 0.05
+"""Share of the axis that a training curve averages over."""
+
+LABEL_WIDTH = 46
+LEGEND_ROWS_PER_INCH = 4.0
+
+HEAD = ("task", "configuration", "seeds", "success", "mean steps", "training steps", "training time")
+
+METHOD = (
+    "Success and steps are interquartile means over the seeds (floor(n / 4) values left out at either end) with 95 % "
+    "percentile intervals of a bootstrap over the seeds, stratified by task; failures count with all their steps. The "
+    "interval says how much training runs differ, and is rough for fewer than five; runs that agree exactly give one "
+    "of no width. Training steps and time are means."
+)
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Group:
+    """The runs of one configuration on one task, which differ in their seeds only."""
+
+    env_id: str
+    label: str
+    """Short name that tells the configuration from the other ones."""
+    runs: Sequence[Run]
+
+    def scores(self, metric: str) -> Float64:
+        """A figure of metrics.json for every evaluated run. Shape (evaluated runs,)."""
+        return np.array(
+            [run.metrics[metric] for run in self.runs if run.metrics is not None], dtype=np.float64
+        )
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Curve:
+    """A figure over the course of training: interquartile mean over runs, with its band."""
+
+    at: Float64
+    """Environment steps or seconds. Shape (points,)."""
+    mean: Float64
+    """Shape (points,)."""
+    low: Float64
+    """Equal to the mean for a single run. Shape (points,)."""
+    high: Float64
+    """Shape (points,)."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class ComparisonRow:
+    """One configuration on one task, or on all of its tasks together."""
+
+    task: str
+    label: str
+    seeds: tuple[int, ...]
+    """Seeds of the evaluated runs, or of all where none was evaluated."""
+    success_rate: Interval | None
+    """None if no run was evaluated."""
+    mean_steps: Interval | None
+    training_steps: float | None
+    """Mean over the runs."""
+    training_seconds: float | None
+    """Mean over the runs, in [s]; None if one of them did not log it."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Comparison:
+    """What a comparison found and wrote."""
+
+    table: str
+    """As Markdown."""
+    report: Path
+    """report.html, which needs no other file."""
+
+
+def compare_runs(config: RunComparisonConfig) -> Comparison:
+    """Compares training runs; writes comparison.json, comparison.md, curves-TASK.png and report.html.
+
+    Raises:
+        InvalidInputError: A folder holds no run, or a run cannot be read, compared or evaluated.
+    """
+    loaded = [load_run(path) for path in find_runs(config.runs)]
+    if config.evaluate is not None:
+        torch.set_num_threads(1)
+        for index, run in enumerate(loaded):
+            if run.metrics is None:
+                evaluate_run(run, config.evaluate, config.eval_seed)
+                loaded[index] = load_run(run.path)
+    return write_comparison(group_runs(loaded), config.out)
+
+
+def make_rows(groups: Sequence[Group]) -> list[ComparisonRow]:
+    """A row for every group, and one more for every configuration that was evaluated on several tasks."""
+    rows = [_row(group.env_id, [group]) for group in groups]
+    by_label: dict[str, list[Group]] = {}
+    for group in groups:
+        if len(group.scores("success_rate")):
+            by_label.setdefault(group.label, []).append(group)
+    rows += [_row(f"{len(same)} tasks", same) for same in by_label.values() if len(same) > 1]
+    return rows
+
+
+def write_comparison(groups: Sequence[Group], out: Path) -> Comparison:
+    """Writes comparison.json, comparison.md, curves-TASK.png and report.html into `out`."""
+    out.mkdir(parents=True, exist_ok=True)
+    rows = make_rows(groups)
+    pictures = []
+    for env_id in dict.fromkeys(group.env_id for group in groups):
+        path = out / f"curves-{env_id}.png"
+        plot_curves([group for group in groups if group.env_id == env_id], path)
+        pictures.append((env_id, path))
+    note = evaluation_note(groups)
+    content = {
+        "package_version": maniskill_tomato.__version__,
+        "rows": [asdict(row) for row in rows],
+        "runs": [
+            {
+                "path": str(run.path),
+                "env_id": group.env_id,
+                "label": group.label,
+                "seed": run.seed,
+                "success_rate": run.metrics and run.metrics["success_rate"],
+                "mean_steps": run.metrics and run.metrics["mean_steps"],
+                "training_steps": run.training_steps,
+                "training_seconds": run.training_seconds,
+            }
+            for group in groups
+            for run in group.runs
+        ],
+        "note": note,
+    }
+    write_json(out / "comparison.json", content)
+    cells = [_cells(row) for row in rows]
+    markdown = markdown_table(HEAD, cells)
+    shown = "".join(f"\n![Training curves of {env_id}]({path.name})\n" for env_id, path in pictures)
+    write_atomically(out / "comparison.md", f"{markdown}\n\n{METHOD} {note}\n{shown}".encode())
+    report = out / "report.html"
+    write_atomically(report, _page(cells, groups, pictures, note).encode())
+    return Comparison(table=markdown, report=report)
+
+
+def evaluation_note(groups: Sequence[Group]) -> str:
+    """On which episodes the runs were evaluated, and a warning where they were not the same."""
+    used = sorted(
+        {
+            (int(run.metrics["episodes"]), int(run.metrics["seed"]))
+            for group in groups
+            for run in group.runs
+            if run.metrics is not None
+        }
+    )
+    listed = " and ".join(f"{episodes} episodes from seed {seed}" for episodes, seed in used)
+    missing = sum(run.metrics is None for group in groups for run in group.runs)
+    parts = [f"Evaluated on {listed}." if used else "No run was evaluated."]
+    if len(used) > 1:
+        parts.append("These are different episodes, so that small differences mean nothing.")
+    if used and missing:
+        parts.append(f"Not evaluated: {missing} of the runs.")
+    return " ".join(parts)
+
+
+def plot_curves(groups: Sequence[Group], path: Path) -> None:
+    """Success and length of training episodes over environment steps and over training time, with 95 % bands."""
+    labels = [textwrap.fill(group.label, LABEL_WIDTH) for group in groups]
+    legend = sum(label.count("\n") + 1 for label in labels) / LEGEND_ROWS_PER_INCH / 2 + 0.3
+    panels = (("Training success", "success", 1.0), ("Steps per training episode", "steps", None))
+    with mpl.rc_context(PLOT_STYLE):
+        canvas = Figure(figsize=(9.0, 5.4 + legend))
+        for row, (title, column, top) in zip(canvas.subplots(2, 2), panels, strict=True):
+            for axes, wall_time in zip(row, (False, True), strict=True):
+                empty = [_draw_curve(axes, group, column, wall_time, i) for i, group in enumerate(groups)]
+                axes.set_title(title)
+                axes.set_xlabel("training time [s]" if wall_time else "environment steps")
+                axes.set_xlim(left=0.0)
+                axes.set_ylim(bottom=0.0, top=top and 1.04 * top)
+                if all(empty):
+                    axes.text(0.5, 0.5, "not logged", transform=axes.transAxes, ha="center", color=MUTED)
+        handles = [Line2D([], [], color=SERIES[i % len(SERIES)]) for i in range(len(groups))]
+        canvas.legend(handles, labels, loc="outside lower center", ncols=2)
+        canvas.savefig(path)
+
+
+def _draw_curve(axes: Axes, group: Group, column: str, wall_time: bool, index: int) -> bool:
+    """One line with its band; whether there was nothing to draw."""
+    curve = training_curve(group, column, wall_time)
+    if curve is None:
+        return True
+    colour = SERIES[index % len(SERIES)]
+    axes.fill_between(curve.at, curve.low, curve.high, color=colour, alpha=0.18, linewidth=0.0)
+    axes.plot(curve.at, curve.mean, color=colour, linewidth=1.6)
+    return False
+
+
+def _row(task: str, groups: Sequence[Group]) -> ComparisonRow:
+    def interval(metric: str) -> Interval | None:
+        strata = [scores for group in groups if len(scores := group.scores(metric))]
+        return interquartile_interval(strata) if strata else None
+
+    runs = [run for group in groups for run in group.runs]
+    runs = [run for run in runs if run.metrics is not None] or runs
+    return ComparisonRow(
+        task=task,
+        label=groups[0].label,
+        seeds=tuple(sorted({run.seed for run in runs})),
+        success_rate=interval("success_rate"),
+        mean_steps=interval("mean_steps"),
+        training_steps=_mean([run.training_steps for run in runs]),
+        training_seconds=_mean([run.training_seconds for run in runs]),
+    )
+
+
+def _mean(values: Sequence[float | None]) -> float | None:
+    known = [value for value in values if value is not None]
+    return float(np.mean(known)) if len(known) == len(values) else None
+
+
+def _cells(row: ComparisonRow) -> tuple[str, ...]:
+    return (
+        row.task,
+        row.label,
+        ", ".join(str(seed) for seed in row.seeds),
+        interval_text(row.success_rate, 100.0, "{:.1f}", " %"),
+        interval_text(row.mean_steps, 1.0, "{:.2f}", ""),
+        "not known" if row.training_steps is None else f"{row.training_steps:,.0f}",
+        "not logged" if row.training_seconds is None else f"{row.training_seconds:.0f} s",
+    )
+
+
+def group_runs(runs: Sequence[Run]) -> list[Group]:
+    """The runs by task and configuration, in the order of their first appearance within a task.
+
+    Raises:
+        InvalidInputError: Two runs have the same task, configuration and seed.
+    """
+    found: dict[tuple[str, str], list[Run]] = {}
+    for run in runs:
+        same = found.setdefault((run.env_id, json.dumps(run.config, sort_keys=True)), [])
+        for other in same:
+            if other.seed == run.seed:
+                raise InvalidInputError(
+                    f"{other.path} and {run.path} have the same task, configuration and seed; give one of them"
+                )
+        same.append(run)
+    configs = [members[0].config for members in found.values()]
+    groups = [
+        Group(
+            env_id=env_id,
+            label=_label(members[0].config, configs),
+            runs=sorted(members, key=lambda run: run.seed),
+        )
+        for (env_id, _), members in found.items()
+    ]
+    return sorted(groups, key=lambda group: group.env_id)
+
+
+def training_curve(group: Group, column: str, wall_time: bool) -> Curve | None:
+    """A column of episodes.csv over the course of training, averaged over a window and then over the runs.
+
+    Each point is the mean of the episodes that ended within the last twentieth of the axis before it; the axis
+    ends where the shortest run of the group does. The band is the pointwise 95 % interval.
+
+    Args:
+        group: The runs.
+        column: The column, for instance `success`.
+        wall_time: Over training time in [s] instead of environment steps.
+
+    Returns:
+        None if a run has no finished episode or, for `wall_time`, no clock.
+    """
+    series: list[tuple[Float64, Float64]] = []
+    for run in group.runs:
+        at = run.episodes["end_step"]
+        if len(at) == 0 or (wall_time and run.clock is None):
+            return None
+        if wall_time and run.clock is not None:
+            at = np.interp(at, run.clock[:, 0], run.clock[:, 1])
+        series.append((at, run.episodes[column]))
+    end = min(float(at[-1]) for at, _ in series)
+    grid = np.linspace(end / CURVE_POINTS, end, CURVE_POINTS)
+    smooth = np.stack([trailing_mean(at, values, grid, CURVE_WINDOW * end) for at, values in series])
+    known = np.isfinite(smooth).all(axis=0)
+    smooth, grid = smooth[:, known], grid[known]
+    mean = interquartile_mean(smooth, axis=0)
+    low, high = interquartile_band(smooth)
+    return Curve(at=grid, mean=mean, low=low, high=high)
+
+
+def trailing_mean(at: Float64, values: Float64, grid: Float64, window: float) -> Float64:
+    """Mean of the values whose place is in (g - window, g] for every g of `grid`; NaN where there is none.
+
+    Args:
+        at: Places of the values, rising. Shape (N,).
+        values: Shape (N,).
+        grid: Shape (G,).
+        window: Width of the window, in units of `at`.
+
+    Returns:
+        Shape (G,).
+    """
+    sums = np.concatenate(([0.0], np.cumsum(values)))
+    first = np.searchsorted(at, grid - window, side="right")
+    after = np.searchsorted(at, grid, side="right")
+    counts = after - first
+    means: Float64 = np.where(counts > 0, (sums[after] - sums[first]) / np.maximum(counts, 1), np.nan)
+    return means
+
+
+def _label(config: dict[str, Any], others: Sequence[dict[str, Any]]) -> str:
+    """The algorithm or nearest preset, and what differs from that preset or between runs of the algorithm."""
+    algorithm = config.get("algorithm")
+    options = {k: v for k, v in config.items() if k not in ("algorithm", "env_options")}
+    shown: dict[str, Any] = {}
+    if algorithm is None:
+        algorithm, shown = _nearest_preset(options)
+    else:
+        same = [other for other in others if other.get("algorithm") == algorithm]
+        shown = {k: v for k, v in options.items() if any(other.get(k) != v for other in same)}
+    parts = [str(algorithm), *(f"{name} {_short(value)}" for name, value in shown.items())]
+    if "env_options" in config:
+        parts.append(json.dumps(config["env_options"], sort_keys=True))
+    return ", ".join(parts)
+
+
+def _nearest_preset(options: dict[str, Any]) -> tuple[str, dict[str, Any]]:
+    """The preset that shares most options, and the options that it does not share."""
+    defaults = TrainConfig(total_timesteps=1).to_dict()
+    complete = {**defaults, "total_timesteps": None, **modernise(options)}
+    differences: dict[str, dict[str, Any]] = {}
+    for name, preset in PRESETS.items():
+        values = preset.to_dict()
+        differences[name] = {k: v for k, v in complete.items() if k not in values or values[k] != v}
+    nearest = min(differences, key=lambda name: len(differences[name]))
+    return nearest, differences[nearest]
+
+
+def _short(value: object) -> str:
+    if isinstance(value, float):
+        return f"{value:g}"
+    return "x".join(_short(v) for v in value) if isinstance(value, list) else str(value)
+
+
+def _page(
+    cells: Sequence[Sequence[str]], groups: Sequence[Group], pictures: Sequence[tuple[str, Path]], note: str
+) -> str:
+    runs = [(group, run) for group in groups for run in group.runs]
+    lines = [
+        (
+            group.env_id,
+            group.label,
+            str(run.seed),
+            "not evaluated" if run.metrics is None else f"{run.metrics['success_rate']:.1%}",
+            "not evaluated" if run.metrics is None else f"{run.metrics['mean_steps']:.2f}",
+            "not known" if run.training_steps is None else f"{run.training_steps:,}",
+            "not logged" if run.training_seconds is None else f"{run.training_seconds:.0f} s",
+        )
+        for group, run in runs
+    ]
+    curves = [
+        section(
+            env_id,
+            figure(
+                path,
+                f"Training on {env_id}: interquartile mean over the seeds and pointwise 95 % interval. Each point is "
+                "the mean of the episodes that ended in the twentieth of the axis before it, exploration included.",
+            ),
+        )
+        for env_id, path in pictures
+    ]
+    return page(
+        "Comparison of training runs",
+        f"{len(runs)} runs of {len(groups)} configurations",
+        [
+            section("Results", table(HEAD, cells), paragraph(f"{METHOD} {note}", "caption")),
+            *curves,
+            section("Runs", table((*HEAD[:2], "seed", *HEAD[3:]), lines)),
+        ],
+    )

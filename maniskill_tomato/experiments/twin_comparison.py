@@ -1,0 +1,130 @@
+"""The twin of `deploy` and the simulated task on the same held-out episodes with the same policy."""
+
+import json
+import time
+from collections import Counter
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import numpy as np
+
+import maniskill_tomato
+from maniskill_tomato.deploy.policies import TASK, default_policy
+from maniskill_tomato.deploy.profile import Profile, load_profile
+from maniskill_tomato.deploy.run import RunConfig, run
+from maniskill_tomato.errors import TomatoError
+from maniskill_tomato.experiments.configs import TwinConfig
+from maniskill_tomato.experiments.metrics import write_json
+from maniskill_tomato.experiments.result_store import ResultStore
+from maniskill_tomato.experiments.rollout import run_episode
+from maniskill_tomato.experiments.statistics import mcnemar_p, wilson_interval
+from maniskill_tomato.experiments.viewpoint_benchmark import MAIN
+from maniskill_tomato.learning.rl.envs import make_env
+from maniskill_tomato.policies.opening import open_policy
+
+
+def compare_twin(config: TwinConfig, report: Callable[[str], None] = lambda line: None) -> dict[str, Any]:
+    """Runs the episodes that are not in the folder yet; writes summary.json and a folder for each run.
+
+    Args:
+        config: What to compare.
+        report: Told one line after each episode.
+
+    Returns:
+        The content of summary.json.
+    """
+    profile = load_profile(config.profile)
+    settings = {
+        "profile": config.profile,
+        "policy": config.policy or default_policy(),
+        "package_version": maniskill_tomato.__version__,
+    }
+    store = ResultStore(config.out, settings)
+    numbers = range(config.seed, config.seed + config.episodes)
+    missing = store.missing(MAIN, "twin", numbers)
+    if missing:
+        policy = open_policy(config.policy or default_policy(), env_id=TASK)
+        env = make_env(TASK, episodes=MAIN)
+        try:
+            for number in missing:
+                record = run_episode(env, policy, number)
+                twin = on_the_twin(profile, config, number)
+                simulation = {
+                    "success": record.success,
+                    "moves": record.steps,
+                    "contact": record.contact is not None and bool(record.contact.any()),
+                    "visible_fraction": round(float(record.visible_fraction[-1]), 4),
+                }
+                result = {"episode": number, "twin": twin, "simulation": simulation}
+                store.add(MAIN, "twin", {number: result})
+                report(
+                    f"{number:3d}  twin {twin['reason']:12} {twin.get('moves', 0):2d} moves   "
+                    f"simulation {'success' if record.success else 'failure'} {record.steps:2d} moves"
+                )
+        finally:
+            env.close()
+    summary = summarise_twin(list(store.read(MAIN, "twin").values()))
+    write_json(config.out / "summary.json", summary)
+    return summary
+
+
+def on_the_twin(profile: Profile, config: TwinConfig, episode: int) -> dict[str, Any]:
+    """One run as `deploy run` makes it."""
+    began = time.process_time()
+    out = config.out / f"{episode:03d}"
+    try:
+        result = run(
+            RunConfig(profile=profile, out=out, policy=config.policy, seed=episode, record=config.record)
+        )
+    except TomatoError as error:
+        return {"success": False, "reason": "cannot begin", "detail": str(error), "steps": []}
+    content = result.to_json()
+    content["steps"] = json.loads((out / "result.json").read_text())["steps"]
+    true_fraction = result.true_visible_fraction
+    seen = result.success and true_fraction is not None and true_fraction > profile.loop.threshold
+    return {**content, "truly_visible": seen, "cpu_seconds": time.process_time() - began}
+
+
+def summarise_twin(episodes: Sequence[dict[str, Any]]) -> dict[str, Any]:
+    """Rates, their intervals, what differs, and what a look costs."""
+    twin = [episode["twin"] for episode in episodes]
+    wins = np.array(
+        [
+            [run["success"], episode["simulation"]["success"]]
+            for run, episode in zip(twin, episodes, strict=True)
+        ]
+    )
+    ran = [run for run in twin if "moves" in run]
+    stages: dict[str, list[float]] = {}
+    for one in ran:
+        for step in one["steps"]:
+            for stage, taken in step["timing_ms"].items():
+                stages.setdefault(stage, []).append(taken)
+    only_twin, only_simulation = int((wins[:, 0] & ~wins[:, 1]).sum()), int((~wins[:, 0] & wins[:, 1]).sum())
+    return {
+        "episodes": len(episodes),
+        "twin_success": int(wins[:, 0].sum()),
+        "twin_interval_95": wilson_interval(int(wins[:, 0].sum()), len(wins)),
+        "twin_success_and_truly_visible": sum(bool(one.get("truly_visible")) for one in twin),
+        "simulation_success": int(wins[:, 1].sum()),
+        "simulation_interval_95": wilson_interval(int(wins[:, 1].sum()), len(wins)),
+        "only_twin": only_twin,
+        "only_simulation": only_simulation,
+        "mcnemar_p": mcnemar_p(only_twin, only_simulation),
+        "reasons": dict(Counter(one["reason"] for one in twin)),
+        "failed": [e["episode"] for e, won in zip(episodes, wins[:, 0], strict=True) if not won],
+        "simulation_failed": [e["episode"] for e, won in zip(episodes, wins[:, 1], strict=True) if not won],
+        "twin_moves_of_successes": float(np.mean([one["moves"] for one in ran if one["success"]])),
+        "simulation_moves_of_successes": float(
+            np.mean([e["simulation"]["moves"] for e in episodes if e["simulation"]["success"]])
+        ),
+        "refused_share_of_moves": sum(one["refused_moves"] for one in ran) / sum(one["moves"] for one in ran),
+        "simulation_contact_share_of_episodes": float(
+            np.mean([e["simulation"]["contact"] for e in episodes])
+        ),
+        "stage_ms_mean": {stage: round(float(np.mean(taken)), 2) for stage, taken in stages.items()},
+        "stage_ms_p95": {stage: round(float(np.percentile(taken, 95)), 2) for stage, taken in stages.items()},
+        "looks": sum(len(one["steps"]) for one in ran),
+        "cpu_seconds_a_run": float(np.mean([one["cpu_seconds"] for one in ran])),
+        "device_seconds_median": float(np.median([one["device_seconds"] for one in ran])),
+    }

@@ -1,0 +1,65 @@
+"""Triangle meshes on a Warp device: one set per plant, shared by every environment that shows it."""
+
+from collections import OrderedDict
+from typing import Any
+
+import numpy as np
+import warp as wp
+from numpy.typing import NDArray
+
+from maniskill_tomato.errors import InvalidInputError
+from maniskill_tomato.plants.organs import Plant
+
+
+def build_mesh(vertices: NDArray[Any], faces: NDArray[Any], device: str) -> Any:
+    """A Warp mesh with its bounding volume hierarchy.
+
+    Args:
+        vertices: Positions, in [m]. Shape (V, 3).
+        faces: Vertex indices. Shape (F, 3).
+        device: A Warp device name.
+    """
+    points = wp.array(np.ascontiguousarray(vertices, dtype=np.float32), dtype=wp.vec3, device=device)
+    indices = wp.array(np.ascontiguousarray(faces, dtype=np.int32).ravel(), dtype=wp.int32, device=device)
+    return wp.Mesh(points=points, indices=indices)
+
+
+class PlantMeshes:
+    """The meshes of one plant: all of it, and each fruit on its own."""
+
+    def __init__(self, plant: Plant, device: str) -> None:
+        if not plant.fruits:
+            raise InvalidInputError(f"a plant needs at least one fruit to look at; {plant.preset!r} has none")
+        self.plant = plant
+        """Kept so that the identity by which this set is found stays taken."""
+        self.whole = build_mesh(plant.vertices, plant.faces, device)
+        organs = [plant.organs[fruit.organ_index] for fruit in plant.fruits]
+        self.fruits = [build_mesh(organ.vertices, organ.faces, device) for organ in organs]
+        self.spheres = np.array([(*fruit.centre, fruit.radius) for fruit in plant.fruits], dtype=np.float32)
+        """Centre in the plant frame and radius of each fruit, in [m]. Shape (F, 4)."""
+        self.is_ripe = np.array([fruit.ripeness == "ripe" for fruit in plant.fruits], dtype=np.int32)
+
+
+class PlantMeshCache:
+    """The meshes of the plants seen last, found by the plant's identity.
+
+    Building the hierarchy of a plant takes tens of milliseconds, so plants that come back should be found
+    here. Environments hold on to the sets they show themselves; the bound is on what this cache keeps alive.
+    """
+
+    def __init__(self, device: str, capacity: int) -> None:
+        self._device = device
+        self._capacity = capacity
+        self._entries: OrderedDict[int, PlantMeshes] = OrderedDict()
+
+    def get(self, plant: Plant) -> PlantMeshes:
+        """The meshes of a plant, built now if they are not at hand."""
+        key = id(plant)
+        entry = self._entries.get(key)
+        if entry is None:
+            entry = self._entries[key] = PlantMeshes(plant, self._device)
+            if len(self._entries) > self._capacity:
+                self._entries.popitem(last=False)
+        else:
+            self._entries.move_to_end(key)
+        return entry

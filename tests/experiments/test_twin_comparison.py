@@ -1,0 +1,69 @@
+"""The twin beside the simulated task."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from maniskill_tomato.errors import TomatoError
+from maniskill_tomato.experiments.configs import TwinConfig
+from maniskill_tomato.experiments.twin_comparison import compare_twin, summarise_twin
+
+
+def episode(number: int, twin: bool, simulated: bool, moves: int, truly: bool = True) -> dict[str, Any]:
+    return {
+        "episode": number,
+        "twin": {
+            "success": twin,
+            "truly_visible": twin and truly,
+            "reason": "success" if twin else "budget",
+            "moves": moves,
+            "refused_moves": 1,
+            "cpu_seconds": 2.0,
+            "device_seconds": 10.0 * moves,
+            "steps": [{"timing_ms": {"capture": 50.0}}, {"timing_ms": {"capture": 70.0, "policy": 4.0}}],
+        },
+        "simulation": {"success": simulated, "moves": 2, "contact": number == 0},
+    }
+
+
+def test_the_summary_counts_what_a_pencil_counts() -> None:
+    cannot = episode(3, False, True, 1)
+    cannot["twin"] = {"success": False, "reason": "cannot begin", "detail": "no", "steps": []}
+    found = summarise_twin(
+        [
+            episode(0, True, True, 4),
+            episode(1, True, False, 6, truly=False),
+            episode(2, False, True, 10),
+            cannot,
+        ]
+    )
+    assert (found["twin_success"], found["simulation_success"], found["episodes"]) == (2, 3, 4)
+    assert (found["only_twin"], found["only_simulation"], found["twin_success_and_truly_visible"]) == (
+        1,
+        2,
+        1,
+    )
+    assert found["mcnemar_p"] == 1.0
+    assert found["failed"] == [2, 3] and found["reasons"] == {"success": 2, "budget": 1, "cannot begin": 1}
+    assert found["twin_moves_of_successes"] == 5.0 and found["refused_share_of_moves"] == pytest.approx(
+        3 / 20
+    )
+    assert found["stage_ms_mean"] == {"capture": 60.0, "policy": 4.0} and found["looks"] == 6
+    assert found["simulation_contact_share_of_episodes"] == 0.25
+
+
+def test_an_episode_runs_on_both_and_is_not_run_again(tmp_path: Path) -> None:
+    config = TwinConfig(seed=6, episodes=1, out=tmp_path)
+    lines: list[str] = []
+    content = compare_twin(config, lines.append)
+    assert content["episodes"] == 1 and content["reasons"] == {"success": 1}
+    assert lines[0].startswith("  6  twin success")
+    assert json.loads((tmp_path / "summary.json").read_text())["looks"] == content["looks"]
+    stored = {path: path.read_bytes() for path in tmp_path.rglob("*.jsonl")}
+    assert len(stored) == 1
+    assert compare_twin(config, lines.append)["looks"] == content["looks"] and len(lines) == 1
+    assert {path: path.read_bytes() for path in tmp_path.rglob("*.jsonl")} == stored
+    with pytest.raises(TomatoError, match="no profile 'nothing'"):
+        compare_twin(TwinConfig(profile="nothing", out=tmp_path))
