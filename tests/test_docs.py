@@ -94,13 +94,13 @@ def test_names_of_modules_in_the_text_exist(page: Path) -> None:
     if page.name == "CHANGELOG.md":
         pytest.skip("it also names what is gone")
     text = page.read_text(encoding="utf-8")
-    dotted = re.findall(rf"(?:maniskill_tomato\.|(?<![-\w./]))((?:{'|'.join(ROOMS)})(?:\.[A-Za-z_]\w*)+)\b", text)
+    rooms = "|".join(ROOMS)
+    pattern = rf"(?:maniskill_tomato\.|(?<![-\w./]))((?:{rooms})(?:\.[A-Za-z_]\w*)+)\b"
+    dotted = re.findall(pattern, text)
     missing = {
         name for name in dotted if not exists(name) and not name.endswith((".md", ".py", ".json", ".png"))
     }
-    files = re.findall(
-        rf"`((?:{'|'.join((*ROOMS, 'scripts', 'tools', 'tests', 'examples'))})/[\w/]+\.\w+)`", text
-    )
+    files = re.findall(rf"`((?:{rooms}|scripts|tools|tests|examples)/[\w/]+\.\w+)`", text)
     gone = {
         name
         for name in files
