@@ -167,7 +167,7 @@ class ViewpointObserver:
         moves_left: Tensor,
         mask: Tensor | None = None,
     ) -> Tensor:
-        """Takes one look into the memory and describes what is known. To be called once for every look.
+        """Takes one view into the memory and describes what is known. To be called once for every view.
 
         Args:
             viewpoint: Of the flange: x, y, z, in [m], roll, pitch, yaw, in [rad], base frame. Shape (B, 6).
