@@ -22,7 +22,7 @@ from mani_skill.envs.sapien_env import BaseEnv
 from mani_skill.envs.sim2real_env import Sim2RealEnv
 from torch import Tensor
 
-from maniskill_tomato.deploy.errors import PerceptionError, ProfileError, RefusedError
+from maniskill_tomato.deploy.deploy_errors import PerceptionError, ProfileError, RefusedError
 from maniskill_tomato.deploy.interface import Float64
 from maniskill_tomato.deploy.real_agent import IiwaRealAgent
 from maniskill_tomato.deploy.robot_belief import RobotBelief

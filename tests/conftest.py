@@ -5,13 +5,10 @@ elsewhere it is skipped.
 """
 
 import functools
-import importlib.util
 import os
 import subprocess
 import sys
-from collections.abc import Callable
 from pathlib import Path
-from types import ModuleType
 
 import pytest
 
@@ -72,18 +69,3 @@ def pytest_runtest_setup(item: pytest.Item) -> None:
         pytest.skip(problem)
     if item.get_closest_marker("render") is not None:
         keep_renderer_alive()
-
-
-@pytest.fixture
-def load_script() -> Callable[[str], ModuleType]:
-    """Gives a script of `scripts/` as a module, by its name."""
-
-    def load(name: str) -> ModuleType:
-        spec = importlib.util.spec_from_file_location(name, ROOT / "scripts" / f"{name}.py")
-        assert spec is not None and spec.loader is not None
-        module = importlib.util.module_from_spec(spec)
-        sys.modules[name] = module
-        spec.loader.exec_module(module)
-        return module
-
-    return load

@@ -51,6 +51,10 @@ COMMANDS: Final[dict[str, CommandEntry]] = {
     "benchmark": CommandEntry(
         "benchmark_command:Benchmark", "Compare policies on the same held-out episodes"
     ),
+    "benchmark-rows": CommandEntry("benchmark_command:BenchmarkRows", "Compare policies on whole rows"),
+    "compare": CommandEntry("compare_command:Compare", "Compare training runs over their seeds"),
+    "reproduce": CommandEntry("study_commands:Reproduce", "Reproduce the thesis's experiments"),
+    "ablate": CommandEntry("study_commands:Ablate", "Measure what each option of the learner is worth"),
     "dataset": CommandEntry("dataset_command:Dataset", "Render annotated images of tomato rows"),
     "detect": CommandEntry("detect_command:Detect", "Find the tomatoes in images"),
     "train-segmenter light": CommandEntry("segmenter_commands:TrainLight", "The light segmenter, on a CPU"),
@@ -62,6 +66,10 @@ COMMANDS: Final[dict[str, CommandEntry]] = {
     "judge segmenter": CommandEntry(
         "judge_commands:JudgeSegmenter", "A segmenter on annotated images: precision, recall, AP"
     ),
+    "judge perception": CommandEntry(
+        "judge_commands:JudgePerception", "What a policy loses when it sees through the camera"
+    ),
+    "judge twin": CommandEntry("judge_commands:JudgeTwin", "The twin of `deploy` beside the simulated task"),
     "deploy run": CommandEntry("deploy_commands:DeployRun", "Look at a tomato until it is fully visible"),
     "deploy check": CommandEntry("deploy_commands:DeployCheck", "Check everything; nothing moves"),
     "deploy calibrate": CommandEntry(
@@ -74,7 +82,7 @@ COMMANDS: Final[dict[str, CommandEntry]] = {
 
 FAMILIES: Final[dict[str, str]] = {
     "train-segmenter": "Train a segmenter on annotated images",
-    "judge": "Judge a part: occlusion models, segmenters",
+    "judge": "Judge a part: V_f models, segmenters, perception, twin",
     "deploy": "Run a policy on an arm and a camera, or on their twin",
 }
 """Commands that have commands, and what the list says of them."""
@@ -89,8 +97,8 @@ GROUPS: Final[dict[str, tuple[str, ...]]] = {
         "train-deep-3dmts",
         "demonstrations",
     ),
-    "Measure": ("eval", "benchmark"),
-    "See": ("dataset", "train-segmenter", "detect", "judge"),
+    "Measure": ("eval", "benchmark", "benchmark-rows", "compare", "reproduce", "ablate", "judge"),
+    "See": ("dataset", "train-segmenter", "detect"),
     "Use": ("export", "deploy"),
 }
 """The commands as the list shows them."""

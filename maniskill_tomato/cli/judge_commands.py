@@ -6,7 +6,16 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
-from maniskill_tomato.cli.early_checks import check_count, check_folder, check_place, check_segmenter
+from maniskill_tomato.cli.early_checks import (
+    check_count,
+    check_folder,
+    check_place,
+    check_policies,
+    check_policy,
+    check_profile,
+    check_segmenter,
+)
+from maniskill_tomato.experiments.configs import PerceptionConfig, TwinConfig
 
 OcclusionModelName = Literal["thesis", "improved", "sphere", "amodal"]
 
@@ -108,3 +117,39 @@ class JudgeSegmenter:
         write_atomically(self.out / "metrics.json", json.dumps(described, indent=1).encode())
         for name, value in metrics.items():
             print(f"{name:24} {value:.4g}")
+
+
+@dataclass(frozen=True, kw_only=True)
+class JudgePerception(PerceptionConfig):
+    """Measure what a policy loses when it sees through the camera instead of the simulator, on the same episodes.
+
+    An episode ends when the robot believes that the target is fully visible, or after the last move. It is a success
+    if that is then true.
+    """
+
+    def run(self) -> None:
+        """Runs what is missing and prints the table."""
+        check_policies("--policies", self.policies)
+
+        from maniskill_tomato.experiments.perception_comparison import compare_perceptions
+
+        print(compare_perceptions(self))
+
+
+@dataclass(frozen=True, kw_only=True)
+class JudgeTwin(TwinConfig):
+    """Run the twin of `deploy` and the simulated task on the same held-out episodes with the same policy.
+
+    The difference of the two rates is what perception, depth noise, dynamics and the safety checks cost. An episode
+    whose run cannot begin, or ends with a fault, counts as failed.
+    """
+
+    def run(self) -> None:
+        """Runs what is missing and prints the figures."""
+        check_profile("--profile", self.profile)
+        if self.policy is not None:
+            check_policy("--policy", self.policy, on_robot=True)
+
+        from maniskill_tomato.experiments.twin_comparison import compare_twin
+
+        print(json.dumps(compare_twin(self, lambda line: print(line, flush=True)), indent=1))

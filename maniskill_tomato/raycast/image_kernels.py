@@ -3,65 +3,94 @@
 # pyright: reportCallIssue=false, reportGeneralTypeIssues=false, reportIndexIssue=false
 # pyright: reportOperatorIssue=false, reportReturnType=false
 # Warp's stubs describe calls from outside, not what stands inside a kernel.
-"""Warp kernel of a whole depth image with labels."""
+"""Warp kernels of whole images: one ray through the middle of every pixel."""
 
 import warp as wp
 
-from maniskill_tomato.raycast.kernels import NEAR, SURFACE_GAP, Scene, View
+from maniskill_tomato.raycast.kernels import (
+    LINK,
+    NEAR,
+    PLANT,
+    Scene,
+    Views,
+    first_hit,
+    is_target,
+)
 
 wp.set_module_options({"enable_backward": False})
 
-NOTHING = wp.constant(wp.int8(0))
-TARGET = wp.constant(wp.int8(1))
-PLANT = wp.constant(wp.int8(2))
-ROBOT = wp.constant(wp.int8(3))
+SHOWS_NOTHING = wp.constant(wp.int8(0))
+SHOWS_TARGET = wp.constant(wp.int8(1))
+SHOWS_PLANT = wp.constant(wp.int8(2))
+SHOWS_ROBOT = wp.constant(wp.int8(3))
+
+NO_FACE = wp.constant(-1)
+FACE_OF_ROBOT = wp.constant(-2)
+
+
+@wp.struct
+class Pinhole:
+    """Intrinsics, in [px]."""
+
+    fx: wp.float32
+    fy: wp.float32
+    cx: wp.float32
+    cy: wp.float32
+
+
+@wp.func
+def pixel_direction(pinhole: Pinhole, row: int, column: int) -> wp.vec3:
+    """Through the middle of a pixel, in the optical frame; with a unit z component a ray's parameter is a depth."""
+    x = (float(column) + 0.5 - pinhole.cx) / pinhole.fx
+    y = (float(row) + 0.5 - pinhole.cy) / pinhole.fy
+    return wp.vec3(x, y, 1.0)
 
 
 @wp.kernel
 def trace_image(
     scene: Scene,
-    view: View,
-    fx: float,
-    fy: float,
-    cx: float,
-    cy: float,
+    views: Views,
+    pinhole: Pinhole,
     farthest: float,
-    targets: wp.array[wp.int32],
     depths: wp.array3d[wp.float32],
     labels: wp.array3d[wp.int8],
 ):
-    """One pixel: the depth of what its centre shows and which kind of thing that is."""
-    env, row, column = wp.tid()
-    # With a unit component along the optical axis, a ray's parameter is a depth.
-    direction_c = wp.vec3((float(column) + 0.5 - cx) / fx, (float(row) + 0.5 - cy) / fy, 1.0)
-    direction = view.plant_rotations[env] * direction_c
-    start = view.plant_positions[env] + NEAR * direction
-    label = NOTHING
-    depth = farthest
-    hit = wp.mesh_query_ray(scene.plant_meshes[env], start, direction, farthest - NEAR)
-    if hit.result:
-        label = PLANT
-        depth = hit.t + NEAR
-        if targets[env] >= 0 and targets[env] < scene.fruit_counts[env]:
-            sphere = scene.fruit_spheres[env, targets[env]]
-            offset = wp.vec3(sphere[0], sphere[1], sphere[2]) - start
-            if wp.length(wp.cross(offset, wp.normalize(direction))) <= sphere[3]:
-                mesh = scene.fruit_meshes[env, targets[env]]
-                if wp.mesh_query_ray_anyhit(mesh, start, direction, hit.t + SURFACE_GAP):
-                    label = TARGET
-    remaining = view.links_in_the_way[env]
-    link = wp.int32(0)
-    while remaining != 0:
-        if remaining & 1:
-            link_start = view.link_positions[env, link] + NEAR * (
-                view.link_rotations[env, link] * direction_c
-            )
-            link_direction = view.link_rotations[env, link] * direction_c
-            met = wp.mesh_query_ray(scene.link_meshes[link], link_start, link_direction, depth - NEAR)
-            if met.result:
-                label = ROBOT
-                depth = met.t + NEAR
-        remaining = remaining >> 1
-        link += 1
-    depths[env, row, column] = depth
-    labels[env, row, column] = label
+    """One pixel: the depth of what its centre shows, `farthest` without anything, and which kind of thing that is."""
+    view, row, column = wp.tid()
+    direction_c = pixel_direction(pinhole, row, column)
+    hit = first_hit(scene, views, view, direction_c, NEAR, farthest)
+    label = SHOWS_NOTHING
+    if hit.kind == LINK:
+        label = SHOWS_ROBOT
+    elif hit.kind == PLANT:
+        label = SHOWS_PLANT
+        if is_target(scene, views, view, direction_c, NEAR, hit.distance):
+            label = SHOWS_TARGET
+    depths[view, row, column] = hit.distance
+    labels[view, row, column] = label
+
+
+@wp.kernel
+def trace_picture(
+    scene: Scene,
+    views: Views,
+    pinhole: Pinhole,
+    farthest: float,
+    depths: wp.array3d[wp.float32],
+    faces: wp.array3d[wp.int32],
+    facings: wp.array3d[wp.float32],
+):
+    """One pixel: depth, 0 without anything; triangle of the plant; cosine between the surface and the ray."""
+    view, row, column = wp.tid()
+    hit = first_hit(scene, views, view, pixel_direction(pinhole, row, column), NEAR, farthest)
+    depth = wp.float32(0.0)
+    face = NO_FACE
+    if hit.kind == LINK:
+        depth = hit.distance
+        face = FACE_OF_ROBOT
+    elif hit.kind == PLANT:
+        depth = hit.distance
+        face = hit.face
+    depths[view, row, column] = depth
+    faces[view, row, column] = face
+    facings[view, row, column] = hit.facing

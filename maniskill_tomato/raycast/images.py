@@ -11,6 +11,8 @@ from torch import Tensor
 BACKGROUND_DEPTH: Final = 4.0
 """Depth of a pixel of `CastImages` that shows neither plant nor robot, in [m]: a greenhouse always has a wall."""
 
+NOTHING_LABEL: Final = 0
+"""Label of the background in a `Picture`."""
 ROBOT_LABEL: Final = 1
 """Label of the robot in a `Picture`."""
 FIRST_ORGAN_LABEL: Final = 2
@@ -46,6 +48,6 @@ class Picture:
     depth: NDArray[np.float32]
     """Along the optical axis, in [m], 0 where there is nothing. Shape (H, W)."""
     labels: NDArray[np.int32]
-    """0 nothing, `ROBOT_LABEL`, or `FIRST_ORGAN_LABEL` plus the index in `Plant.organs`. Shape (H, W)."""
+    """`NOTHING_LABEL`, `ROBOT_LABEL`, or `FIRST_ORGAN_LABEL` plus the index in `Plant.organs`. Shape (H, W)."""
     facing: NDArray[np.float32]
     """Cosine of the angle between ray and surface, 1 where one looks straight at it. Shape (H, W)."""

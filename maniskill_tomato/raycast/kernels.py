@@ -3,11 +3,11 @@
 # pyright: reportCallIssue=false, reportGeneralTypeIssues=false, reportIndexIssue=false
 # pyright: reportOperatorIssue=false, reportReturnType=false
 # Warp's stubs describe calls from outside, not what stands inside a kernel.
-"""Warp kernels that count which part of a fruit's silhouette a camera sees.
+"""What a ray meets: the Warp structs of a scene and its views, and the functions that all ray-casting kernels share.
 
-Rays live in the plant frame and have a unit component along the optical axis, so a ray parameter is a depth
-in metres. A point of the image plane is named by its tangents (x / z, y / z) in the optical frame: z forward,
-x right, y down.
+A ray leaves a camera along a direction given in the optical frame: z forward, x right, y down. Its parameter counts
+lengths of that direction, so it is a distance for a unit direction and a depth for one with a unit z component, both in
+[m]. Where the ray meets something is worked out in the frame of the plant or the link.
 """
 
 import warp as wp
@@ -18,33 +18,95 @@ wp.set_module_options({"enable_backward": False})
 
 NEAR = wp.constant(CAMERA_NEAR)
 """Depth in [m] from which on something is seen, as in the rendered images."""
-FAR = wp.constant(100.0)
-"""Depth in [m] beyond which a target is not looked for."""
 SURFACE_GAP = wp.constant(2.0e-5)
-"""What lies less than this in front of the target's surface, in [m], is taken for the target itself."""
+"""What lies less than this in front of a fruit's surface, in [m], is taken for the fruit itself."""
 TANGENT_LIMIT = wp.constant(4.0)
 """Silhouettes are cut at this tangent (76 degrees) off the optical axis, far outside any image."""
 
-HIDDEN_BY_EDGE = wp.constant(0)
-HIDDEN_BY_PLANT = wp.constant(1)
-HIDDEN_BY_FRUIT = wp.constant(2)
-HIDDEN_BY_ROBOT = wp.constant(3)
-VISIBLE = wp.constant(4)
-OUTCOMES = wp.constant(5)
+NOTHING = wp.constant(0)
+PLANT = wp.constant(1)
+LINK = wp.constant(2)
 
-RESULTS = 8
-"""Rows of the results: visible fraction, visible and total pixels, any fruit seen, four hidden fractions."""
+
+@wp.struct
+class Scene:
+    """The plants of N environments with at most F fruits, and the L links that have a mesh."""
+
+    plant_meshes: wp.array[wp.uint64]
+    """All triangles of each plant. Shape (N,)."""
+    fruit_counts: wp.array[wp.int32]
+    """Number of fruits of each plant. Shape (N,)."""
+    fruit_meshes: wp.array2d[wp.uint64]
+    """Each fruit on its own. Shape (N, F)."""
+    fruit_spheres: wp.array2d[wp.vec4]
+    """Centre in the plant frame and radius, in [m]. Shape (N, F)."""
+    fruit_is_ripe: wp.array2d[wp.int32]
+    """Also 0 where a plant has fewer fruits. Shape (N, F)."""
+    link_meshes: wp.array[wp.uint64]
+    """Shape (L,)."""
+    link_indices: wp.array[wp.int32]
+    """Which of the given link poses belongs to the mesh. Shape (L,)."""
+    link_lows: wp.array[wp.vec3]
+    """Lower corner of the mesh in the link frame, in [m]. Shape (L,)."""
+    link_highs: wp.array[wp.vec3]
+    """Upper corner of the mesh in the link frame, in [m]. Shape (L,)."""
+
+
+@wp.struct
+class Views:
+    """B views: what is asked, and below what `prepare` works out from it."""
+
+    environments: wp.array[wp.int32]
+    """Which environment's plant is looked at. Shape (B,)."""
+    targets: wp.array[wp.int32]
+    """Index of the target among its fruits. Shape (B,)."""
+    camera_poses: wp.array[wp.mat44]
+    """Optical frame to world. Shape (B,)."""
+    plant_poses: wp.array[wp.mat44]
+    """Plant frame to world. Shape (B,)."""
+    link_poses: wp.array2d[wp.mat44]
+    """Link frames to world. Shape (B, 9)."""
+
+    plant_rotations: wp.array[wp.mat33]
+    """Optical frame to plant frame. Shape (B,)."""
+    plant_positions: wp.array[wp.vec3]
+    """Camera in the plant frame, in [m]. Shape (B,)."""
+    link_rotations: wp.array2d[wp.mat33]
+    """Optical frame to link frame. Shape (B, L)."""
+    link_positions: wp.array2d[wp.vec3]
+    """Camera in the link frame, in [m]. Shape (B, L)."""
+    links_in_front: wp.array[wp.int32]
+    """Bit k is set if mesh k reaches beyond the near plane. Shape (B,)."""
+    links_before_target: wp.array[wp.int32]
+    """Bit k is set if mesh k can hide the target. Shape (B,)."""
+    rectangles: wp.array[wp.vec4]
+    """Left, top, right, bottom of the target in tangents; empty without a silhouette. Shape (B,)."""
 
 
 @wp.struct
 class Camera:
-    """An undistorted pinhole camera by what its image covers."""
+    """An undistorted pinhole camera by what its image covers, in tangents (x / z, y / z)."""
 
     left: wp.float32
     top: wp.float32
     right: wp.float32
     bottom: wp.float32
     square_pixels: wp.float32
+    """Pixels on a unit square of the image plane at depth 1."""
+
+
+@wp.struct
+class Hit:
+    """The first thing on a ray."""
+
+    kind: wp.int32
+    """NOTHING, PLANT or LINK."""
+    distance: wp.float32
+    """Parameter of the ray there; where the search ended if there is nothing."""
+    face: wp.int32
+    """Which triangle of the plant."""
+    facing: wp.float32
+    """Cosine of the angle between ray and surface, 1 where one looks straight at it."""
 
 
 @wp.func
@@ -55,6 +117,46 @@ def rotation(m: wp.mat44) -> wp.mat33:
 @wp.func
 def translation(m: wp.mat44) -> wp.vec3:
     return wp.vec3(m[0, 3], m[1, 3], m[2, 3])
+
+
+@wp.func
+def segment_meets_box(start: wp.vec3, end: wp.vec3, low: wp.vec3, high: wp.vec3) -> bool:
+    enter = wp.float32(0.0)
+    leave = wp.float32(1.0)
+    for axis in range(3):
+        step = end[axis] - start[axis]
+        if wp.abs(step) < 1.0e-9:
+            if start[axis] < low[axis] or start[axis] > high[axis]:
+                return False
+        else:
+            a = (low[axis] - start[axis]) / step
+            b = (high[axis] - start[axis]) / step
+            enter = wp.max(enter, wp.min(a, b))
+            leave = wp.min(leave, wp.max(a, b))
+    return enter <= leave
+
+
+@wp.func
+def stands_in_front(turn: wp.mat33, position: wp.vec3, low: wp.vec3, high: wp.vec3) -> bool:
+    """Whether any corner of a box lies beyond the near plane of a camera, given its pose in the box's frame."""
+    forward = wp.vec3(turn[0, 2], turn[1, 2], turn[2, 2])
+    depth = -wp.dot(forward, position)
+    for axis in range(3):
+        depth += wp.max(forward[axis] * low[axis], forward[axis] * high[axis])
+    return depth > NEAR
+
+
+@wp.func
+def has_target(scene: Scene, views: Views, view: int) -> bool:
+    target = views.targets[view]
+    return target >= 0 and target < scene.fruit_counts[views.environments[view]]
+
+
+@wp.func
+def fruit_centre(sphere: wp.vec4, views: Views, view: int) -> wp.vec3:
+    """Centre of a fruit in the optical frame, in [m]."""
+    offset = wp.vec3(sphere[0], sphere[1], sphere[2]) - views.plant_positions[view]
+    return wp.transpose(views.plant_rotations[view]) * offset
 
 
 @wp.func
@@ -90,249 +192,131 @@ def bounding_rectangle(centre: wp.vec3, radius: float) -> wp.vec4:
 
 
 @wp.func
-def segment_meets_box(start: wp.vec3, end: wp.vec3, low: wp.vec3, high: wp.vec3) -> bool:
-    enter = wp.float32(0.0)
-    leave = wp.float32(1.0)
-    for axis in range(3):
-        step = end[axis] - start[axis]
-        if wp.abs(step) < 1.0e-9:
-            if start[axis] < low[axis] or start[axis] > high[axis]:
-                return False
-        else:
-            a = (low[axis] - start[axis]) / step
-            b = (high[axis] - start[axis]) / step
-            enter = wp.max(enter, wp.min(a, b))
-            leave = wp.min(leave, wp.max(a, b))
-    return enter <= leave
-
-
-@wp.struct
-class Scene:
-    """The plants and links of B environments with at most F fruits and L links with a mesh."""
-
-    plant_meshes: wp.array[wp.uint64]
-    """All triangles of each plant, those of fruits last. Shape (B,)."""
-    first_fruit_faces: wp.array[wp.int32]
-    """Index of the first triangle that belongs to a fruit. Shape (B,)."""
-    fruit_counts: wp.array[wp.int32]
-    """Number of fruits of each plant. Shape (B,)."""
-    fruit_meshes: wp.array2d[wp.uint64]
-    """Each fruit on its own. Shape (B, F)."""
-    fruit_spheres: wp.array2d[wp.vec4]
-    """Centre in the plant frame and radius, in [m]. Shape (B, F)."""
-    fruit_is_ripe: wp.array2d[wp.int32]
-    """Also 0 where a plant has fewer fruits. Shape (B, F)."""
-    link_meshes: wp.array[wp.uint64]
-    """Shape (L,)."""
-    link_indices: wp.array[wp.int32]
-    """Which of the given link poses belongs to the mesh. Shape (L,)."""
-    link_lows: wp.array[wp.vec3]
-    """Lower corner of the mesh in the link frame, in [m]. Shape (L,)."""
-    link_highs: wp.array[wp.vec3]
-    """Upper corner of the mesh in the link frame, in [m]. Shape (L,)."""
-
-
-@wp.struct
-class View:
-    """What is worked out once per environment and call."""
-
-    plant_rotations: wp.array[wp.mat33]
-    """Optical frame to plant frame. Shape (B,)."""
-    plant_positions: wp.array[wp.vec3]
-    """Camera in the plant frame, in [m]. Shape (B,)."""
-    rectangles: wp.array[wp.vec4]
-    """Left, top, right, bottom of the target in tangents; empty without a silhouette. Shape (B,)."""
-    link_rotations: wp.array2d[wp.mat33]
-    """Optical frame to link frame. Shape (B, L)."""
-    link_positions: wp.array2d[wp.vec3]
-    """Camera in the link frame, in [m]. Shape (B, L)."""
-    links_in_the_way: wp.array[wp.int32]
-    """Bit k is set if mesh k can hide the target. Shape (B,)."""
-    counters: wp.array2d[wp.int32]
-    """Rays by what they met. Shape (B, 5)."""
-    any_seen: wp.array[wp.int32]
-    """Whether another ripe fruit is seen. Shape (B,)."""
-
-
-@wp.func
-def links_between(scene: Scene, view: View, env: int, centre: wp.vec3, radius: float) -> int:
+def links_between(scene: Scene, views: Views, view: int, centre: wp.vec3, radius: float) -> int:
     """The links that a sphere, given in the optical frame, can be hidden by: one bit each."""
     mask = wp.int32(0)
     margin = wp.vec3(radius, radius, radius)
     for link in range(scene.link_lows.shape[0]):
-        start = view.link_positions[env, link]
-        end = start + view.link_rotations[env, link] * centre
+        start = views.link_positions[view, link]
+        end = start + views.link_rotations[view, link] * centre
         if segment_meets_box(start, end, scene.link_lows[link] - margin, scene.link_highs[link] + margin):
             mask = mask | (1 << link)
     return mask
 
 
+@wp.kernel
+def prepare(scene: Scene, views: Views):
+    """Relative poses, the links to be considered and the target's rectangle of one view."""
+    view = wp.tid()
+    camera = rotation(views.camera_poses[view])
+    position = translation(views.camera_poses[view])
+    plant_pose = views.plant_poses[view]
+    to_plant = wp.transpose(rotation(plant_pose))
+    views.plant_rotations[view] = to_plant * camera
+    views.plant_positions[view] = to_plant * (position - translation(plant_pose))
+    in_front = wp.int32(0)
+    for link in range(scene.link_lows.shape[0]):
+        pose = views.link_poses[view, scene.link_indices[link]]
+        to_link = wp.transpose(rotation(pose))
+        turn = to_link * camera
+        place = to_link * (position - translation(pose))
+        views.link_rotations[view, link] = turn
+        views.link_positions[view, link] = place
+        if stands_in_front(turn, place, scene.link_lows[link], scene.link_highs[link]):
+            in_front = in_front | (1 << link)
+    views.links_in_front[view] = in_front
+    views.links_before_target[view] = 0
+    views.rectangles[view] = wp.vec4(0.0, 0.0, 0.0, 0.0)
+    if has_target(scene, views, view):
+        sphere = scene.fruit_spheres[views.environments[view], views.targets[view]]
+        centre = fruit_centre(sphere, views, view)
+        views.links_before_target[view] = links_between(scene, views, view, centre, sphere[3])
+        views.rectangles[view] = bounding_rectangle(centre, sphere[3])
+
+
 @wp.func
-def hidden_by_robot(scene: Scene, view: View, env: int, links: int, tangents: wp.vec3, depth: float) -> bool:
-    """Whether one of the links stands on the ray between the near plane and a depth."""
+def first_hit(
+    scene: Scene, views: Views, view: int, direction_c: wp.vec3, start: float, farthest: float
+) -> Hit:
+    """What a ray meets first, plant or robot, between two values of its parameter."""
+    hit = Hit()
+    hit.kind = NOTHING
+    hit.distance = farthest
+    direction = views.plant_rotations[view] * direction_c
+    origin = views.plant_positions[view] + start * direction
+    mesh = scene.plant_meshes[views.environments[view]]
+    met = wp.mesh_query_ray(mesh, origin, direction, farthest - start)
+    if met.result:
+        hit.kind = PLANT
+        hit.distance = met.t + start
+        hit.face = met.face
+        hit.facing = wp.abs(wp.dot(wp.normalize(met.normal), wp.normalize(direction)))
+    remaining = views.links_in_front[view]
+    link = wp.int32(0)
+    while remaining != 0:
+        if remaining & 1:
+            ray = views.link_rotations[view, link] * direction_c
+            first = views.link_positions[view, link] + start * ray
+            last = views.link_positions[view, link] + hit.distance * ray
+            if segment_meets_box(first, last, scene.link_lows[link], scene.link_highs[link]):
+                touched = wp.mesh_query_ray(scene.link_meshes[link], first, ray, hit.distance - start)
+                if touched.result:
+                    hit.kind = LINK
+                    hit.distance = touched.t + start
+                    hit.facing = wp.abs(wp.dot(wp.normalize(touched.normal), wp.normalize(ray)))
+        remaining = remaining >> 1
+        link += 1
+    return hit
+
+
+@wp.func
+def is_hidden(
+    scene: Scene, views: Views, view: int, links: int, direction_c: wp.vec3, start: float, length: float
+) -> bool:
+    """Whether anything stands on a piece of a ray: the plant, or one of the links of a mask."""
     remaining = links
     link = wp.int32(0)
     while remaining != 0:
         if remaining & 1:
-            direction = view.link_rotations[env, link] * tangents
-            start = view.link_positions[env, link] + NEAR * direction
-            if wp.mesh_query_ray_anyhit(scene.link_meshes[link], start, direction, depth - NEAR):
+            ray = views.link_rotations[view, link] * direction_c
+            first = views.link_positions[view, link] + start * ray
+            if wp.mesh_query_ray_anyhit(scene.link_meshes[link], first, ray, length):
                 return True
         remaining = remaining >> 1
         link += 1
-    return False
+    direction = views.plant_rotations[view] * direction_c
+    origin = views.plant_positions[view] + start * direction
+    mesh = scene.plant_meshes[views.environments[view]]
+    return wp.mesh_query_ray_anyhit(mesh, origin, direction, length)
 
 
-@wp.kernel
-def prepare(
-    scene: Scene,
-    view: View,
-    camera_poses: wp.array[wp.mat44],
-    plant_poses: wp.array[wp.mat44],
-    link_poses: wp.array2d[wp.mat44],
-    targets: wp.array[wp.int32],
-):
-    """Relative poses, the target's rectangle and the links that can stand in the way, for one environment."""
-    env = wp.tid()
-    for k in range(OUTCOMES):
-        view.counters[env, k] = 0
-    view.any_seen[env] = 0
-
-    camera_rotation = rotation(camera_poses[env])
-    camera_position = translation(camera_poses[env])
-    to_plant = wp.transpose(rotation(plant_poses[env]))
-    view.plant_rotations[env] = to_plant * camera_rotation
-    view.plant_positions[env] = to_plant * (camera_position - translation(plant_poses[env]))
-    for link in range(scene.link_lows.shape[0]):
-        pose = link_poses[env, scene.link_indices[link]]
-        to_link = wp.transpose(rotation(pose))
-        view.link_rotations[env, link] = to_link * camera_rotation
-        view.link_positions[env, link] = to_link * (camera_position - translation(pose))
-
-    if targets[env] < 0 or targets[env] >= scene.fruit_counts[env]:
-        view.rectangles[env] = wp.vec4(0.0, 0.0, 0.0, 0.0)
-        return
-    sphere = scene.fruit_spheres[env, targets[env]]
-    offset = wp.vec3(sphere[0], sphere[1], sphere[2]) - view.plant_positions[env]
-    centre = wp.transpose(view.plant_rotations[env]) * offset
-    view.rectangles[env] = bounding_rectangle(centre, sphere[3])
-    view.links_in_the_way[env] = links_between(scene, view, env, centre, sphere[3])
+@wp.func
+def fruit_distance(
+    scene: Scene, views: Views, view: int, fruit: int, direction_c: wp.vec3, start: float, farthest: float
+) -> float:
+    """Parameter at which a ray enters a fruit, whatever stands before it; negative if it passes the fruit by."""
+    direction = views.plant_rotations[view] * direction_c
+    origin = views.plant_positions[view] + start * direction
+    mesh = scene.fruit_meshes[views.environments[view], fruit]
+    met = wp.mesh_query_ray(mesh, origin, direction, farthest)
+    if met.result:
+        return met.t + start
+    return -1.0
 
 
-@wp.kernel
-def trace_target(
-    scene: Scene,
-    view: View,
-    camera: Camera,
-    pattern: wp.array[wp.vec2],
-    targets: wp.array[wp.int32],
-):
-    """One ray through the target's rectangle: what it meets, if it belongs to the target's silhouette."""
-    env, ray = wp.tid()
-    box = view.rectangles[env]
-    if box[2] <= box[0] or box[3] <= box[1]:
-        return
-    x = box[0] + pattern[ray][0] * (box[2] - box[0])
-    y = box[1] + pattern[ray][1] * (box[3] - box[1])
-    tangents = wp.vec3(x, y, 1.0)
-    direction = view.plant_rotations[env] * tangents
-    start = view.plant_positions[env] + NEAR * direction
-    target = wp.mesh_query_ray(scene.fruit_meshes[env, targets[env]], start, direction, FAR)
-    if not target.result:
-        return
-    outcome = VISIBLE
-    if x < camera.left or x > camera.right or y < camera.top or y > camera.bottom:
-        outcome = HIDDEN_BY_EDGE
-    elif hidden_by_robot(scene, view, env, view.links_in_the_way[env], tangents, target.t + NEAR):
-        outcome = HIDDEN_BY_ROBOT
-    else:
-        nearer = wp.mesh_query_ray(scene.plant_meshes[env], start, direction, target.t - SURFACE_GAP)
-        if nearer.result:
-            outcome = HIDDEN_BY_PLANT
-            if nearer.face >= scene.first_fruit_faces[env]:
-                outcome = HIDDEN_BY_FRUIT
-    wp.atomic_add(view.counters, env, outcome, 1)
-
-
-@wp.kernel
-def trace_others(
-    scene: Scene,
-    view: View,
-    camera: Camera,
-    pattern: wp.array[wp.vec2],
-    targets: wp.array[wp.int32],
-):
-    """Whether another ripe fruit is seen, asked only where nothing of the target is."""
-    env, fruit = wp.tid()
-    if view.counters[env, VISIBLE] > 0 or scene.fruit_is_ripe[env, fruit] == 0 or fruit == targets[env]:
-        return
-    turn = view.plant_rotations[env]
-    position = view.plant_positions[env]
-    sphere = scene.fruit_spheres[env, fruit]
-    centre = wp.transpose(turn) * (wp.vec3(sphere[0], sphere[1], sphere[2]) - position)
-    box = bounding_rectangle(centre, sphere[3])
-    left = wp.max(box[0], camera.left)
-    top = wp.max(box[1], camera.top)
-    right = wp.min(box[2], camera.right)
-    bottom = wp.min(box[3], camera.bottom)
-    if left >= right or top >= bottom:
-        return
-    links = links_between(scene, view, env, centre, sphere[3])
-    for ray in range(pattern.shape[0]):
-        if view.any_seen[env] != 0:
-            return
-        x = left + pattern[ray][0] * (right - left)
-        y = top + pattern[ray][1] * (bottom - top)
-        tangents = wp.vec3(x, y, 1.0)
-        direction = turn * tangents
-        start = position + NEAR * direction
-        hit = wp.mesh_query_ray(scene.fruit_meshes[env, fruit], start, direction, FAR)
-        if hit.result:
-            gap = hit.t - SURFACE_GAP
-            if not wp.mesh_query_ray_anyhit(scene.plant_meshes[env], start, direction, gap):
-                if not hidden_by_robot(scene, view, env, links, tangents, hit.t + NEAR):
-                    view.any_seen[env] = 1
-
-
-@wp.kernel
-def summarise(
-    scene: Scene,
-    view: View,
-    camera: Camera,
-    rays: float,
-    targets: wp.array[wp.int32],
-    results: wp.array2d[wp.float32],
-):
-    """Rays to fractions and pixels, for one environment; the rows of `results` are those of `RESULTS`."""
-    env = wp.tid()
-    if targets[env] < 0 or targets[env] >= scene.fruit_counts[env]:
-        for k in range(results.shape[0]):
-            results[k, env] = wp.nan
-        return
-    seen = float(view.counters[env, VISIBLE])
-    total = seen
-    for k in range(VISIBLE):
-        total += float(view.counters[env, k])
-    if total > 0.0:
-        box = view.rectangles[env]
-        pixels = (box[2] - box[0]) * (box[3] - box[1]) * camera.square_pixels / rays
-        results[0, env] = seen / total
-        results[1, env] = seen * pixels
-        results[2, env] = total * pixels
-        for k in range(VISIBLE):
-            results[4 + k, env] = float(view.counters[env, k]) / total
-    else:
-        # No silhouette in front of the camera: nothing is seen, and the size is the one it had if looked at.
-        sphere = scene.fruit_spheres[env, targets[env]]
-        offset = wp.vec3(sphere[0], sphere[1], sphere[2]) - view.plant_positions[env]
-        squared = sphere[3] * sphere[3]
-        beyond = wp.max(wp.dot(offset, offset) - squared, 0.05 * squared)
-        results[0, env] = 0.0
-        results[1, env] = 0.0
-        results[2, env] = 3.14159265 * squared / beyond * camera.square_pixels
-        for k in range(VISIBLE):
-            results[4 + k, env] = 0.0
-        results[4, env] = 1.0
-    results[3, env] = 0.0
-    if seen > 0.0 or view.any_seen[env] != 0:
-        results[3, env] = 1.0
+@wp.func
+def is_target(
+    scene: Scene, views: Views, view: int, direction_c: wp.vec3, start: float, distance: float
+) -> bool:
+    """Whether what a ray meets at a value of its parameter is the target."""
+    if not has_target(scene, views, view):
+        return False
+    env = views.environments[view]
+    sphere = scene.fruit_spheres[env, views.targets[view]]
+    direction = views.plant_rotations[view] * direction_c
+    origin = views.plant_positions[view] + start * direction
+    offset = wp.vec3(sphere[0], sphere[1], sphere[2]) - origin
+    if wp.length(wp.cross(offset, wp.normalize(direction))) > sphere[3]:
+        return False
+    mesh = scene.fruit_meshes[env, views.targets[view]]
+    return wp.mesh_query_ray_anyhit(mesh, origin, direction, distance - start + SURFACE_GAP)

@@ -7,20 +7,27 @@ scene.replace_plant(env_index, new_plant)
 """
 
 from collections.abc import Sequence
+from typing import Final
 
 import torch
 from torch import Tensor
 
+from maniskill_tomato.errors import InvalidInputError
 from maniskill_tomato.plants.organs import Plant
-from maniskill_tomato.raycast.cast_image import ImageCaster
-from maniskill_tomato.raycast.cast_views import CastViews
-from maniskill_tomato.raycast.caster import LinkMeshes, VisibilityCaster
-from maniskill_tomato.raycast.clearance import PlantClearance
 from maniskill_tomato.raycast.images import CastImages, Picture
-from maniskill_tomato.raycast.picture_caster import PictureCaster
-from maniskill_tomato.raycast.view_rays import ViewRayCaster, ViewRays
+from maniskill_tomato.raycast.ray_library import LinkMeshes, RayLibrary
+from maniskill_tomato.raycast.view_rays import ViewRays
 from maniskill_tomato.raycast.visibility import Visibility
+from maniskill_tomato.raycast.warp_scene import WarpScene
 from maniskill_tomato.robot.d435 import CameraIntrinsics
+from maniskill_tomato.robot.iiwa14 import LINK_NAMES, NUM_JOINTS
+from maniskill_tomato.robot.kinematics import link_transforms
+
+CLEARANCE_RANGE: Final = 0.1
+"""Largest clearance that is told apart, in [m]; what is farther away counts as this."""
+
+PATH_SAMPLES: Final = 8
+"""Joint positions looked at along a move, its end among them: 15 mm apart on a move of 0.12 m."""
 
 
 class RayScene:
@@ -49,29 +56,36 @@ class RayScene:
         Raises:
             InvalidInputError: No plants, a plant without fruits, an unknown link, or a number out of range.
         """
+        if len(plants) == 0:
+            raise InvalidInputError("plants must name the plant of at least one environment, got none")
+        if rays_per_side < 2:
+            raise InvalidInputError(f"rays_per_side must be at least 2, got {rays_per_side}")
+        if cached_plants < 1:
+            raise InvalidInputError(f"cached_plants must be at least 1, got {cached_plants}")
+        for name in robot_meshes or {}:
+            if name not in LINK_NAMES:
+                raise InvalidInputError.choice("a key of robot_meshes", name, LINK_NAMES)
         self._intrinsics = intrinsics
-        self._caster = VisibilityCaster(
-            plants=plants,
-            intrinsics=intrinsics,
-            robot_meshes=robot_meshes,
-            rays_per_side=rays_per_side,
-            cached_plants=cached_plants,
-            device=device,
+        self._device = torch.device(device)
+        self._plants = list(plants)
+        self._rays: RayLibrary = WarpScene(
+            plants, intrinsics, robot_meshes or {}, rays_per_side, cached_plants, self._device
         )
-        self._views = CastViews(self._caster, rays_per_side)
-        self._view_rays = ViewRayCaster(self._caster)
-        self._clearance = PlantClearance(self._caster)
-        self._images: dict[CameraIntrinsics, ImageCaster] = {}
+        n = len(plants)
+        self._poses_shape, self._row_shape = (n, 4, 4), (n,)
+        self._links_shape = (n, len(LINK_NAMES), 4, 4)
+        shares = torch.arange(1, PATH_SAMPLES + 1, dtype=torch.float32, device=self._device) / PATH_SAMPLES
+        self._path_shares = shares[None, :, None]
 
     @property
     def num_envs(self) -> int:
         """Number of environments N."""
-        return self._caster.num_envs
+        return len(self._plants)
 
     @property
     def device(self) -> torch.device:
         """Where the rays are cast."""
-        return self._caster.device
+        return self._device
 
     @property
     def intrinsics(self) -> CameraIntrinsics:
@@ -80,7 +94,7 @@ class RayScene:
 
     def plant(self, env_index: int) -> Plant:
         """The plant that an environment shows."""
-        return self._caster.plant(env_index)
+        return self._plants[env_index]
 
     def replace_plant(self, env_index: int, plant: Plant) -> None:
         """Shows another plant in one environment.
@@ -89,7 +103,10 @@ class RayScene:
             env_index: Which environment, from 0 to N - 1.
             plant: A plant object used lately is found again, a new one costs the time to sort its triangles.
         """
-        self._caster.replace_plant(env_index, plant)
+        if not 0 <= env_index < self.num_envs:
+            raise InvalidInputError(f"env_index must be from 0 to {self.num_envs - 1}, got {env_index}")
+        self._rays.show(env_index, plant)
+        self._plants[env_index] = plant
 
     def visibility(
         self, T_w_camera: Tensor, target_fruit: Tensor, T_w_plant: Tensor, T_w_links: Tensor | None = None
@@ -106,7 +123,10 @@ class RayScene:
         Raises:
             InvalidInputError: A tensor has the wrong shape or a target does not exist.
         """
-        return self._caster.cast(T_w_camera, target_fruit, T_w_plant, T_w_links)
+        self._check_views(T_w_camera, target_fruit, T_w_plant, T_w_links)
+        if self._device.type == "cpu":
+            self._check_targets(target_fruit)
+        return self._rays.visibility(T_w_camera, target_fruit, T_w_plant, T_w_links)
 
     def visible_fraction_from(
         self,
@@ -131,7 +151,17 @@ class RayScene:
         Raises:
             InvalidInputError: A shape does not fit, or the fruit or the environment does not exist.
         """
-        return self._views.visible_fraction(T_w_camera, target_fruit, T_w_plant, T_w_links, env_index)
+        count = T_w_camera.shape[0] if T_w_camera.dim() == 3 else 0
+        _check_shape("T_w_camera", T_w_camera, (count, 4, 4))
+        _check_shape("T_w_plant", T_w_plant, (4, 4))
+        if T_w_links is not None:
+            _check_shape("T_w_links", T_w_links, (count, *self._links_shape[1:]))
+        if not 0 <= env_index < self.num_envs:
+            raise InvalidInputError(f"env_index must be from 0 to {self.num_envs - 1}, got {env_index}")
+        fruits = len(self._plants[env_index].fruits)
+        if not 0 <= target_fruit < fruits:
+            raise InvalidInputError(f"target_fruit must be from 0 to {fruits - 1}, got {target_fruit}")
+        return self._rays.visible_fraction_from(T_w_camera, target_fruit, T_w_plant, T_w_links, env_index)
 
     def view_rays(
         self,
@@ -155,7 +185,9 @@ class RayScene:
         Raises:
             InvalidInputError: A tensor has the wrong shape.
         """
-        return self._view_rays.cast(T_w_camera, target_fruit, target_position, T_w_plant, T_w_links)
+        self._check_views(T_w_camera, target_fruit, T_w_plant, T_w_links)
+        _check_shape("target_position", target_position, (self.num_envs, 3))
+        return self._rays.view_rays(T_w_camera, target_fruit, target_position, T_w_plant, T_w_links)
 
     def image(
         self,
@@ -178,10 +210,8 @@ class RayScene:
         Raises:
             InvalidInputError: A tensor has the wrong shape.
         """
-        caster = self._images.get(intrinsics)
-        if caster is None:
-            caster = self._images[intrinsics] = ImageCaster(self._caster, intrinsics)
-        return caster.cast(T_w_camera, target_fruit, T_w_plant, T_w_links)
+        self._check_views(T_w_camera, target_fruit, T_w_plant, T_w_links)
+        return self._rays.image(intrinsics, T_w_camera, target_fruit, T_w_plant, T_w_links)
 
     def picture(
         self,
@@ -197,8 +227,15 @@ class RayScene:
             T_w_camera: Pose of the optical frame, translation in [m]. Shape (4, 4).
             T_w_plant: Pose of the plant. Shape (4, 4).
             T_w_links: Poses of `iiwa14.LINK_NAMES`; None for no robot. Shape (9, 4, 4).
+
+        Raises:
+            InvalidInputError: A tensor has the wrong shape.
         """
-        return PictureCaster(self._caster, intrinsics).draw(T_w_camera, T_w_plant, T_w_links)
+        _check_shape("T_w_camera", T_w_camera, (4, 4))
+        _check_shape("T_w_plant", T_w_plant, (4, 4))
+        if T_w_links is not None:
+            _check_shape("T_w_links", T_w_links, self._links_shape[1:])
+        return self._rays.picture(intrinsics, T_w_camera, T_w_plant, T_w_links)
 
     def clearance_along(
         self,
@@ -225,8 +262,40 @@ class RayScene:
         Raises:
             InvalidInputError: A tensor has the wrong shape.
         """
-        return self._clearance.along(start_qpos, end_qpos, T_w_plant, env_idx)
+        paths = self.num_envs if env_idx is None else len(env_idx)
+        _check_shape("start_qpos", start_qpos, (paths, NUM_JOINTS))
+        _check_shape("end_qpos", end_qpos, (paths, NUM_JOINTS))
+        _check_shape("T_w_plant", T_w_plant, (paths, 4, 4))
+        if paths == 0:
+            return start_qpos.new_zeros(0)
+        path = torch.lerp(start_qpos[:, None], end_qpos[:, None], self._path_shares)
+        T_w_links = link_transforms(path.reshape(-1, NUM_JOINTS)).view(
+            paths, PATH_SAMPLES, *self._links_shape[1:]
+        )
+        return self._rays.clearance(T_w_links, T_w_plant, env_idx, CLEARANCE_RANGE)
 
     def clearance_at(self, qpos: Tensor, T_w_plant: Tensor, env_idx: Tensor | None = None) -> Tensor:
         """The clearance where the arm stands; as `clearance_along` a path that goes nowhere. Shape (P,)."""
-        return self._clearance.at(qpos, T_w_plant, env_idx)
+        return self.clearance_along(qpos, qpos, T_w_plant, env_idx)
+
+    def _check_views(
+        self, T_w_camera: Tensor, target_fruit: Tensor, T_w_plant: Tensor, T_w_links: Tensor | None
+    ) -> None:
+        """Checks the arguments that describe one view in each environment."""
+        _check_shape("T_w_camera", T_w_camera, self._poses_shape)
+        _check_shape("target_fruit", target_fruit, self._row_shape)
+        _check_shape("T_w_plant", T_w_plant, self._poses_shape)
+        if T_w_links is not None:
+            _check_shape("T_w_links", T_w_links, self._links_shape)
+
+    def _check_targets(self, target_fruit: Tensor) -> None:
+        for env, (target, plant) in enumerate(zip(target_fruit.tolist(), self._plants, strict=True)):
+            if not 0 <= target < len(plant.fruits):
+                raise InvalidInputError(
+                    f"target_fruit[{env}] must be from 0 to {len(plant.fruits) - 1} for its plant, got {target}"
+                )
+
+
+def _check_shape(name: str, tensor: Tensor, shape: tuple[int, ...]) -> None:
+    if tensor.shape != shape:
+        raise InvalidInputError(f"{name} must have shape {shape}, got {tuple(tensor.shape)}")

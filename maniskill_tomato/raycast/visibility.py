@@ -18,7 +18,7 @@ class Visibility:
     """What the camera of each environment sees of its target."""
 
     rows: Tensor
-    """The answers below, one row each, float32. Shape (8, B)."""
+    """The answers below, one row each, float32. Shape (4, B)."""
 
     @property
     def visible_fraction(self) -> Tensor:
@@ -39,12 +39,3 @@ class Visibility:
     def any_visible(self) -> Tensor:
         """Whether the target or another ripe fruit of the plant is seen by any ray, bool. Shape (B,)."""
         return self.rows[3] > 0.5
-
-    @property
-    def occluders(self) -> Tensor:
-        """The hidden part of T by what hides it: image edge, leaf or stem, other fruit, robot. Shape (B, 4).
-
-        Fractions of T: each row and the visible fraction add up to 1. What lies outside the image counts for
-        the edge alone, what a link hides for the robot alone, the rest for the organ nearest to the camera.
-        """
-        return self.rows[4:8].T

@@ -23,8 +23,8 @@ from maniskill_tomato.errors import InvalidInputError
 from maniskill_tomato.robot import ik_neighbour, ik_select, ik_solve
 from maniskill_tomato.robot.iiwa14 import NUM_JOINTS
 from maniskill_tomato.robot.ik_chain import vec7d
-from maniskill_tomato.robot.kinematics import LARGEST_KEPT_BATCH, RecordedLaunch
-from maniskill_tomato.warp_runtime import start_warp
+from maniskill_tomato.robot.kinematics import LARGEST_KEPT_BATCH
+from maniskill_tomato.warp_runtime import RecordedLaunch, start_warp
 
 
 class Reach(IntEnum):
@@ -184,4 +184,4 @@ class _SolveLaunch:
             wp.from_torch(self.reach),
             wp.from_torch(self.reached, dtype=wp.mat44d),
         ]
-        self.run = RecordedLaunch(ik_solve.solve_kernel, batch, device, arguments)
+        self.run = RecordedLaunch(device, (ik_solve.solve_kernel, batch, arguments))

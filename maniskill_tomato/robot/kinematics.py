@@ -7,7 +7,6 @@ carry no gradient.
 """
 
 from functools import lru_cache
-from typing import Any
 
 import torch
 import warp as wp
@@ -15,37 +14,10 @@ import warp as wp
 from maniskill_tomato.errors import InvalidInputError
 from maniskill_tomato.robot.iiwa14 import LINK_NAMES, NUM_JOINTS
 from maniskill_tomato.robot.ik_chain import link_transforms_kernel, viewpoint_transform_kernel
-from maniskill_tomato.warp_runtime import start_warp
+from maniskill_tomato.warp_runtime import RecordedLaunch, start_warp
 
 LARGEST_KEPT_BATCH = 4096
 """Buffers of larger batches are not kept between calls."""
-
-
-class RecordedLaunch:
-    """A Warp kernel with its arguments, ready to run again and again at little cost."""
-
-    def __init__(
-        self, kernel: Any, threads: int | tuple[int, ...], device: torch.device, arguments: list[Any]
-    ) -> None:
-        """Records the launch without running it.
-
-        Args:
-            kernel: The Warp kernel.
-            threads: Number of kernel threads, along each dimension of the launch.
-            device: Where it runs.
-            arguments: Warp arrays, structs and numbers, in the order of the kernel's parameters.
-        """
-        self._device = device
-        self._command: Any = wp.launch(
-            kernel, threads, inputs=arguments, device=wp.device_from_torch(device), record_cmd=True
-        )
-
-    def __call__(self) -> None:
-        """Runs the kernel, on CUDA in torch's current stream."""
-        if self._device.type == "cuda":
-            self._command.launch(wp.stream_from_torch(torch.cuda.current_stream(self._device)))
-        else:
-            self._command.launch()
 
 
 class _LinkTransformsLaunch:
@@ -56,7 +28,7 @@ class _LinkTransformsLaunch:
         self.qpos = torch.zeros(batch, NUM_JOINTS, dtype=torch.float64, device=device)
         self.transforms = torch.zeros(batch, len(LINK_NAMES), 4, 4, dtype=torch.float64, device=device)
         arrays = [wp.from_torch(self.qpos), wp.from_torch(self.transforms, dtype=wp.mat44d)]
-        self.run = RecordedLaunch(link_transforms_kernel, batch, device, arrays)
+        self.run = RecordedLaunch(device, (link_transforms_kernel, batch, arrays))
 
 
 class _ViewpointTransformLaunch:
@@ -67,7 +39,7 @@ class _ViewpointTransformLaunch:
         self.viewpoints = torch.zeros(batch, 6, dtype=torch.float64, device=device)
         self.transforms = torch.zeros(batch, 4, 4, dtype=torch.float64, device=device)
         arrays = [wp.from_torch(self.viewpoints), wp.from_torch(self.transforms, dtype=wp.mat44d)]
-        self.run = RecordedLaunch(viewpoint_transform_kernel, batch, device, arrays)
+        self.run = RecordedLaunch(device, (viewpoint_transform_kernel, batch, arrays))
 
 
 _kept_viewpoint_transform_launch = lru_cache(maxsize=16)(_ViewpointTransformLaunch)

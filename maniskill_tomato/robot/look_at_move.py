@@ -24,12 +24,12 @@ from maniskill_tomato.robot import look_at_kernels
 from maniskill_tomato.robot.d435 import T_flange_camera_color_optical
 from maniskill_tomato.robot.iiwa14 import NUM_JOINTS
 from maniskill_tomato.robot.inverse_kinematics import InverseKinematics, Reach
-from maniskill_tomato.robot.kinematics import RecordedLaunch
 from maniskill_tomato.robot.look_at import (
     CAMERA_ROLLS,
     look_at_pose,
     look_frame,
 )
+from maniskill_tomato.warp_runtime import RecordedLaunch
 
 MAX_MOVE: Final = 0.12
 """Length of the move that an action of norm 1 asks for, in [m]."""
@@ -210,9 +210,8 @@ class _UprightLaunch:
         vectors: list[Any] = [wp.from_torch(tensor, dtype=wp.vec3d) for tensor in self._inputs]
         poses: list[Any] = [wp.from_torch(tensor, dtype=wp.mat44d) for tensor in self._poses]
         mount: Any = wp.mat44d(*T_camera_flange.ravel())
-        # The launch keeps addresses: what they point to must stay alive with it.
-        self._arguments = [*vectors, wp.float64(MAX_MOVE), wp.float64(MIN_DISTANCE), mount, *poses]
-        self._launch = RecordedLaunch(look_at_kernels.upright_move, batch, device, self._arguments)
+        arguments = [*vectors, wp.float64(MAX_MOVE), wp.float64(MIN_DISTANCE), mount, *poses]
+        self._launch = RecordedLaunch(device, (look_at_kernels.upright_move, batch, arguments))
 
     def run(self, *inputs: Tensor) -> tuple[Tensor, Tensor]:
         """Poses of the optical frame and the flange after a move from positions, targets and actions."""

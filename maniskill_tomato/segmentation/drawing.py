@@ -36,14 +36,24 @@ def draw_instances(image: Image, found: Instances, least_score: float = 0.0) -> 
     return drawn
 
 
-def contact_sheet(images: Sequence[Image], columns: int = 4, tile: int = 320) -> Image:
-    """Images side by side, each fitted into a square of `tile` [px]. Shape (rows * tile, columns * tile, 3)."""
+def contact_sheet(images: Sequence[Image], columns: int = 4, tile: tuple[int, int] = (320, 320)) -> Image:
+    """Images side by side, each fitted into a tile.
+
+    Args:
+        images: RGB images of any size.
+        columns: In a row.
+        tile: Width and height of a tile, in [px].
+
+    Returns:
+        RGB. Shape (rows * tile height, columns * tile width, 3).
+    """
+    width, height = tile
     rows = -(-len(images) // columns)
-    sheet = np.full((rows * tile, columns * tile, 3), 255, np.uint8)
+    sheet = np.full((rows * height, columns * width, 3), 255, np.uint8)
     for number, image in enumerate(images):
-        factor = tile / max(image.shape[:2])
+        factor = min(width / image.shape[1], height / image.shape[0])
         size = max(round(image.shape[1] * factor), 1), max(round(image.shape[0] * factor), 1)
         small = cv2.resize(image, size, interpolation=cv2.INTER_AREA if factor < 1 else cv2.INTER_LINEAR)
-        top, left = number // columns * tile, number % columns * tile
+        top, left = number // columns * height, number % columns * width
         sheet[top : top + size[1], left : left + size[0]] = small
     return sheet

@@ -11,7 +11,7 @@ from maniskill_tomato.sensing.view_lattice import ViewLattice
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Belief:
-    """What is known in B environments after a look: nothing that a robot with a wrist camera could not know."""
+    """What is known in B environments after a view: nothing that a robot with a wrist camera could not know."""
 
     observation: Tensor
     """`ViewpointObserver.observe`'s vector. Shape (B, D)."""

@@ -14,11 +14,11 @@ from torch import Tensor
 
 from maniskill_tomato.errors import InvalidInputError
 from maniskill_tomato.raycast.view_rays import RAYS_PER_SIDE, ViewRays
-from maniskill_tomato.robot.kinematics import RecordedLaunch
 from maniskill_tomato.sensing import observation_kernels as kernels
 from maniskill_tomato.sensing.belief import Belief
 from maniskill_tomato.sensing.occlusion_memory import OcclusionMemory
 from maniskill_tomato.sensing.view_lattice import FIRST_DISTANCE, ViewLattice
+from maniskill_tomato.warp_runtime import RecordedLaunch
 
 Part = Literal["viewpoint", "pose", "target", "visible_fraction", "time", "patch", "map", "near_map"]
 
@@ -167,7 +167,7 @@ class ViewpointObserver:
         moves_left: Tensor,
         mask: Tensor | None = None,
     ) -> Tensor:
-        """Takes one look into the memory and describes what is known. To be called once for every look.
+        """Takes one view into the memory and describes what is known. To be called once for every view.
 
         Args:
             viewpoint: Of the flange: x, y, z, in [m], roll, pitch, yaw, in [rad], base frame. Shape (B, 6).
@@ -271,15 +271,14 @@ class ViewpointObserver:
         layout.target_middle = wp.vec3(*WORKSPACE_MIDDLE)
         layout.target_scale = wp.vec3(*WORKSPACE_HALF_SIZE)
         threads = (b, 1 + PATCH_SIDE**2 + MAP_SIDE**2 + NEAR_MAP_SIDE**2)
-        # The launch keeps addresses: what they point to must stay alive with it.
-        self._arguments = [
+        arguments = [
             belief,
             self.memory.grid,
             self.memory.foliage,
             layout,
             wp.from_torch(self._observation),
         ]
-        self._launch = RecordedLaunch(kernels.observe, threads, device, self._arguments)
+        self._launch = RecordedLaunch(device, (kernels.observe, threads, arguments))
 
 
 def _length(part: Part) -> int:

@@ -16,9 +16,8 @@ from torch import Tensor
 
 from maniskill_tomato.errors import InvalidInputError
 from maniskill_tomato.raycast.view_rays import ViewRays
-from maniskill_tomato.robot.kinematics import RecordedLaunch
 from maniskill_tomato.sensing import memory_kernels
-from maniskill_tomato.warp_runtime import start_warp
+from maniskill_tomato.warp_runtime import RecordedLaunch, start_warp
 
 GRID_CELLS: Final = int(memory_kernels.CELLS)
 """Voxels along each edge of the grid."""
@@ -92,7 +91,8 @@ class OcclusionMemory:
         self.grid, self.foliage = grid, foliage
         """The same as the kernels see it."""
         self._estimate = RecordedLaunch(
-            memory_kernels.estimate, (num_envs, int(memory_kernels.BLOCKS)), self.device, [grid, foliage]
+            self.device,
+            (memory_kernels.estimate, (num_envs, int(memory_kernels.BLOCKS)), [grid, foliage]),
         )
         self._integrations: dict[int, _Integration] = {}
         self._predictions: dict[int, _Prediction] = {}
@@ -258,7 +258,7 @@ class _Integration:
         self._distances = torch.zeros(b, count, device=device)
         self._labels = torch.zeros(b, count, dtype=torch.int8, device=device)
         self._active = torch.ones(b, dtype=torch.int32, device=device)
-        self._arguments = [
+        arguments = [
             memory.grid,
             wp.from_torch(self._poses, dtype=wp.mat44),
             wp.from_torch(self._directions, dtype=wp.vec3),
@@ -266,7 +266,7 @@ class _Integration:
             wp.from_torch(self._labels),
             wp.from_torch(self._active),
         ]
-        self._launch = RecordedLaunch(memory_kernels.integrate, (b, count), device, self._arguments)
+        self._launch = RecordedLaunch(device, (memory_kernels.integrate, (b, count), arguments))
 
     def run(self, T_world_camera: Tensor, rays: ViewRays, mask: Tensor | None) -> None:
         self._poses.copy_(T_world_camera)
@@ -287,13 +287,13 @@ class _Prediction:
         b, device = memory.num_envs, memory.device
         self._positions = torch.zeros(b, count, 3, device=device)
         self._predictions = torch.zeros(b, count, 2, device=device)
-        self._arguments = [
+        arguments = [
             memory.grid,
             memory.foliage,
             wp.from_torch(self._positions, dtype=wp.vec3),
             wp.from_torch(self._predictions, dtype=wp.vec2),
         ]
-        self._launch = RecordedLaunch(memory_kernels.predict, (b, count), device, self._arguments)
+        self._launch = RecordedLaunch(device, (memory_kernels.predict, (b, count), arguments))
 
     def run(self, camera_positions: Tensor) -> Tensor:
         self._positions.copy_(camera_positions)

@@ -17,9 +17,9 @@ from mani_skill.sensors.camera import CameraConfig
 
 from maniskill_tomato.errors import InvalidInputError
 from maniskill_tomato.robot import d435, iiwa14
-from maniskill_tomato.robot.description import urdf_path
 from maniskill_tomato.robot.iiwa14 import READY_QPOS as READY_QPOS
 from maniskill_tomato.robot.iiwa14 import REST_QPOS as REST_QPOS
+from maniskill_tomato.robot.robot_description import urdf_path
 from maniskill_tomato.tasks.maniskill.look_at_controller import LookAtControllerConfig
 from maniskill_tomato.tasks.maniskill.viewpoint_controller import ViewpointControllerConfig
 

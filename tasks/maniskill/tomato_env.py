@@ -19,9 +19,9 @@ from maniskill_tomato.plants.organs import SemanticClass
 from maniskill_tomato.plants.spec import PlantPose, PlantSpec
 from maniskill_tomato.raycast.scene import RayScene
 from maniskill_tomato.robot.d435 import CameraIntrinsics, T_flange_camera_color_optical
-from maniskill_tomato.robot.description import link_meshes
 from maniskill_tomato.robot.inverse_kinematics import Reach
 from maniskill_tomato.robot.kinematics import link_transforms
+from maniskill_tomato.robot.robot_description import link_meshes
 from maniskill_tomato.robot.rotations import matrix_to_rpy
 from maniskill_tomato.tasks import options
 from maniskill_tomato.tasks.maniskill import scene_mask, scenery

@@ -106,6 +106,24 @@ ERRORS: dict[str, tuple[tuple[str, ...], str]] = {
         ("demonstrations", "--planner", "orakle"),
         "error: --planner: no policy at 'orakle'",
     ),
+    "policy of a benchmark": (
+        ("benchmark", "--policies", "nbv,oracel"),
+        "error: --policies: no policy at 'oracel'",
+    ),
+    "file of a policy": (
+        ("benchmark", "--policies", "mine=no.pt"),
+        "error: --policies: no policy at 'no.pt'",
+    ),
+    "list of episodes": (("benchmark", "--episode-list", "heldout"), "error: --episode-list must be one of"),
+    "rows": (("benchmark-rows", "--rows", "0"), "error: --rows must be 1 or more, got 0"),
+    "split of rows": (("benchmark-rows", "--split", "test"), "error: --split must be one of"),
+    "runs to compare": (("compare", "no"), "error: RUN: there is no folder no"),
+    "no runs": (("compare",), "error: give one run folder or more"),
+    "experiment": (("reproduce", "guidet"), "'guidet' is none of guided, sparse"),
+    "variant": (("reproduce", "guided", "--variant", "small-action"), "small-action"),
+    "variant of the learner": (("ablate", "--variants", "n-step"), "n-step"),
+    "task of an ablation": (("ablate", "--env-ids", "Tomato"), "error: --env-ids must be one of"),
+    "twin": (("judge", "twin", "--profile", "mok"), "error: --profile: no profile 'mok'"),
     "minutes": (("demo", "--minutes", "0"), "error: --minutes must be above 0"),
 }
 """Command lines that cannot be done as asked, and what is said."""
@@ -121,6 +139,9 @@ SUGGESTIONS = {
     "profile": "did you mean 'mock'?",
     "segmenter": "did you mean 'light'?",
     "student": "did you mean 'actor'?",
+    "policy of a benchmark": "did you mean 'oracle'?",
+    "list of episodes": "did you mean 'held_out'?",
+    "experiment": "did you mean 'guided'?",
     "demonstrations": "did you mean 'oracle'?",
 }
 """What is offered instead of a mistyped word."""

@@ -289,7 +289,7 @@ def test_without_a_shipped_policy_the_message_says_what_to_do(
 @pytest.mark.parametrize(
     ("arguments", "expected"),
     [
-        (("train", GUIDED, "--num-envs", "4"), "num_envs must be 1 without a CUDA device"),
+        (("train", GUIDED, "--num-envs", "4"), "--num-envs must be 1 without a CUDA device"),
     ],
 )
 def test_bad_options_are_answered_in_words(

@@ -1,4 +1,4 @@
-"""The comparison of runs: statistics against hand values, runs made by hand, the report and both scripts."""
+"""The comparison of runs: statistics against hand values, runs made by hand, the report and PPO."""
 
 import json
 import os
@@ -76,7 +76,7 @@ def groups_of(*paths: Path) -> list[Group]:
     return group_runs([load_run(path) for path in paths])
 
 
-def run_script(*arguments: str) -> subprocess.CompletedProcess[str]:
+def run_python(*arguments: str) -> subprocess.CompletedProcess[str]:
     environment = {**os.environ, "PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1"}
     command = [sys.executable, *arguments]
     return subprocess.run(command, capture_output=True, text=True, cwd=ROOT, env=environment, timeout=300)
@@ -286,7 +286,7 @@ def test_ppo_trains_evaluates_and_can_be_compared(tmp_path: Path, capsys: pytest
         "--n-steps",
         "100",
     )
-    done = run_script(*arguments)
+    done = run_python(*arguments)
     assert done.returncode == 0, done.stderr
     run = load_run(tmp_path / "seed-3")
     assert run.metrics is not None
@@ -306,5 +306,5 @@ def test_ppo_trains_evaluates_and_can_be_compared(tmp_path: Path, capsys: pytest
     largest = metrics["per_episode"]["max_visible_fraction"]
     np.testing.assert_allclose(largest, run.metrics["per_episode"]["max_visible_fraction"], atol=0.02)
     assert "Training" in (evaluated / "report.html").read_text()
-    again = run_script(*arguments)
+    again = run_python(*arguments)
     assert again.returncode == 2 and "already holds a run" in again.stderr

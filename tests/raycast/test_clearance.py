@@ -10,12 +10,11 @@ import trimesh
 from maniskill_tomato.errors import InvalidInputError
 from maniskill_tomato.plants.generator import generate_plant
 from maniskill_tomato.plants.organs import Plant
-from maniskill_tomato.raycast.caster import VisibilityCaster
-from maniskill_tomato.raycast.clearance import CLEARANCE_RANGE, PATH_SAMPLES, PlantClearance
+from maniskill_tomato.raycast.scene import CLEARANCE_RANGE, PATH_SAMPLES, RayScene
 from maniskill_tomato.robot.d435 import color_intrinsics
-from maniskill_tomato.robot.description import link_meshes
 from maniskill_tomato.robot.iiwa14 import LINK_NAMES
 from maniskill_tomato.robot.kinematics import link_transforms
+from maniskill_tomato.robot.robot_description import link_meshes
 from maniskill_tomato.robot.spheres import LINK_SPHERES, sphere_table
 from maniskill_tomato.tasks.maniskill.agent import READY_QPOS
 
@@ -27,14 +26,13 @@ def plants() -> tuple[Plant, Plant]:
     return generate_plant("one_tomato", 1), generate_plant("full", 2)
 
 
-def make() -> tuple[PlantClearance, torch.Tensor]:
-    caster = VisibilityCaster(plants=plants(), intrinsics=color_intrinsics(160, 120))
+def make() -> tuple[RayScene, torch.Tensor]:
     T = torch.eye(4).repeat(2, 1, 1)
     for k, (x, y, yaw) in enumerate(PLANT_POSES):
         c, s = np.cos(yaw), np.sin(yaw)
         T[k, :2, :2] = torch.tensor([[c, -s], [s, c]])
         T[k, :2, 3] = torch.tensor([x, y])
-    return PlantClearance(caster), T
+    return RayScene(plants(), color_intrinsics(160, 120)), T
 
 
 def joints(rng: np.random.Generator) -> torch.Tensor:
@@ -65,13 +63,13 @@ def slow_clearance(
 
 
 def test_clearance_along_a_path_is_that_of_a_plain_loop() -> None:
-    checker, T = make()
+    scene, T = make()
     rng = np.random.default_rng(0)
     found = []
     for _ in range(3):
         start, end = joints(rng), joints(rng)
         end = start + 0.2 * (end - start)
-        clearance = checker.along(start, end, T)
+        clearance = scene.clearance_along(start, end, T)
         for k in range(2):
             expected = slow_clearance(start[k], end[k], T[k], plants()[k])
             assert float(clearance[k]) == pytest.approx(expected, abs=2e-5)
@@ -81,25 +79,24 @@ def test_clearance_along_a_path_is_that_of_a_plain_loop() -> None:
 
 
 def test_any_number_of_paths_can_be_held_against_one_plant() -> None:
-    checker, T = make()
+    scene, T = make()
     rng = np.random.default_rng(1)
     start = torch.cat([joints(rng) for _ in range(4)])
-    single = [checker.at(torch.stack([q, q]), T)[1] for q in start]
-    together = checker.at(start, T[1].expand(8, 4, 4), torch.ones(8, dtype=torch.int64))
+    single = [scene.clearance_at(torch.stack([q, q]), T)[1] for q in start]
+    together = scene.clearance_at(start, T[1].expand(8, 4, 4), torch.ones(8, dtype=torch.int64))
     torch.testing.assert_close(together, torch.stack(single))
-    back = checker.at(start[:2], T)
+    back = scene.clearance_at(start[:2], T)
     torch.testing.assert_close(back[1], single[1])
 
 
 def test_clearance_follows_a_replaced_plant() -> None:
-    caster = VisibilityCaster(plants=plants()[:1], intrinsics=color_intrinsics(160, 120))
-    checker = PlantClearance(caster)
+    scene = RayScene(plants()[:1], color_intrinsics(160, 120))
     _, T = make()
     rng = np.random.default_rng(0)
     q = joints(rng)[:1]
-    before = checker.at(q, T[1:])
-    caster.replace_plant(0, plants()[1])
-    after = checker.at(q, T[1:])
+    before = scene.clearance_at(q, T[1:])
+    scene.replace_plant(0, plants()[1])
+    after = scene.clearance_at(q, T[1:])
     assert float(after[0]) == pytest.approx(slow_clearance(q[0], q[0], T[1], plants()[1]), abs=2e-5)
     assert not torch.equal(before, after)
 
@@ -139,12 +136,10 @@ def test_spheres_stay_near_the_arm() -> None:
 
 
 def test_wrong_shapes_are_refused() -> None:
-    checker, T = make()
+    scene, T = make()
     q = torch.zeros(2, 7)
     with pytest.raises(InvalidInputError, match="end_qpos"):
-        checker.along(q, q[:, :6], T)
-    with pytest.raises(InvalidInputError, match="samples"):
-        PlantClearance(VisibilityCaster(plants=plants(), intrinsics=color_intrinsics(160, 120)), samples=0)
+        scene.clearance_along(q, q[:, :6], T)
 
 
 def test_every_sphere_sits_on_a_link_that_exists() -> None:

@@ -1,6 +1,4 @@
-"""The pattern of rays against geometry worked out by hand, a plain ray tracer, and images made without a renderer."""
-
-import math
+"""The pattern of rays against geometry worked out by hand and a plain ray tracer; many views against single ones."""
 
 import numpy as np
 import pytest
@@ -13,24 +11,21 @@ from torch.testing import assert_close
 from maniskill_tomato.errors import InvalidInputError
 from maniskill_tomato.plants.generator import generate_plant
 from maniskill_tomato.plants.organs import Fruit, MeshPart, Organ, Plant, SemanticClass
-from maniskill_tomato.raycast.cast_views import CastViews
-from maniskill_tomato.raycast.caster import VisibilityCaster
+from maniskill_tomato.raycast.scene import RayScene
 from maniskill_tomato.raycast.view_rays import (
-    DEPTH_MODE,
     NEAREST_DEPTH,
     PATTERN_HALF_WIDTH,
     RANGE,
     RAYS_PER_SIDE,
     RayLabel,
-    ViewRayCaster,
     ViewRays,
     ray_pattern,
 )
-from maniskill_tomato.robot.d435 import CameraIntrinsics, color_intrinsics, depth_noise_std
-from maniskill_tomato.robot.description import link_meshes
+from maniskill_tomato.raycast.warp_scene import VIEWS_AT_ONCE
+from maniskill_tomato.robot.d435 import CameraIntrinsics, color_intrinsics
 from maniskill_tomato.robot.iiwa14 import LINK_NAMES
 from maniskill_tomato.robot.look_at import look_at_pose, look_frame
-from maniskill_tomato.sensing.view_pattern import disturb, sample_view
+from maniskill_tomato.robot.robot_description import link_meshes
 
 RAYS = RAYS_PER_SIDE**2
 RADIUS = 0.035
@@ -80,8 +75,7 @@ def look(
     """One view of a plant that stands at the origin, straight at a fruit."""
     centre = torch.from_numpy(plant.fruits[target].centre).to(device)
     pose = look_at_pose(torch.tensor(position, device=device), centre, roll)
-    caster = ViewRayCaster(VisibilityCaster(plants=[plant], intrinsics=intrinsics, device=device))
-    return caster.cast(
+    return RayScene([plant], intrinsics, device=device).view_rays(
         pose[None], torch.tensor([target], device=device), centre[None], torch.eye(4, device=device)[None]
     )
 
@@ -162,9 +156,7 @@ def test_the_robots_links_leave_rays_without_an_answer(device: str) -> None:
     plant = ball_plant([(0.5, 0.0, 0.0)])
     cube = trimesh.creation.box(extents=(0.1, 0.1, 0.1))
     meshes = {"link_3": (np.asarray(cube.vertices), np.asarray(cube.faces))}
-    caster = ViewRayCaster(
-        VisibilityCaster(plants=[plant], intrinsics=WIDE, robot_meshes=meshes, device=device)
-    )
+    scene = RayScene([plant], WIDE, robot_meshes=meshes, device=device)
     pose = look_at_pose(torch.zeros(1, 3, device=device), torch.tensor([[0.5, 0.0, 0.0]], device=device))
     links = torch.eye(4, device=device).repeat(1, len(LINK_NAMES), 1, 1)
     links[0, LINK_NAMES.index("link_3"), :3, 3] = torch.tensor([0.3, 0.05, 0.0], device=device)
@@ -174,8 +166,8 @@ def test_the_robots_links_leave_rays_without_an_answer(device: str) -> None:
         torch.tensor([[0.5, 0, 0]], device=device),
         torch.eye(4, device=device)[None],
     )
-    with_link = caster.cast(*given, link_transforms=links).label[0].cpu()
-    without = caster.cast(*given).label[0].cpu()
+    with_link = scene.view_rays(*given, links).label[0].cpu()
+    without = scene.view_rays(*given).label[0].cpu()
     # The cube covers y from 0 to 0.1 and z from -0.05 to 0.05 at x = 0.25, and less behind.
     y, z = -ray_pattern()[:, 0] / 0.5, ray_pattern()[:, 1] / 0.5
     covered = torch.from_numpy((y > 0) & (y < 0.1 / 0.25) & (np.abs(z) < 0.05 / 0.25))
@@ -184,7 +176,7 @@ def test_the_robots_links_leave_rays_without_an_answer(device: str) -> None:
     assert_close(with_link[~covered], without[~covered])
     assert int((without == RayLabel.OUTSIDE).sum()) == 0
     links[0, LINK_NAMES.index("link_3"), 0, 3] = -0.3
-    assert_close(caster.cast(*given, link_transforms=links).label[0].cpu(), without)
+    assert_close(scene.view_rays(*given, links).label[0].cpu(), without)
 
 
 def test_a_grown_plant_agrees_with_a_plain_loop_over_its_triangles() -> None:
@@ -236,21 +228,20 @@ def _first_hits(
 
 def test_a_new_plant_is_seen_also_when_it_has_more_fruits(device: str) -> None:
     one, two = ball_plant([(0.5, 0.0, 0.0)]), ball_plant([(0.5, 0.3, 0.0), (0.5, 0.0, 0.0)])
-    casters = VisibilityCaster(plants=[one], intrinsics=WIDE, device=device)
-    rays, views = ViewRayCaster(casters), CastViews(casters)
+    scene = RayScene([one], WIDE, device=device)
     pose = look_at_pose(torch.zeros(1, 3, device=device), torch.tensor([[0.5, 0.0, 0.0]], device=device))
     there, plant_pose = torch.tensor([[0.5, 0.0, 0.0]], device=device), torch.eye(4, device=device)
 
     def targets_seen(index: int) -> int:
-        view = rays.cast(pose, torch.tensor([index], device=device), there, plant_pose[None])
+        view = scene.view_rays(pose, torch.tensor([index], device=device), there, plant_pose[None])
         return int((view.label == RayLabel.TARGET).sum())
 
     seen = targets_seen(0)
-    assert seen >= 6 and float(views.visible_fraction(pose, 0, plant_pose)) == 1.0
-    casters.replace_plant(0, two)
-    assert targets_seen(1) == seen and float(views.visible_fraction(pose, 1, plant_pose)) == 1.0
+    assert seen >= 6 and float(scene.visible_fraction_from(pose, 0, plant_pose)) == 1.0
+    scene.replace_plant(0, two)
+    assert targets_seen(1) == seen and float(scene.visible_fraction_from(pose, 1, plant_pose)) == 1.0
     # This fruit lies 31 degrees to the left, in the image still, and the pattern ends before.
-    assert targets_seen(0) == 0 and float(views.visible_fraction(pose, 0, plant_pose)) == 1.0
+    assert targets_seen(0) == 0 and float(scene.visible_fraction_from(pose, 0, plant_pose)) == 1.0
 
 
 def random_cameras(centre: Tensor, count: int) -> Tensor:
@@ -262,23 +253,23 @@ def random_cameras(centre: Tensor, count: int) -> Tensor:
 
 def test_many_views_at_once_have_the_visible_fractions_of_single_views(device: str) -> None:
     plants = [generate_plant("three_tomatoes", seed, "training") for seed in (1, 2)]
-    caster = VisibilityCaster(
-        plants=plants, intrinsics=color_intrinsics(), robot_meshes=link_meshes(), device=device
-    )
-    views = CastViews(caster, at_once=32)
+    scene = RayScene(plants, color_intrinsics(), robot_meshes=link_meshes(), device=device)
     T_world_plant = torch.eye(4)
     T_world_plant[:3, 3] = torch.tensor([0.8, 0.1, 0.0])
     T_world_plant = T_world_plant.to(device)
-    links = torch.eye(4).repeat(100, len(LINK_NAMES), 1, 1)
-    links[..., :3, 3] = torch.randn(100, len(LINK_NAMES), 3, generator=torch.Generator().manual_seed(1)) * 0.5
+    count = 2 * VIEWS_AT_ONCE + 76
+    links = torch.eye(4).repeat(count, len(LINK_NAMES), 1, 1)
+    links[..., :3, 3] = (
+        torch.randn(count, len(LINK_NAMES), 3, generator=torch.Generator().manual_seed(1)) * 0.5
+    )
     links = links.to(device)
     for env_index, target in ((0, 2), (1, 0)):
         centre = torch.from_numpy(plants[env_index].fruits[target].centre) + T_world_plant[:3, 3].cpu()
-        cameras = random_cameras(centre, 100).to(device)
+        cameras = random_cameras(centre, count).to(device)
         for given in (None, links):
-            at_once = views.visible_fraction(cameras, target, T_world_plant, given, env_index=env_index)
-            for k in (0, 31, 32, 99):
-                single = caster.cast(
+            at_once = scene.visible_fraction_from(cameras, target, T_world_plant, given, env_index=env_index)
+            for k in (0, VIEWS_AT_ONCE - 1, VIEWS_AT_ONCE, count - 1):
+                single = scene.visibility(
                     cameras[k : k + 1].expand(2, 4, 4),
                     torch.full((2,), target, device=device),
                     T_world_plant.expand(2, 4, 4),
@@ -286,104 +277,15 @@ def test_many_views_at_once_have_the_visible_fractions_of_single_views(device: s
                 )
                 assert float(at_once[k]) == float(single.visible_fraction[env_index])
             assert 0.05 < float(at_once.mean()) < 0.95
-    assert views.visible_fraction(cameras[:0], 0, T_world_plant).shape == (0,)
+    assert scene.visible_fraction_from(cameras[:0], 0, T_world_plant).shape == (0,)
 
 
 def test_views_that_do_not_exist_are_refused() -> None:
-    views = CastViews(VisibilityCaster(plants=[ball_plant([(0.5, 0, 0)])], intrinsics=WIDE))
+    scene = RayScene([ball_plant([(0.5, 0, 0)])], WIDE)
     pose = torch.eye(4)
     with pytest.raises(InvalidInputError, match=r"target_fruit must be from 0 to 0, got 1"):
-        views.visible_fraction(pose[None], 1, pose)
+        scene.visible_fraction_from(pose[None], 1, pose)
     with pytest.raises(InvalidInputError, match=r"env_index must be from 0 to 0, got 2"):
-        views.visible_fraction(pose[None], 0, pose, env_index=2)
-    with pytest.raises(InvalidInputError, match=r"T_world_plant must have shape \(4, 4\)"):
-        views.visible_fraction(pose[None], 0, pose[None])
-
-
-def painted_view(roll: float) -> tuple[NDArray[np.float64], NDArray[np.bool_], NDArray[np.bool_], Tensor]:
-    """Depth and masks of a ball at (0.5, 0, 0) behind a leaf at x = 0.3, y > 0, painted pixel by pixel."""
-    T_world_camera = look_at_pose(
-        torch.zeros(3, dtype=torch.float64), torch.tensor([0.5, 0, 0], dtype=torch.float64), roll
-    )
-    direction = WIDE.ray_directions(WIDE.pixel_centres()) @ T_world_camera[:3, :3].numpy().T
-    length = np.linalg.norm(direction, axis=-1)
-    unit = direction / length[..., None]
-    along = unit[..., 0] * 0.5
-    inside = RADIUS**2 - (0.25 - along**2)
-    target = inside > 0
-    depth = np.where(target, (along - np.sqrt(np.maximum(inside, 0))) / length, 2.0)
-    leaf = unit[..., 1] > 0
-    depth = np.where(leaf, 0.3 / direction[..., 0], depth)
-    return depth, target & ~leaf, leaf, T_world_camera
-
-
-@pytest.mark.parametrize("roll", [0.0, 0.6])
-def test_an_image_tells_what_the_rays_tell(roll: float) -> None:
-    depth, target_mask, _, T_world_camera = painted_view(roll)
-    sampled = sample_view(depth, target_mask, WIDE, T_world_camera, torch.tensor([0.5, 0.0, 0.0]))
-    cast = look(ball_plant([(0.5, 0.0, 0.0)], leaf_x=0.3), (0.0, 0.0, 0.0), roll=roll)
-    assert_close(sampled.direction_c, cast.direction_c, atol=1e-5, rtol=0)
-    equal = sampled.label == cast.label
-    # A pixel is 2 mm wide here; the row of rays nearest to the ball's edge passes it by less.
-    assert float(equal.float().mean()) > 0.98
-    assert_close(sampled.distance[equal], cast.distance[equal], atol=4e-3, rtol=0)
-
-
-def test_pixels_without_depth_and_the_robots_pixels_have_no_answer() -> None:
-    depth, target_mask, leaf, T_world_camera = painted_view(0.0)
-    target = torch.tensor([0.5, 0.0, 0.0])
-    whole = sample_view(depth, target_mask, WIDE, T_world_camera, target)
-    assert int((whole.label == RayLabel.OUTSIDE).sum()) == 0
-    for nothing in (0.0, math.nan, math.inf, NEAREST_DEPTH - 0.01):
-        holes = np.where(leaf, nothing, depth)
-        rays = sample_view(holes, target_mask, WIDE, T_world_camera, target)
-        lost = rays.label == RayLabel.OUTSIDE
-        assert_close(lost, whole.label == RayLabel.OTHER)
-        assert bool((rays.distance[lost] == 0).all())
-    robot = sample_view(depth, target_mask, WIDE, T_world_camera, target, robot_mask=leaf)
-    assert_close(robot.label == RayLabel.OUTSIDE, whole.label == RayLabel.OTHER)
-
-
-def test_images_of_another_size_are_refused() -> None:
-    depth, target_mask, _, T_world_camera = painted_view(0.0)
-    with pytest.raises(InvalidInputError, match=r"target_mask must have the camera's shape \(480, 640\)"):
-        sample_view(depth, target_mask[:-1], WIDE, T_world_camera, torch.zeros(3))
-    with pytest.raises(InvalidInputError, match=r"target_position must have shape \(3,\)"):
-        sample_view(depth, target_mask, WIDE, T_world_camera, torch.zeros(1, 3))
-
-
-def test_disturbed_rays_err_as_often_and_as_far_as_asked() -> None:
-    count = 200_000
-    label = torch.arange(count).remainder(4).to(torch.int8)[None]
-    distance = torch.where(label == RayLabel.FREE, RANGE, 0.8) * (label != RayLabel.OUTSIDE)
-    direction = torch.tensor([0.6, 0.0, 0.8]).expand(1, count, 3)
-    rays = ViewRays(direction, distance, label)
-    generator = torch.Generator().manual_seed(0)
-
-    same = disturb(rays, generator, depth_noise=0.0)
-    assert_close(same.label, rays.label)
-    assert_close(same.distance, rays.distance)
-
-    noisy = disturb(rays, generator, depth_noise=2.0)
-    assert_close(noisy.label, rays.label)
-    hit = label >= RayLabel.TARGET
-    assert_close(noisy.distance[~hit], rays.distance[~hit])
-    # The noise of the depth 0.8 * 0.8 m, along the ray.
-    wanted = 2.0 * float(depth_noise_std(0.64, DEPTH_MODE)) / 0.8
-    error = noisy.distance[hit] - 0.8
-    assert float(error.std()) == pytest.approx(wanted, rel=0.02)
-    assert float(error.mean()) == pytest.approx(0.0, abs=wanted / 50)
-
-    wrong = disturb(rays, generator, depth_noise=0.0, dropout=0.1, false_target=0.2, missed_target=0.3)
-    lost = wrong.label == RayLabel.OUTSIDE
-    for before, after, share in (
-        (RayLabel.FREE, RayLabel.OUTSIDE, 0.1),
-        (RayLabel.TARGET, RayLabel.OUTSIDE, 0.1),
-        (RayLabel.OTHER, RayLabel.TARGET, 0.9 * 0.2),
-        (RayLabel.TARGET, RayLabel.OTHER, 0.9 * 0.3),
-    ):
-        found = (wrong.label[label == before] == after).float().mean()
-        assert float(found) == pytest.approx(share, abs=0.01)
-    assert bool((wrong.distance[lost] == 0).all())
-    with pytest.raises(InvalidInputError, match=r"dropout must lie in \[0, 1\], got 1.5"):
-        disturb(rays, generator, dropout=1.5)
+        scene.visible_fraction_from(pose[None], 0, pose, env_index=2)
+    with pytest.raises(InvalidInputError, match=r"T_w_plant must have shape \(4, 4\)"):
+        scene.visible_fraction_from(pose[None], 0, pose[None])

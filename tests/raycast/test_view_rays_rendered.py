@@ -7,8 +7,8 @@ import pytest
 import torch
 
 from maniskill_tomato.plants.generator import generate_plant
-from maniskill_tomato.raycast.caster import VisibilityCaster
-from maniskill_tomato.raycast.view_rays import RANGE, RayLabel, ViewRayCaster
+from maniskill_tomato.raycast.scene import RayScene
+from maniskill_tomato.raycast.view_rays import RANGE, RayLabel
 from maniskill_tomato.robot.look_at import camera_to_viewpoint, look_at_pose
 from maniskill_tomato.sensing.observation import ViewpointObserver
 from maniskill_tomato.sensing.view_pattern import sample_view
@@ -29,7 +29,7 @@ def test_a_rendered_image_tells_what_the_rays_tell_and_gives_the_same_observatio
     for seed in range(PLANTS):
         plant = generate_plant("full" if seed % 2 else "three_tomatoes", seed, "training")
         segmented = SegmentedPlant(plant, COMPARISON_INTRINSICS)
-        caster = ViewRayCaster(VisibilityCaster(plants=[plant], intrinsics=COMPARISON_INTRINSICS))
+        scene = RayScene([plant], COMPARISON_INTRINSICS)
         fruit = int(rng.integers(len(plant.fruits)))
         centre = torch.from_numpy(plant.fruits[fruit].centre.astype(np.float64))
         observers = [ViewpointObserver(), ViewpointObserver()]
@@ -46,7 +46,7 @@ def test_a_rendered_image_tells_what_the_rays_tell_and_gives_the_same_observatio
             depth = np.where(np.isinf(depth), 2 * RANGE, depth)
             is_target = organs == plant.fruits[fruit].organ_index
             sampled = sample_view(depth, is_target, COMPARISON_INTRINSICS, pose, centre)
-            cast = caster.cast(
+            cast = scene.view_rays(
                 pose.float()[None], torch.tensor([fruit]), centre.float()[None], torch.eye(4)[None]
             )
             torch.testing.assert_close(sampled.direction_c, cast.direction_c, atol=1e-5, rtol=0)

@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from maniskill_tomato.errors import InvalidInputError
-from maniskill_tomato.segmentation.training.classic_augmentation import (
+from maniskill_tomato.segmentation.training.augmentation import (
     brighter,
     classic_augmentation,
     contrasted,

@@ -81,8 +81,8 @@ def test_reward_goes_by_what_is_measured() -> None:
     _, reward, _, _, info = env.step(torch.tensor([1.0, 0.0, 0.0]))
     expected = float(info["visible_fraction_gain"][0]) - env.task.step_cost
     expected += env.task.success_reward * float(info["success"][0])
-    if not bool(info["plant_contact"][0]):
-        assert float(reward[0]) == pytest.approx(expected, abs=1e-5)
+    expected -= env.task.contact_penalty * float(info["plant_contact"][0])
+    assert float(reward[0]) == pytest.approx(expected, abs=1e-5)
     env.close()
 
 

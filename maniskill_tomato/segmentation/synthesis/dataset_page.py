@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from maniskill_tomato.files import write_atomically
 from maniskill_tomato.segmentation.datasets.annotations import AnnotatedImage, AnnotatedImages, Instance
 from maniskill_tomato.segmentation.datasets.picture_files import write_picture
+from maniskill_tomato.segmentation.drawing import contact_sheet
 
 COLOURS: Final[dict[str, tuple[int, int, int]]] = {
     "tomato_ripe": (255, 70, 60),
@@ -22,6 +23,10 @@ COLOURS: Final[dict[str, tuple[int, int, int]]] = {
 """Outlines by category, RGB; other fruits are red."""
 
 
+SHEET_IMAGES, SHEET_COLUMNS, SHEET_TILE = 24, 6, 320
+"""Images on the contact sheet, images in a row, and width of each in [px]."""
+
+
 def write_statistics(images: AnnotatedImages, folder: Path) -> Path:
     """Writes `statistics.md`, `statistics.png` and `contact_sheet.jpg` into a data set's folder.
 
@@ -29,37 +34,18 @@ def write_statistics(images: AnnotatedImages, folder: Path) -> Path:
         The page.
     """
     _write_plot(images, folder / "statistics.png")
-    sheet = contact_sheet(_spread(images.images, 24))
+    shown = [outlined(image) for image in _spread(images.images, SHEET_IMAGES)]
+    # As high as the images need, up to a little more than a square.
+    height = round(SHEET_TILE * min(max(i.shape[0] / i.shape[1] for i in shown), 1.25))
+    sheet = contact_sheet(shown, SHEET_COLUMNS, (SHEET_TILE, height))
     write_picture(folder / "contact_sheet.jpg", sheet, 88)
     page = folder / "statistics.md"
     write_atomically(page, _page(images).encode())
     return page
 
 
-def contact_sheet(images: list[AnnotatedImage], *, columns: int = 6, width: int = 320) -> NDArray[np.uint8]:
-    """Small pictures side by side with the outlines of the visible fruits and, thin, of the whole ones.
-
-    Args:
-        images: What to show.
-        columns: In a row.
-        width: Of each, in [px].
-
-    Returns:
-        RGB. Shape (rows, columns, 3).
-    """
-    tiles = [_tile(image, width) for image in images]
-    height = max(tile.shape[0] for tile in tiles)
-    blank = np.zeros((height, width, 3), np.uint8)
-    padded = []
-    for tile in tiles:
-        place = blank.copy()
-        place[: tile.shape[0]] = tile
-        padded.append(place)
-    padded += [blank] * (-len(padded) % columns)
-    return np.vstack([np.hstack(padded[i : i + columns]) for i in range(0, len(padded), columns)])
-
-
-def _tile(image: AnnotatedImage, width: int) -> NDArray[np.uint8]:
+def outlined(image: AnnotatedImage) -> NDArray[np.uint8]:
+    """An image with the outlines of its visible fruits and, thin and white, of the whole ones. Shape (H, W, 3)."""
     picture = image.load().copy()
     for instance in image.instances:
         if not instance.fruit and instance.category != "robot":
@@ -72,10 +58,7 @@ def _tile(image: AnnotatedImage, width: int) -> NDArray[np.uint8]:
         elif instance.box_xywh[2] > 0:
             x, y, w, h = (round(v) for v in instance.box_xywh)
             cv2.rectangle(picture, (x, y), (x + w, y + h), colour, 2)
-    height = min(round(width * image.height / image.width), round(width * 1.25))
-    scale = min(width / image.width, height / image.height)
-    small = cv2.resize(picture, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
-    return np.asarray(small, np.uint8)
+    return picture
 
 
 def _outline(

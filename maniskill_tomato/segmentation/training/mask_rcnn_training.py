@@ -11,7 +11,7 @@ from torch import Tensor, nn
 
 from maniskill_tomato.segmentation.datasets.annotations import AnnotatedImage
 from maniskill_tomato.segmentation.mask_rcnn import build_mask_rcnn
-from maniskill_tomato.segmentation.training.classic_augmentation import classic_augmentation
+from maniskill_tomato.segmentation.training.augmentation import classic_augmentation
 from maniskill_tomato.segmentation.training.detector_presets import MaskRcnnConfig
 from maniskill_tomato.segmentation.training.resumable_training import (
     ResumableTraining,

@@ -33,8 +33,8 @@ SAMPLES: Final = 64
 ROUNDS: Final = 4
 """Rounds of the cross-entropy search for the best circle (Rubinstein 1999)."""
 
-DRAWS: Final = 64
-"""Circles drawn in each round."""
+CANDIDATES: Final = 64
+"""Circles compared in each round."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -344,8 +344,8 @@ def _thinned(points: Float64, count: int = SAMPLES) -> Float64:
 
 @lru_cache(maxsize=1)
 def _noise() -> NDArray[np.float64]:
-    # Always the same draws, so that the same image gives the same answer.
-    return np.asarray(np.random.default_rng(5).standard_normal((ROUNDS, DRAWS, 3)))
+    # Always the same numbers, so that the same image gives the same answer.
+    return np.asarray(np.random.default_rng(5).standard_normal((ROUNDS, CANDIDATES, 3)))
 
 
 def _circles(edge: Floats) -> Floats:

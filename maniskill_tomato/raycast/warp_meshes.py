@@ -8,9 +8,7 @@ import warp as wp
 from numpy.typing import NDArray
 
 from maniskill_tomato.errors import InvalidInputError
-from maniskill_tomato.plants.organs import Plant, SemanticClass
-
-FRUIT_CLASSES = (SemanticClass.FRUIT_RIPE, SemanticClass.FRUIT_TURNING, SemanticClass.FRUIT_GREEN)
+from maniskill_tomato.plants.organs import Plant
 
 
 def build_mesh(vertices: NDArray[Any], faces: NDArray[Any], device: str) -> Any:
@@ -34,10 +32,7 @@ class PlantMeshes:
             raise InvalidInputError(f"a plant needs at least one fruit to look at; {plant.preset!r} has none")
         self.plant = plant
         """Kept so that the identity by which this set is found stays taken."""
-        is_fruit = np.array([organ.semantic_class in FRUIT_CLASSES for organ in plant.organs])
-        fruit_last = np.argsort(is_fruit[plant.organ_of_face], kind="stable")
-        self.first_fruit_face = int(np.count_nonzero(~is_fruit[plant.organ_of_face]))
-        self.whole = build_mesh(plant.vertices, plant.faces[fruit_last], device)
+        self.whole = build_mesh(plant.vertices, plant.faces, device)
         organs = [plant.organs[fruit.organ_index] for fruit in plant.fruits]
         self.fruits = [build_mesh(organ.vertices, organ.faces, device) for organ in organs]
         self.spheres = np.array([(*fruit.centre, fruit.radius) for fruit in plant.fruits], dtype=np.float32)
@@ -56,9 +51,6 @@ class PlantMeshCache:
         self._device = device
         self._capacity = capacity
         self._entries: OrderedDict[int, PlantMeshes] = OrderedDict()
-
-    def __len__(self) -> int:
-        return len(self._entries)
 
     def get(self, plant: Plant) -> PlantMeshes:
         """The meshes of a plant, built now if they are not at hand."""

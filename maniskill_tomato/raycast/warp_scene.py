@@ -1,0 +1,443 @@
+"""Rays traced by NVIDIA Warp, on the CPU or on CUDA: the triangles of a `RayScene` and the launches of its queries.
+
+A query copies its arguments into tensors that recorded kernels read in place, runs them in torch's current stream and
+clones what they wrote. Each kind of query is recorded when it is first made.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any, Final
+
+import numpy as np
+import torch
+import warp as wp
+from numpy.typing import NDArray
+from torch import Tensor
+
+from maniskill_tomato.plants.organs import Plant
+from maniskill_tomato.raycast import (
+    clearance_kernels,
+    image_kernels,
+    kernels,
+    view_ray_kernels,
+    visibility_kernels,
+)
+from maniskill_tomato.raycast.images import (
+    BACKGROUND_DEPTH,
+    FIRST_ORGAN_LABEL,
+    NOTHING_LABEL,
+    ROBOT_LABEL,
+    CastImages,
+    Picture,
+)
+from maniskill_tomato.raycast.lattice import ray_lattice
+from maniskill_tomato.raycast.ray_library import LinkMeshes
+from maniskill_tomato.raycast.view_rays import NEAREST_DEPTH, RANGE, RAYS_PER_SIDE, ViewRays, ray_pattern
+from maniskill_tomato.raycast.visibility import Visibility
+from maniskill_tomato.raycast.warp_meshes import PlantMeshCache, PlantMeshes, build_mesh
+from maniskill_tomato.robot.d435 import CAMERA_FAR, CameraIntrinsics
+from maniskill_tomato.robot.iiwa14 import LINK_NAMES
+from maniskill_tomato.robot.spheres import sphere_table
+from maniskill_tomato.warp_runtime import RecordedLaunch, start_warp
+
+VIEWS_AT_ONCE: Final = 512
+"""`visible_fraction_from` casts more views than this in several parts."""
+
+_COARSE_RAYS_PER_SIDE: Final = 6
+_FAR_AWAY: Final = 1.0e6
+_RECORDED_AT_MOST: Final = 16
+"""Launches that are kept, for queries, sizes of images and numbers of paths."""
+
+
+class WarpScene:
+    """A `RayLibrary` on NVIDIA Warp."""
+
+    def __init__(
+        self,
+        plants: Sequence[Plant],
+        intrinsics: CameraIntrinsics,
+        robot_meshes: LinkMeshes,
+        rays_per_side: int,
+        cached_plants: int,
+        device: torch.device,
+    ) -> None:
+        """Builds the meshes; the arguments are those of `RayScene`."""
+        start_warp()
+        self._device = device
+        self._warp_device = str(wp.device_from_torch(str(device)))
+        self._camera: Any = kernels.Camera()
+        self._camera.left = -intrinsics.cx / intrinsics.fx
+        self._camera.top = -intrinsics.cy / intrinsics.fy
+        self._camera.right = (intrinsics.width - intrinsics.cx) / intrinsics.fx
+        self._camera.bottom = (intrinsics.height - intrinsics.cy) / intrinsics.fy
+        self._camera.square_pixels = intrinsics.fx * intrinsics.fy
+        self._rays = rays_per_side**2
+        self._pattern = self._points(ray_lattice(rays_per_side))
+        self._coarse_pattern = self._points(ray_lattice(_COARSE_RAYS_PER_SIDE))
+
+        self._cache = PlantMeshCache(self._warp_device, cached_plants)
+        self._shown = [self._cache.get(plant) for plant in plants]
+        self._links = _LinkMeshes(robot_meshes, self._warp_device)
+        self._scene: Any = kernels.Scene()
+        self._links.describe(self._scene, device)
+        self._allocate_tables()
+        self._views = _Views(len(plants), self._links.count, device)
+        self._views.environments.copy_(torch.arange(len(plants)))
+        self._many_views: _Views | None = None
+        self._first_view = _Views(1, self._links.count, device)
+        self._finish_work()
+
+    def show(self, env_index: int, plant: Plant) -> None:
+        """Shows another plant in one environment."""
+        meshes = self._cache.get(plant)
+        # A new mesh is built in Warp's stream, and an old one must outlive the casts still under way with it.
+        self._finish_work()
+        self._shown[env_index] = meshes
+        if len(meshes.fruits) > self._fruit_meshes.shape[1]:
+            self._allocate_tables()
+        else:
+            self._write_row(env_index, meshes)
+
+    def visibility(
+        self, T_w_camera: Tensor, target_fruit: Tensor, T_w_plant: Tensor, T_w_links: Tensor | None
+    ) -> Visibility:
+        """See `RayScene.visibility`."""
+        self._views.place(T_w_camera, target_fruit, T_w_plant, T_w_links)
+        recorded = self._recorded(self._record_visibility, self._views)
+        recorded.launch()
+        return Visibility(recorded.outputs[0].clone())
+
+    def visible_fraction_from(
+        self,
+        T_w_camera: Tensor,
+        target_fruit: int,
+        T_w_plant: Tensor,
+        T_w_links: Tensor | None,
+        env_index: int,
+    ) -> Tensor:
+        """See `RayScene.visible_fraction_from`."""
+        if self._many_views is None:
+            self._many_views = _Views(VIEWS_AT_ONCE, self._links.count, self._device)
+        views, count = self._many_views, T_w_camera.shape[0]
+        recorded = self._recorded(self._record_visibility, views)
+        views.environments.fill_(env_index)
+        answers = torch.empty(count, device=self._device)
+        for first in range(0, count, VIEWS_AT_ONCE):
+            part = slice(first, min(first + VIEWS_AT_ONCE, count))
+            links = None if T_w_links is None else T_w_links[part]
+            views.place(T_w_camera[part], target_fruit, T_w_plant, links)
+            recorded.launch(part.stop - first)
+            answers[part] = recorded.outputs[0][0, : part.stop - first]
+        return answers
+
+    def view_rays(
+        self,
+        T_w_camera: Tensor,
+        target_fruit: Tensor,
+        target_position: Tensor,
+        T_w_plant: Tensor,
+        T_w_links: Tensor | None,
+    ) -> ViewRays:
+        """See `RayScene.view_rays`."""
+        recorded = self._recorded(self._record_view_rays)
+        self._views.place(T_w_camera, target_fruit, T_w_plant, T_w_links)
+        recorded.inputs[0].copy_(target_position)
+        recorded.launch()
+        directions, distances, labels = recorded.outputs
+        return ViewRays(directions.clone(), distances.clone(), labels.clone())
+
+    def image(
+        self,
+        intrinsics: CameraIntrinsics,
+        T_w_camera: Tensor,
+        target_fruit: Tensor,
+        T_w_plant: Tensor,
+        T_w_links: Tensor | None,
+    ) -> CastImages:
+        """See `RayScene.image`."""
+        recorded = self._recorded(self._record_image, intrinsics)
+        self._views.place(T_w_camera, target_fruit, T_w_plant, T_w_links)
+        recorded.launch()
+        depth, label = recorded.outputs
+        return CastImages(depth.clone(), label.clone())
+
+    def picture(
+        self,
+        intrinsics: CameraIntrinsics,
+        T_w_camera: Tensor,
+        T_w_plant: Tensor,
+        T_w_links: Tensor | None,
+    ) -> Picture:
+        """See `RayScene.picture`."""
+        recorded = self._recorded(self._record_picture, intrinsics)
+        self._first_view.place(T_w_camera, -1, T_w_plant, T_w_links)
+        recorded.launch()
+        depth, face, facing = (output[0].cpu().numpy() for output in recorded.outputs)
+        # A face is -1 where there is nothing and -2 on the robot: the last two entries.
+        organs = self._shown[0].plant.organ_of_face.astype(np.int32) + FIRST_ORGAN_LABEL
+        labels = np.append(organs, np.array([ROBOT_LABEL, NOTHING_LABEL], np.int32))
+        return Picture(depth.copy(), labels[face], facing.copy())
+
+    def clearance(
+        self, T_w_links: Tensor, T_w_plant: Tensor, env_idx: Tensor | None, farthest: float
+    ) -> Tensor:
+        """See `RayLibrary.clearance`."""
+        paths, samples = T_w_links.shape[:2]
+        recorded = self._recorded(self._record_clearance, paths, samples, farthest)
+        environments, plants, links, every = recorded.inputs
+        links.copy_(T_w_links)
+        plants.copy_(T_w_plant)
+        environments.copy_(every if env_idx is None else env_idx)
+        recorded.outputs[0].fill_(farthest)
+        recorded.launch()
+        return recorded.outputs[0].clone()
+
+    def _recorded(self, record: Callable[..., "_Recorded"], *arguments: Any) -> "_Recorded":
+        """What a method recorded for its arguments, recorded now if it is not at hand."""
+        key = (record, *arguments)
+        found = self._kept.get(key)
+        if found is None:
+            if len(self._kept) >= _RECORDED_AT_MOST:
+                self._kept.clear()
+            found = self._kept[key] = record(*arguments)
+        return found
+
+    def _points(self, points: NDArray[np.float32]) -> Any:
+        return wp.from_torch(torch.tensor(points, device=self._device), dtype=wp.vec2)
+
+    def _allocate_tables(self) -> None:
+        """Makes the tables of all plants, with room for the fruits of any of them, and forgets what read other ones."""
+        n, fruits, device = len(self._shown), max(len(meshes.fruits) for meshes in self._shown), self._device
+        self._plant_meshes = torch.zeros(n, dtype=torch.int64, device=device)
+        self._fruit_counts = torch.zeros(n, dtype=torch.int32, device=device)
+        self._fruit_meshes = torch.zeros((n, fruits), dtype=torch.int64, device=device)
+        self._fruit_spheres = torch.zeros((n, fruits, 4), device=device)
+        self._fruit_is_ripe = torch.zeros((n, fruits), dtype=torch.int32, device=device)
+        for env, meshes in enumerate(self._shown):
+            self._write_row(env, meshes)
+        self._scene.plant_meshes = wp.from_torch(self._plant_meshes, dtype=wp.uint64)
+        self._scene.fruit_counts = wp.from_torch(self._fruit_counts)
+        self._scene.fruit_meshes = wp.from_torch(self._fruit_meshes, dtype=wp.uint64)
+        self._scene.fruit_spheres = wp.from_torch(self._fruit_spheres, dtype=wp.vec4)
+        self._scene.fruit_is_ripe = wp.from_torch(self._fruit_is_ripe)
+        self._kept: dict[tuple[Any, ...], _Recorded] = {}
+
+    def _write_row(self, env: int, meshes: PlantMeshes) -> None:
+        count = len(meshes.fruits)
+        self._plant_meshes[env] = meshes.whole.id
+        self._fruit_counts[env] = count
+        self._fruit_meshes[env, :count] = torch.tensor([mesh.id for mesh in meshes.fruits])
+        self._fruit_spheres[env, :count] = torch.from_numpy(meshes.spheres)
+        self._fruit_is_ripe[env] = 0
+        self._fruit_is_ripe[env, :count] = torch.from_numpy(meshes.is_ripe)
+
+    def _zeros(self, *shape: int, dtype: torch.dtype = torch.float32) -> Tensor:
+        return torch.zeros(shape, dtype=dtype, device=self._device)
+
+    def _record_visibility(self, views: "_Views") -> "_Recorded":
+        b, scene, asked, camera = views.count, self._scene, views.struct, self._camera
+        tallies = [self._zeros(b, dtype=torch.int32) for _ in range(3)]
+        counts: Any = visibility_kernels.Counts()
+        counts.silhouette, counts.visible, counts.any_seen = (wp.from_torch(tally) for tally in tallies)
+        results = self._zeros(visibility_kernels.RESULTS, b)
+        calls: list[tuple[Any, int | tuple[int, ...], list[Any]]] = [
+            (kernels.prepare, b, [scene, asked]),
+            (
+                visibility_kernels.trace_target,
+                (b, self._rays),
+                [scene, asked, camera, self._pattern, counts],
+            ),
+            (
+                visibility_kernels.trace_others,
+                (b, self._fruit_meshes.shape[1]),
+                [scene, asked, camera, self._coarse_pattern, counts],
+            ),
+            (
+                visibility_kernels.summarise,
+                b,
+                [scene, asked, camera, float(self._rays), counts, wp.from_torch(results)],
+            ),
+        ]
+        if views is not self._views:
+            del calls[2]
+        return _Recorded(RecordedLaunch(self._device, *calls), outputs=(results,))
+
+    def _record_view_rays(self) -> "_Recorded":
+        b, n = self._views.count, RAYS_PER_SIDE**2
+        limits: Any = view_ray_kernels.Limits()
+        limits.nearest, limits.farthest = NEAREST_DEPTH, RANGE
+        target_positions = self._zeros(b, 3)
+        directions, distances = self._zeros(b, n, 3), self._zeros(b, n)
+        labels = self._zeros(b, n, dtype=torch.int8)
+        arguments = [
+            self._scene,
+            self._views.struct,
+            self._camera,
+            limits,
+            self._points(ray_pattern()),
+            wp.from_torch(target_positions, dtype=wp.vec3),
+            wp.from_torch(directions, dtype=wp.vec3),
+            wp.from_torch(distances),
+            wp.from_torch(labels),
+        ]
+        launch = RecordedLaunch(
+            self._device,
+            (kernels.prepare, b, [self._scene, self._views.struct]),
+            (view_ray_kernels.trace_view_rays, (b, n), arguments),
+        )
+        return _Recorded(launch, inputs=(target_positions,), outputs=(directions, distances, labels))
+
+    def _record_image(self, intrinsics: CameraIntrinsics) -> "_Recorded":
+        shape = (self._views.count, intrinsics.height, intrinsics.width)
+        depth, label = self._zeros(*shape), self._zeros(*shape, dtype=torch.int8)
+        arrays = [wp.from_torch(depth), wp.from_torch(label)]
+        arguments = [self._scene, self._views.struct, _pinhole(intrinsics), BACKGROUND_DEPTH, *arrays]
+        launch = RecordedLaunch(
+            self._device,
+            (kernels.prepare, shape[0], [self._scene, self._views.struct]),
+            (image_kernels.trace_image, shape, arguments),
+        )
+        return _Recorded(launch, outputs=(depth, label))
+
+    def _record_picture(self, intrinsics: CameraIntrinsics) -> "_Recorded":
+        views = self._first_view
+        shape = (1, intrinsics.height, intrinsics.width)
+        depth, face = self._zeros(*shape), self._zeros(*shape, dtype=torch.int32)
+        facing = self._zeros(*shape)
+        arrays = [wp.from_torch(depth), wp.from_torch(face), wp.from_torch(facing)]
+        arguments = [self._scene, views.struct, _pinhole(intrinsics), CAMERA_FAR, *arrays]
+        launch = RecordedLaunch(
+            self._device,
+            (kernels.prepare, 1, [self._scene, views.struct]),
+            (image_kernels.trace_picture, shape, arguments),
+        )
+        return _Recorded(launch, outputs=(depth, face, facing))
+
+    def _record_clearance(self, paths: int, samples: int, farthest: float) -> "_Recorded":
+        environments = self._zeros(paths, dtype=torch.int32)
+        every = torch.arange(paths, dtype=torch.int32, device=self._device)
+        plants, links = self._zeros(paths, 4, 4), self._zeros(paths, samples, len(LINK_NAMES), 4, 4)
+        clearance = self._zeros(paths)
+        sphere_links, spheres = (torch.tensor(table, device=self._device) for table in sphere_table())
+        arguments = [
+            self._scene,
+            wp.from_torch(environments),
+            wp.from_torch(plants, dtype=wp.mat44),
+            wp.from_torch(links, dtype=wp.mat44),
+            wp.from_torch(sphere_links, dtype=wp.int32),
+            wp.from_torch(spheres, dtype=wp.vec4),
+            farthest,
+            wp.from_torch(clearance),
+        ]
+        threads = (paths, samples, len(spheres))
+        launch = RecordedLaunch(self._device, (clearance_kernels.sphere_clearance, threads, arguments))
+        return _Recorded(launch, inputs=(environments, plants, links, every), outputs=(clearance,))
+
+    def _finish_work(self) -> None:
+        """Waits for what is under way on a GPU, in Warp's stream and in torch's."""
+        if self._device.type == "cuda":
+            wp.synchronize_device(self._warp_device)
+
+
+@dataclass(frozen=True, eq=False)
+class _Recorded:
+    """A query's launch with the tensors it reads, beside those of its views, and writes."""
+
+    launch: RecordedLaunch
+    outputs: tuple[Tensor, ...]
+    inputs: tuple[Tensor, ...] = ()
+
+
+def _pinhole(intrinsics: CameraIntrinsics) -> Any:
+    pinhole: Any = image_kernels.Pinhole()
+    pinhole.fx, pinhole.fy, pinhole.cx, pinhole.cy = (
+        intrinsics.fx,
+        intrinsics.fy,
+        intrinsics.cx,
+        intrinsics.cy,
+    )
+    return pinhole
+
+
+class _LinkMeshes:
+    """The links that have triangles."""
+
+    def __init__(self, robot_meshes: LinkMeshes, warp_device: str) -> None:
+        names = [name for name, (_, faces) in robot_meshes.items() if len(faces)]
+        points = [np.asarray(robot_meshes[name][0], dtype=np.float32) for name in names]
+        self.count = len(names)
+        self._meshes = [
+            build_mesh(p, robot_meshes[name][1], warp_device) for name, p in zip(names, points, strict=True)
+        ]
+        self._indices = [LINK_NAMES.index(name) for name in names]
+        self._lows = [p.min(axis=0) for p in points]
+        self._highs = [p.max(axis=0) for p in points]
+
+    def describe(self, scene: Any, device: torch.device) -> None:
+        """Fills the table of links of a `kernels.Scene`."""
+        meshes = torch.tensor([mesh.id for mesh in self._meshes], dtype=torch.int64, device=device)
+        indices = torch.tensor(self._indices, dtype=torch.int32, device=device)
+        scene.link_meshes = wp.from_torch(meshes, dtype=wp.uint64)
+        scene.link_indices = wp.from_torch(indices)
+        for name, corners in (("link_lows", self._lows), ("link_highs", self._highs)):
+            table = torch.tensor(np.array(corners, dtype=np.float32).reshape(-1, 3), device=device)
+            setattr(scene, name, wp.from_torch(table, dtype=wp.vec3))
+
+
+class _Views:
+    """Cameras, plants, links and targets of B views, in tensors that the kernels read in place."""
+
+    def __init__(self, count: int, links: int, device: torch.device) -> None:
+        self.count = count
+        self.environments = torch.zeros(count, dtype=torch.int32, device=device)
+        self._targets = torch.zeros(count, dtype=torch.int32, device=device)
+        self._camera_poses = torch.eye(4, device=device).repeat(count, 1, 1)
+        self._plant_poses = torch.eye(4, device=device).repeat(count, 1, 1)
+        self._links_away = torch.eye(4, device=device).repeat(count, len(LINK_NAMES), 1, 1)
+        self._links_away[..., :3, 3] = _FAR_AWAY
+        self._link_poses = self._links_away.clone()
+        self._robot_present = False
+
+        def floats(dtype: Any, *shape: int) -> Any:
+            return wp.from_torch(torch.zeros(shape, device=device), dtype=dtype)
+
+        views: Any = kernels.Views()
+        views.environments = wp.from_torch(self.environments)
+        views.targets = wp.from_torch(self._targets)
+        views.camera_poses = wp.from_torch(self._camera_poses, dtype=wp.mat44)
+        views.plant_poses = wp.from_torch(self._plant_poses, dtype=wp.mat44)
+        views.link_poses = wp.from_torch(self._link_poses, dtype=wp.mat44)
+        views.plant_rotations = floats(wp.mat33, count, 3, 3)
+        views.plant_positions = floats(wp.vec3, count, 3)
+        views.link_rotations = floats(wp.mat33, count, links, 3, 3)
+        views.link_positions = floats(wp.vec3, count, links, 3)
+        views.links_in_front = wp.from_torch(torch.zeros(count, dtype=torch.int32, device=device))
+        views.links_before_target = wp.from_torch(torch.zeros(count, dtype=torch.int32, device=device))
+        views.rectangles = floats(wp.vec4, count, 4)
+        self.struct = views
+
+    def place(
+        self, T_w_camera: Tensor, target_fruit: Tensor | int, T_w_plant: Tensor, T_w_links: Tensor | None
+    ) -> None:
+        """Fills the first K views.
+
+        Args:
+            T_w_camera: Shape (K, 4, 4), or (4, 4) for one.
+            target_fruit: Shape (K,), or one for all.
+            T_w_plant: Shape (K, 4, 4), or (4, 4) for all.
+            T_w_links: Shape (K, 9, 4, 4), or (9, 4, 4) for one; None for no robot.
+        """
+        count = T_w_camera.shape[0] if T_w_camera.dim() == 3 else 1
+        whole = count == self.count
+        (self._camera_poses if whole else self._camera_poses[:count]).copy_(T_w_camera)
+        self._plant_poses.copy_(T_w_plant)
+        if isinstance(target_fruit, int):
+            self._targets.fill_(target_fruit)
+        else:
+            self._targets.copy_(target_fruit)
+        if T_w_links is not None:
+            (self._link_poses if whole else self._link_poses[:count]).copy_(T_w_links)
+            self._robot_present = True
+        elif self._robot_present:
+            self._link_poses.copy_(self._links_away)
+            self._robot_present = False

@@ -1,0 +1,91 @@
+"""Fruits measured in cast images of held-out plants against what the plants are."""
+
+import numpy as np
+import pytest
+import torch
+
+from maniskill_tomato.errors import InvalidInputError
+from maniskill_tomato.plants.episode_list import load_episodes
+from maniskill_tomato.plants.spec import ROW_PLANT
+from maniskill_tomato.raycast.scene import RayScene
+from maniskill_tomato.robot.d435 import color_intrinsics
+from maniskill_tomato.robot.iiwa14 import LINK_NAMES
+from maniskill_tomato.robot.look_at import look_at_pose
+from maniskill_tomato.segmentation.instances import Instances
+from maniskill_tomato.sensing.fruit_detector import FEWEST_PIXELS, LEAST_SCORE, FruitDetector
+from maniskill_tomato.sensing.posed_frame import PosedFrame
+from maniskill_tomato.sensing.simulated_camera import SimulatedCamera
+
+AWAY = torch.eye(4).repeat(1, len(LINK_NAMES), 1, 1)
+AWAY[..., :3, 3] = 1e6
+
+
+def test_visible_fraction_position_and_radius_are_near_the_truth() -> None:
+    episodes = load_episodes("held_out")
+    stand, rng = torch.eye(4)[None], np.random.default_rng(3)
+    scene, fractions, positions, radii = None, [], [], []
+    for episode in (episodes[i] for i in (21, 34, 55)):
+        plant = ROW_PLANT.grow(episode.plant_seed)
+        scene = scene or RayScene([plant], color_intrinsics(320, 240), rays_per_side=48)
+        scene.replace_plant(0, plant)
+        camera, detector = SimulatedCamera(scene), FruitDetector(None)
+        fruit = plant.fruits[episode.target]
+        centre = torch.as_tensor(np.asarray(fruit.centre, np.float64))[None]
+        for _ in range(4):
+            turn, rise = rng.uniform(-0.6, 0.6, 2)
+            from_target = -0.35 * np.array([np.cos(turn), np.sin(turn), -np.sin(rise)])
+            pose = look_at_pose(centre + torch.as_tensor(from_target), centre).float()
+            target = torch.tensor([episode.target])
+            (frame,) = camera.take(pose, target, stand, AWAY)
+            assert frame is not None
+            truth = float(scene.visibility(pose, target, stand).visible_fraction[0])
+            measured = detector.measure(frame)
+            if truth < 0.3:
+                continue
+            found = measured.fruits[0]
+            assert found.centre_w is not None
+            fractions.append(abs(found.visible_fraction - truth))
+            positions.append(float(np.linalg.norm(found.centre_w - centre[0].numpy())))
+            radii.append(abs(found.radius_m / float(fruit.radius) - 1.0))
+    assert len(fractions) >= 5
+    assert np.mean(fractions) < 0.06
+    assert np.median(positions) < 0.006
+    assert np.median(radii) < 0.12
+
+
+def frame(rgb: bool = True) -> PosedFrame:
+    return PosedFrame(
+        depth_m=np.full((60, 80), 0.5, np.float32),
+        intrinsics=color_intrinsics(80, 60),
+        T_world_camera=np.eye(4),
+        rgb=np.zeros((60, 80, 3), np.uint8) if rgb else None,
+    )
+
+
+def test_small_and_unsure_fruits_are_left_out() -> None:
+    masks = np.zeros((3, 60, 80), np.bool_)
+    masks[0, 10:20, 10:20] = True
+    masks[1, 30:40, 30:40] = True
+    masks[2, 50, 50 : 50 + FEWEST_PIXELS - 1] = True
+    scores = np.array([0.9, LEAST_SCORE - 0.01, 0.9], np.float32)
+    kinds = ("tomato_unripe", "tomato_ripe", "tomato_ripe")
+    found = Instances.from_masks(masks, scores, kinds)
+    measured = FruitDetector(lambda image, depth_m=None: found).measure(frame())
+    (fruit,) = measured.fruits
+    assert (fruit.category, fruit.is_ripe, fruit.pixels) == ("tomato_unripe", False, 100)
+    np.testing.assert_array_equal(measured.mask(0), masks[0])
+    assert not measured.mask(None).any()
+
+
+def test_what_segmentation_needs_must_be_in_the_frame() -> None:
+    with pytest.raises(InvalidInputError, match="choose a segmenter"):
+        FruitDetector(None).measure(frame())
+    with pytest.raises(InvalidInputError, match="colours"):
+        FruitDetector(lambda image, depth_m=None: Instances.empty(60, 80)).measure(frame(rgb=False))
+    with pytest.raises(InvalidInputError, match="robot_mask must have shape"):
+        PosedFrame(
+            depth_m=np.zeros((60, 80), np.float32),
+            intrinsics=color_intrinsics(80, 60),
+            T_world_camera=np.eye(4),
+            robot_mask=np.zeros((60, 81), np.bool_),
+        )
