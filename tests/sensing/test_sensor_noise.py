@@ -8,8 +8,8 @@ import torch
 
 from maniskill_tomato.errors import InvalidInputError
 from maniskill_tomato.learning.rl.envs import make_env
-from maniskill_tomato.raycast.view_rays import RayLabel
-from maniskill_tomato.sensing.sensor_noise import SensorNoise
+from maniskill_tomato.raycast.view_rays import RayLabel, ViewRays
+from maniskill_tomato.sensing.sensor_noise import SensorErrors, SensorNoise
 
 PLANT = {"seed": 3, "pool": None}
 
@@ -68,3 +68,28 @@ def test_noise_that_makes_no_sense_is_refused() -> None:
     for name, value in (("dropout", 1.5), ("depth_noise", -1.0), ("target_position", float("nan"))):
         with pytest.raises(InvalidInputError, match=name):
             SensorNoise.parse({name: value})
+
+
+def test_every_environment_has_its_own_errors() -> None:
+    """What one environment draws depends on its own seed and on how often it looked, not on the others."""
+    there = ViewRays(
+        torch.tensor([0.0, 0.0, 1.0]).expand(2, 64, 3),
+        torch.full((2, 64), 0.5),
+        torch.full((2, 64), int(RayLabel.OTHER), dtype=torch.int8),
+    )
+    noise = SensorNoise(depth_noise=1.0, dropout=0.2, false_target=0.1)
+
+    def errors(seeds: tuple[int, int]) -> SensorErrors:
+        made = SensorErrors(noise, 2, torch.device("cpu"))
+        for k, seed in enumerate(seeds):
+            made.begin(k, np.random.RandomState(seed))
+        return made
+
+    both, other = errors((1, 2)), errors((1, 3))
+    first, beside = both.rays(there), other.rays(there)
+    assert torch.equal(first.distance[0], beside.distance[0]) and torch.equal(first.label[0], beside.label[0])
+    assert not torch.equal(first.distance[1], beside.distance[1])
+    # The second environment looks alone: the first one's next view is the same as without that.
+    alone = both.rays(there, torch.tensor([False, True]))
+    assert torch.equal(alone.distance[0], there.distance[0])
+    assert torch.equal(both.rays(there).distance[0], other.rays(there).distance[0])
