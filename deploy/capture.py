@@ -7,7 +7,7 @@ from typing import Final
 import numpy as np
 
 from maniskill_tomato.deploy.clock import Clock
-from maniskill_tomato.deploy.errors import DeployError, NotConnectedError, PerceptionError, StaleError
+from maniskill_tomato.deploy.deploy_errors import DeployError, NotConnectedError, PerceptionError, StaleError
 from maniskill_tomato.deploy.interface import Camera, Frame
 from maniskill_tomato.errors import InvalidInputError
 

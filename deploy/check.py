@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 
 from maniskill_tomato.deploy.capture import Capture
-from maniskill_tomato.deploy.errors import DeployError, RecordingError
+from maniskill_tomato.deploy.deploy_errors import DeployError, RecordingError
 from maniskill_tomato.deploy.interface import JointMove
 from maniskill_tomato.deploy.policies import TASK, decide, default_policy
 from maniskill_tomato.deploy.profile import Profile

@@ -3,7 +3,7 @@
 import time
 from typing import Protocol
 
-from maniskill_tomato.deploy.errors import FaultError
+from maniskill_tomato.deploy.deploy_errors import FaultError
 
 
 class Clock(Protocol):

@@ -9,7 +9,7 @@ import numpy as np
 from maniskill_tomato.deploy.interface import Float64
 from maniskill_tomato.deploy.safety_config import Box
 from maniskill_tomato.robot.d435 import CAMERA_LINK_NAME, T_flange_camera_color_optical, camera_link_pose
-from maniskill_tomato.robot.description import urdf_path
+from maniskill_tomato.robot.robot_description import urdf_path
 
 mj: Any = mujoco
 

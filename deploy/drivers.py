@@ -15,7 +15,7 @@ from importlib.metadata import entry_points
 from typing import Any, Final, Literal, TypeVar
 
 from maniskill_tomato.deploy.clock import Clock
-from maniskill_tomato.deploy.errors import ProfileError
+from maniskill_tomato.deploy.deploy_errors import ProfileError
 from maniskill_tomato.deploy.interface import Arm, Camera
 
 Kind = Literal["arm", "camera"]
@@ -25,12 +25,12 @@ ENTRY_POINT_GROUP: Final = "maniskill_tomato.drivers"
 
 BUILT_IN: Final[dict[Kind, dict[str, str]]] = {
     "arm": {
-        "mock": "maniskill_tomato.deploy.mock.arm:make_arm",
-        "sunrise": "maniskill_tomato.deploy.sunrise.arm:make_arm",
+        "mock": "maniskill_tomato.deploy.mock.mock_arm:make_arm",
+        "sunrise": "maniskill_tomato.deploy.sunrise.sunrise_arm:make_arm",
     },
     "camera": {
-        "mock": "maniskill_tomato.deploy.mock.camera:make_camera",
-        "realsense": "maniskill_tomato.deploy.realsense.camera:make_camera",
+        "mock": "maniskill_tomato.deploy.mock.mock_camera:make_camera",
+        "realsense": "maniskill_tomato.deploy.realsense.realsense_camera:make_camera",
     },
 }
 """Module and callable of each driver of this package."""

@@ -6,7 +6,7 @@ from typing import Final
 import numpy as np
 
 from maniskill_tomato.deploy.clock import Clock
-from maniskill_tomato.deploy.errors import DeviceTimeoutError, FaultError, RefusedError
+from maniskill_tomato.deploy.deploy_errors import DeviceTimeoutError, FaultError, RefusedError
 from maniskill_tomato.deploy.interface import Arm, ArmState, Float64, JointMove
 from maniskill_tomato.deploy.safety import Safety
 from maniskill_tomato.robot.iiwa14 import JOINT_LOWER, JOINT_NAMES, JOINT_UPPER, VELOCITY_LIMITS

@@ -12,7 +12,7 @@ from typing import Any, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from maniskill_tomato.deploy.errors import ProtocolError
+from maniskill_tomato.deploy.deploy_errors import ProtocolError
 from maniskill_tomato.raycast.view_rays import ViewRays
 from maniskill_tomato.robot.d435 import CameraIntrinsics
 from maniskill_tomato.robot.iiwa14 import NUM_JOINTS

@@ -18,7 +18,7 @@ import torch
 
 from maniskill_tomato.deploy.capture import Capture
 from maniskill_tomato.deploy.clock import Clock
-from maniskill_tomato.deploy.errors import (
+from maniskill_tomato.deploy.deploy_errors import (
     DeployError,
     FaultError,
     HeartbeatLostError,

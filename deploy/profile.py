@@ -10,7 +10,7 @@ from typing import Any, Final, Literal
 import numpy as np
 
 from maniskill_tomato.deploy.capture import CaptureConfig
-from maniskill_tomato.deploy.errors import ProfileError
+from maniskill_tomato.deploy.deploy_errors import ProfileError
 from maniskill_tomato.deploy.fields import parse_table
 from maniskill_tomato.deploy.interface import Float64
 from maniskill_tomato.deploy.loop_config import LoopConfig

@@ -10,7 +10,7 @@ from mani_skill.agents.base_real_agent import BaseRealAgent
 from torch import Tensor
 
 from maniskill_tomato.deploy.capture import Capture
-from maniskill_tomato.deploy.errors import NotConnectedError, RefusedError
+from maniskill_tomato.deploy.deploy_errors import NotConnectedError, RefusedError
 from maniskill_tomato.deploy.interface import Float64, Frame, JointMove
 from maniskill_tomato.deploy.picture_fit import depth_in_mm, fit_color, fit_depth
 from maniskill_tomato.deploy.plant_points import PlantPoints

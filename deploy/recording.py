@@ -19,7 +19,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from maniskill_tomato.deploy.errors import CutOffError, RecordingError
+from maniskill_tomato.deploy.deploy_errors import CutOffError, RecordingError
 from maniskill_tomato.deploy.interface import Frame
 from maniskill_tomato.deploy.steps import Step
 

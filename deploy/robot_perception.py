@@ -6,7 +6,7 @@ from typing import Any, Final, Literal, Protocol
 
 import numpy as np
 
-from maniskill_tomato.deploy.errors import PerceptionError, ProfileError
+from maniskill_tomato.deploy.deploy_errors import PerceptionError, ProfileError
 from maniskill_tomato.deploy.interface import Float64, Frame
 from maniskill_tomato.errors import TomatoError
 from maniskill_tomato.raycast.images import ROBOT_LABEL

@@ -9,8 +9,8 @@ import numpy as np
 
 from maniskill_tomato.deploy.capture import Capture
 from maniskill_tomato.deploy.clock import CheckedClock, Clock, MonotonicClock, SimulatedClock
+from maniskill_tomato.deploy.deploy_errors import ProfileError, RecordingError
 from maniskill_tomato.deploy.drivers import DriverContext, make_arm, make_camera
-from maniskill_tomato.deploy.errors import ProfileError, RecordingError
 from maniskill_tomato.deploy.guarded_arm import GuardedArm
 from maniskill_tomato.deploy.interface import Arm, Camera, Float64
 from maniskill_tomato.deploy.loop import Loop

@@ -6,7 +6,7 @@ from pathlib import Path
 import tyro
 
 from maniskill_tomato.assets import ASSETS_DIR
-from maniskill_tomato.robot.description import VISIBLE_LINK_NAMES
+from maniskill_tomato.robot.robot_description import VISIBLE_LINK_NAMES
 from robot_model import glb, meshes, urdf
 
 _logger = logging.getLogger(__name__)

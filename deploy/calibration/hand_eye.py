@@ -25,7 +25,7 @@ from maniskill_tomato.deploy.calibration.rigid import (
     transform,
     vector_from_rotation,
 )
-from maniskill_tomato.deploy.errors import DeployError
+from maniskill_tomato.deploy.deploy_errors import DeployError
 from maniskill_tomato.deploy.interface import Float64
 from maniskill_tomato.robot.d435 import CameraIntrinsics
 

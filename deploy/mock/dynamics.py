@@ -6,8 +6,8 @@ import mujoco
 import numpy as np
 
 from maniskill_tomato.deploy.interface import Float64
-from maniskill_tomato.robot.description import urdf_path
 from maniskill_tomato.robot.iiwa14 import ACCELERATION_LIMITS, NUM_JOINTS, TORQUE_LIMITS, VELOCITY_LIMITS
+from maniskill_tomato.robot.robot_description import urdf_path
 
 mj: Any = mujoco
 

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from maniskill_tomato.deploy.collision import CollisionChecker
-from maniskill_tomato.deploy.errors import ProfileError
+from maniskill_tomato.deploy.deploy_errors import ProfileError
 from maniskill_tomato.deploy.interface import Float64
 from maniskill_tomato.deploy.postures import Postures
 from maniskill_tomato.plants.episode_list import Episode, load_episodes

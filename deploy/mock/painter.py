@@ -6,7 +6,7 @@ from typing import Any, Literal, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from maniskill_tomato.deploy.errors import ProfileError
+from maniskill_tomato.deploy.deploy_errors import ProfileError
 from maniskill_tomato.deploy.mock.world import TwinWorld
 from maniskill_tomato.raycast.images import ROBOT_LABEL, Picture
 

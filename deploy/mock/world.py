@@ -15,8 +15,8 @@ from maniskill_tomato.plants.organs import SemanticClass
 from maniskill_tomato.raycast.images import FIRST_ORGAN_LABEL, Picture
 from maniskill_tomato.raycast.scene import RayScene
 from maniskill_tomato.robot.d435 import CameraIntrinsics, T_flange_camera_color_optical
-from maniskill_tomato.robot.description import link_meshes
 from maniskill_tomato.robot.kinematics import link_transforms
+from maniskill_tomato.robot.robot_description import link_meshes
 
 COLORS: Final = {
     SemanticClass.BACKGROUND: (178, 196, 204),

@@ -2,7 +2,7 @@
 
 from typing import Any
 
-from maniskill_tomato.deploy.realsense.config import RealSenseConfig
+from maniskill_tomato.deploy.realsense.realsense_config import RealSenseConfig
 
 
 class DepthFilters:

@@ -5,7 +5,7 @@ import importlib
 from functools import cache
 from typing import Any
 
-from maniskill_tomato.deploy.errors import NotConnectedError
+from maniskill_tomato.deploy.deploy_errors import NotConnectedError
 
 
 @cache

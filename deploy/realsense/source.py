@@ -4,8 +4,8 @@ import time
 from pathlib import Path
 from typing import Any
 
-from maniskill_tomato.deploy.errors import DeviceTimeoutError, NotConnectedError
-from maniskill_tomato.deploy.realsense.config import RealSenseConfig
+from maniskill_tomato.deploy.deploy_errors import DeviceTimeoutError, NotConnectedError
+from maniskill_tomato.deploy.realsense.realsense_config import RealSenseConfig
 
 
 class FrameSource:

@@ -16,7 +16,7 @@ from typing import Final, Literal
 
 import numpy as np
 
-from maniskill_tomato.deploy.errors import (
+from maniskill_tomato.deploy.deploy_errors import (
     DeployError,
     DeviceTimeoutError,
     FaultError,

@@ -4,7 +4,7 @@ import socket
 import time
 from typing import Final
 
-from maniskill_tomato.deploy.errors import DeployError, NotConnectedError, ProtocolError
+from maniskill_tomato.deploy.deploy_errors import DeployError, NotConnectedError, ProtocolError
 
 MAX_LINE_BYTES: Final = 512
 """The longest line taken; seven numbers as Java prints them have less than 200."""

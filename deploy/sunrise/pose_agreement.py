@@ -5,9 +5,9 @@ import math
 import numpy as np
 import torch
 
-from maniskill_tomato.deploy.errors import FaultError
+from maniskill_tomato.deploy.deploy_errors import FaultError
 from maniskill_tomato.deploy.interface import Float64
-from maniskill_tomato.deploy.sunrise.config import SunriseConfig
+from maniskill_tomato.deploy.sunrise.sunrise_config import SunriseConfig
 from maniskill_tomato.robot.kinematics import forward_kinematics
 from maniskill_tomato.robot.rotations import rotation_angle_between, rpy_to_matrix
 

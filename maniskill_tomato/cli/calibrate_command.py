@@ -118,9 +118,9 @@ class DeployCalibrate:
 
     def _take(self, name: str, folder: Path) -> bool:
         """Takes pictures with the devices of a profile; whether there are enough to calculate."""
-        from maniskill_tomato.deploy.calibration.capture import CapturePlan, capture_views
         from maniskill_tomato.deploy.calibration.hand_eye import MIN_VIEWS
-        from maniskill_tomato.deploy.errors import StoppedError
+        from maniskill_tomato.deploy.calibration.view_capture import CapturePlan, capture_views
+        from maniskill_tomato.deploy.deploy_errors import StoppedError
         from maniskill_tomato.deploy.profile import load_profile
         from maniskill_tomato.deploy.stops import Stops
         from maniskill_tomato.deploy.workcell import make_workcell, prepare_folder

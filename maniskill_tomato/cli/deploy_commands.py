@@ -55,8 +55,8 @@ class DeployRun:
             raise InvalidInputError("--confirm asks before every move and needs a terminal")
 
         from maniskill_tomato.deploy.loop_config import Mode
+        from maniskill_tomato.deploy.policy_run import RunConfig, run
         from maniskill_tomato.deploy.profile import load_profile
-        from maniskill_tomato.deploy.run import RunConfig, run
 
         modes: list[Mode] = []
         if self.confirm:
@@ -126,7 +126,7 @@ class DeployReplay:
         check_file("RECORDING", self.recording)
         _check_policy(self.policy)
 
-        from maniskill_tomato.deploy.replay import each_difference, load_recording, replay
+        from maniskill_tomato.deploy.run_replay import each_difference, load_recording, replay
 
         recorded = load_recording(self.recording)
         if recorded.is_cut_off:

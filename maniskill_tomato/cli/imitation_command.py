@@ -33,6 +33,6 @@ class TrainImitation:
         check_count("--jobs", self.jobs)
         options = parse_env_options(self.env_options)
 
-        from maniskill_tomato.learning.imitation.training import train_imitation
+        from maniskill_tomato.learning.imitation.imitation_training import train_imitation
 
         tell_policy(lambda report: train_imitation(self.out, self.config, self.jobs, options, report))

@@ -34,7 +34,7 @@ class TrainViewQuality:
         check_file("--start-from", self.start_from)
         options = parse_env_options(self.env_options)
 
-        from maniskill_tomato.learning.view_quality.training import train_view_quality
+        from maniskill_tomato.learning.view_quality.quality_training import train_view_quality
 
         tell_policy(
             lambda report: train_view_quality(

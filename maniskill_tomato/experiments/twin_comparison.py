@@ -10,8 +10,8 @@ import numpy as np
 
 import maniskill_tomato
 from maniskill_tomato.deploy.policies import TASK, default_policy
+from maniskill_tomato.deploy.policy_run import RunConfig, run
 from maniskill_tomato.deploy.profile import Profile, load_profile
-from maniskill_tomato.deploy.run import RunConfig, run
 from maniskill_tomato.errors import TomatoError
 from maniskill_tomato.experiments.configs import TwinConfig
 from maniskill_tomato.experiments.metrics import write_json

@@ -6,9 +6,9 @@ from math import cos, pi, radians, sin
 import numpy as np
 from numpy.random import Generator
 
-from maniskill_tomato.plants.config import FruitConfig
 from maniskill_tomato.plants.meshing import Float64, Patch, cross, normalized
 from maniskill_tomato.plants.organs import Ripeness
+from maniskill_tomato.plants.plant_config import FruitConfig
 from maniskill_tomato.plants.random_streams import normal, uniform
 
 SKIN_VARIANTS = {"ripe": 3, "turning": 4, "green": 3}

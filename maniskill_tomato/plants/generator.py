@@ -7,12 +7,12 @@ from typing import Literal, get_args
 import numpy as np
 
 from maniskill_tomato.errors import InvalidInputError
-from maniskill_tomato.plants.config import PlantConfig, make_config
 from maniskill_tomato.plants.fruit import berry_patch, draw_berry
 from maniskill_tomato.plants.hiding import choose_clear_directions, clear_view, hang_curtain
 from maniskill_tomato.plants.leaf import Leaf, draw_leaf, draw_rachis, leaf_parts
 from maniskill_tomato.plants.meshing import Float64, join
 from maniskill_tomato.plants.organs import Fruit, Organ, Plant, Ripeness, SemanticClass
+from maniskill_tomato.plants.plant_config import PlantConfig, make_config
 from maniskill_tomato.plants.random_streams import Stream, normal, stream
 from maniskill_tomato.plants.stem import Shoot, grow_shoot, stem_patch
 from maniskill_tomato.plants.truss import Hanging, Truss, draw_truss, truss_parts

@@ -5,10 +5,10 @@ from math import cos, pi, radians, sin, tan
 
 import numpy as np
 
-from maniskill_tomato.plants.config import HidingConfig, LeafConfig
 from maniskill_tomato.plants.leaf import Leaf, draw_leaf, draw_rachis, leaflet_points
 from maniskill_tomato.plants.leaflet import Leaflet, coarse_triangles
 from maniskill_tomato.plants.meshing import Float64, cross, normalized
+from maniskill_tomato.plants.plant_config import HidingConfig, LeafConfig
 from maniskill_tomato.plants.random_streams import Stream, stream, uniform
 from maniskill_tomato.plants.truss import Hanging
 

@@ -6,10 +6,10 @@ from math import atan2, cos, pi, radians, sin, sqrt
 import numpy as np
 from numpy.random import Generator
 
-from maniskill_tomato.plants.config import LeafConfig
 from maniskill_tomato.plants.leaflet import Leaflet, both_sides, coarse_triangles
 from maniskill_tomato.plants.meshing import Float64, Patch, cross, hanging_curve, join, normalized, tube
 from maniskill_tomato.plants.organs import MeshPart
+from maniskill_tomato.plants.plant_config import LeafConfig
 from maniskill_tomato.plants.random_streams import normal, uniform
 
 DOWN = np.array([0.0, 0.0, -1.0])

@@ -9,9 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from maniskill_tomato.errors import InvalidInputError
-from maniskill_tomato.plants.config import PRESETS
 from maniskill_tomato.plants.generator import generate_plant
 from maniskill_tomato.plants.organs import Plant
+from maniskill_tomato.plants.plant_config import PRESETS
 from maniskill_tomato.plants.row import generate_row, leaf_density_of
 
 SEED_SPLITS: dict[str, tuple[int, int]] = {
@@ -34,7 +34,7 @@ class PlantSpec:
     """The identity of a plant, or a rule that draws a new one at every reset."""
 
     preset: str = "one_tomato"
-    """One of `maniskill_tomato.plants.config.PRESETS`."""
+    """One of `maniskill_tomato.plants.plant_config.PRESETS`."""
     seed: int | str = 0
     """The plant's seed, or the name of a split of `SEED_SPLITS`: then each reset draws a seed from it."""
     pool: int | None = None

@@ -5,8 +5,8 @@ from math import pi, radians
 
 import numpy as np
 
-from maniskill_tomato.plants.config import PlantConfig
 from maniskill_tomato.plants.meshing import Float64, Patch, tube
+from maniskill_tomato.plants.plant_config import PlantConfig
 from maniskill_tomato.plants.random_streams import Stream, normal, stream
 
 

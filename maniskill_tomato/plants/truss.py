@@ -6,7 +6,6 @@ from math import cos, pi, radians, sin
 import numpy as np
 from numpy.random import Generator
 
-from maniskill_tomato.plants.config import TrussConfig
 from maniskill_tomato.plants.fruit import Berry
 from maniskill_tomato.plants.meshing import (
     Float64,
@@ -21,6 +20,7 @@ from maniskill_tomato.plants.meshing import (
     tube,
 )
 from maniskill_tomato.plants.organs import MeshPart
+from maniskill_tomato.plants.plant_config import TrussConfig
 from maniskill_tomato.plants.random_streams import normal, uniform
 
 UP = np.array([0.0, 0.0, 1.0])

@@ -16,7 +16,6 @@ from maniskill_tomato.cli import main
 from maniskill_tomato.deploy.calibration.board import CharucoBoard
 from maniskill_tomato.deploy.calibration.board_print import print_board
 from maniskill_tomato.deploy.calibration.calibration_file import read_calibration, write_calibration
-from maniskill_tomato.deploy.calibration.capture import CapturePlan, camera_poses, capture_views
 from maniskill_tomato.deploy.calibration.hand_eye import (
     BoardView,
     CalibrationError,
@@ -32,6 +31,7 @@ from maniskill_tomato.deploy.calibration.rigid import (
     transform,
     vector_from_rotation,
 )
+from maniskill_tomato.deploy.calibration.view_capture import CapturePlan, camera_poses, capture_views
 from maniskill_tomato.deploy.calibration.view_folder import (
     RecordedView,
     board_view,
@@ -40,7 +40,7 @@ from maniskill_tomato.deploy.calibration.view_folder import (
     write_views,
 )
 from maniskill_tomato.deploy.clock import SimulatedClock
-from maniskill_tomato.deploy.errors import StoppedError
+from maniskill_tomato.deploy.deploy_errors import StoppedError
 from maniskill_tomato.deploy.guarded_arm import GuardedArm
 from maniskill_tomato.deploy.interface import Arm, ArmState, Camera, Float64, Frame, JointMove
 from maniskill_tomato.deploy.profile import parse_profile

@@ -1,5 +1,6 @@
 """The loop over the digital twin: how runs end, and what every fault does."""
 
+import itertools
 import os
 import signal
 import time
@@ -15,7 +16,7 @@ from torch import Tensor
 
 from maniskill_tomato.assets import asset_path
 from maniskill_tomato.deploy.clock import SimulatedClock
-from maniskill_tomato.deploy.errors import ProfileError
+from maniskill_tomato.deploy.deploy_errors import ProfileError, RefusedError
 from maniskill_tomato.deploy.guarded_arm import GuardedArm
 from maniskill_tomato.deploy.interface import Frame, JointMove
 from maniskill_tomato.deploy.loop import Loop
@@ -173,6 +174,23 @@ def test_a_controller_that_takes_no_moves_ends_the_run_as_refused() -> None:
     assert "nak" in result.detail
 
 
+def test_refusals_with_a_move_between_them_are_not_in_a_row() -> None:
+    workcell = make_workcell(profile(loop="refused_after = 2"), EPISODE)
+    arm: Any = workcell.arm
+    command, calls = arm.command, itertools.count()
+
+    def refuse_every_second(move: JointMove) -> JointMove:
+        if next(calls) % 2 == 0:
+            raise RefusedError("nak")
+        sent: JointMove = command(move)
+        return sent
+
+    arm.command = refuse_every_second
+    with workcell.arm, workcell.camera, Stops() as stops:
+        result = workcell.loop(open_policy("stay"), stops, "unattended").run()
+    assert (result.reason, result.moves, result.refused_moves) == ("budget", 6, 3), result.detail
+
+
 class TrueMasks(ImagePerception):
     """Perfect masks, of fruits that a test may hold back or put in another order."""
 
@@ -222,6 +240,18 @@ def with_perception(of: Profile, perception: Any, policy: Policy) -> RunResult:
 def test_a_target_that_stays_out_of_sight_is_lost() -> None:
     result = with_perception(profile(loop="lost_after = 3"), Hidden(), open_policy("stay", env_id=TASK))
     assert (result.reason, result.moves, result.is_fault) == ("target_lost", 3, False)
+
+
+class Blinking(TrueMasks):
+    """A segmenter that finds the target in every third picture."""
+
+    def found(self, ripe: list[int], target: int) -> list[int]:
+        return ripe if self.looks % 3 == 1 else []
+
+
+def test_looks_without_the_target_count_as_lost_only_in_a_row() -> None:
+    result = with_perception(profile(loop="lost_after = 3"), Blinking(), open_policy("stay"))
+    assert (result.reason, result.moves) == ("budget", 6), result.detail
 
 
 def test_fruits_that_change_places_in_the_list_change_nothing() -> None:

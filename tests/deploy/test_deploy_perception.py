@@ -14,9 +14,9 @@ from maniskill_tomato.raycast.images import FIRST_ORGAN_LABEL, ROBOT_LABEL
 from maniskill_tomato.raycast.scene import RayScene
 from maniskill_tomato.raycast.view_rays import ViewRays
 from maniskill_tomato.robot.d435 import T_flange_camera_color_optical, color_intrinsics
-from maniskill_tomato.robot.description import link_meshes
 from maniskill_tomato.robot.kinematics import link_transforms
 from maniskill_tomato.robot.look_at_move import LookAtMover
+from maniskill_tomato.robot.robot_description import link_meshes
 from maniskill_tomato.robot.rotations import matrix_to_rpy
 from maniskill_tomato.segmentation.instances import Instances
 from maniskill_tomato.sensing.camera_perception import CameraPerception

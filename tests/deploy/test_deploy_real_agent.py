@@ -9,7 +9,7 @@ import pytest
 import torch
 
 import maniskill_tomato  # noqa: F401
-from maniskill_tomato.deploy.errors import NotConnectedError, ProfileError, RefusedError
+from maniskill_tomato.deploy.deploy_errors import NotConnectedError, ProfileError, RefusedError
 from maniskill_tomato.deploy.interface import Frame
 from maniskill_tomato.deploy.picture_fit import depth_in_mm, fit_color, fit_depth
 from maniskill_tomato.deploy.profile import parse_profile

@@ -14,19 +14,19 @@ import pytest
 from numpy.typing import NDArray
 
 from maniskill_tomato.deploy.clock import MonotonicClock
-from maniskill_tomato.deploy.drivers import DriverContext, make_camera
-from maniskill_tomato.deploy.errors import (
+from maniskill_tomato.deploy.deploy_errors import (
     FaultError,
     NotConnectedError,
     ProfileError,
     RecordingError,
     StaleError,
 )
+from maniskill_tomato.deploy.drivers import DriverContext, make_camera
 from maniskill_tomato.deploy.interface import Camera
 from maniskill_tomato.deploy.realsense import sdk as sdk_module
-from maniskill_tomato.deploy.realsense.camera import RealSenseCamera
-from maniskill_tomato.deploy.realsense.config import RealSenseConfig
-from maniskill_tomato.deploy.realsense.recording import write_recording
+from maniskill_tomato.deploy.realsense.realsense_camera import RealSenseCamera
+from maniskill_tomato.deploy.realsense.realsense_config import RealSenseConfig
+from maniskill_tomato.deploy.realsense.realsense_recording import write_recording
 from maniskill_tomato.deploy.realsense.source import FrameSource
 from maniskill_tomato.robot import d435
 
@@ -231,7 +231,7 @@ def test_a_file_that_is_no_recording_is_said(tmp_path: Path) -> None:
 def test_distorted_colour_is_refused_rather_than_taken_for_straight(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    from maniskill_tomato.deploy.realsense import recording
+    from maniskill_tomato.deploy.realsense import realsense_recording as recording
 
     made = recording._video_stream
 

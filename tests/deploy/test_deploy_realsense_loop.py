@@ -15,16 +15,16 @@ from torch import Tensor
 
 from maniskill_tomato.cli import main
 from maniskill_tomato.deploy.clock import SimulatedClock
+from maniskill_tomato.deploy.deploy_errors import NotConnectedError
 from maniskill_tomato.deploy.drivers import DriverContext
-from maniskill_tomato.deploy.errors import NotConnectedError
 from maniskill_tomato.deploy.interface import Float64
-from maniskill_tomato.deploy.mock.options import twin_options, twin_world
+from maniskill_tomato.deploy.mock.twin_options import twin_options, twin_world
 from maniskill_tomato.deploy.mock.world import TwinWorld
 from maniskill_tomato.deploy.profile import Profile, parse_profile
-from maniskill_tomato.deploy.realsense.config import RealSenseConfig
+from maniskill_tomato.deploy.realsense.realsense_config import RealSenseConfig
 from maniskill_tomato.deploy.realsense.sdk import load_sdk
 from maniskill_tomato.deploy.realsense.source import FrameSource
-from maniskill_tomato.deploy.replay import load_recording
+from maniskill_tomato.deploy.run_replay import load_recording
 from maniskill_tomato.deploy.steps import KeptSteps, RunResult, Step
 from maniskill_tomato.deploy.stops import Stops
 from maniskill_tomato.deploy.workcell import make_workcell
@@ -94,7 +94,7 @@ def world() -> TwinWorld:
 
 def record(path: Path, of: TwinWorld, postures: Sequence[Float64]) -> None:
     """What a D435 would send from these postures: colours, and raw depth from the left infrared imager."""
-    from maniskill_tomato.deploy.realsense.recording import write_recording
+    from maniskill_tomato.deploy.realsense.realsense_recording import write_recording
 
     pictures: list[tuple[NDArray[np.uint8], NDArray[np.uint16]]] = []
     for joints in postures:

@@ -10,12 +10,12 @@ import numpy as np
 import pytest
 
 from maniskill_tomato.cli import main
-from maniskill_tomato.deploy.errors import RecordingError
+from maniskill_tomato.deploy.deploy_errors import RecordingError
 from maniskill_tomato.deploy.interface import Frame
+from maniskill_tomato.deploy.policy_run import RunConfig, run
 from maniskill_tomato.deploy.profile import Profile, load_profile, parse_profile
 from maniskill_tomato.deploy.recording import McapRecorder, decode_depth, encode_depth, read_messages
-from maniskill_tomato.deploy.replay import load_recording, replay
-from maniskill_tomato.deploy.run import RunConfig, run
+from maniskill_tomato.deploy.run_replay import load_recording, replay
 from maniskill_tomato.deploy.steps import RunResult
 from maniskill_tomato.robot.d435 import T_flange_camera_color_optical
 

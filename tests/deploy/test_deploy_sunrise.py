@@ -17,8 +17,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from maniskill_tomato.deploy.clock import MonotonicClock
-from maniskill_tomato.deploy.drivers import DriverContext, make_arm, make_camera
-from maniskill_tomato.deploy.errors import (
+from maniskill_tomato.deploy.deploy_errors import (
     DeployError,
     DeviceTimeoutError,
     FaultError,
@@ -27,6 +26,7 @@ from maniskill_tomato.deploy.errors import (
     ProtocolError,
     RefusedError,
 )
+from maniskill_tomato.deploy.drivers import DriverContext, make_arm, make_camera
 from maniskill_tomato.deploy.interface import Arm, JointMove
 from maniskill_tomato.deploy.profile import load_profile
 from maniskill_tomato.deploy.sunrise.client import SunriseClient

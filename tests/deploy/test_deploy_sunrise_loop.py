@@ -14,7 +14,7 @@ from maniskill_tomato.deploy.interface import Float64
 from maniskill_tomato.deploy.loop import Loop
 from maniskill_tomato.deploy.loop_config import LoopConfig
 from maniskill_tomato.deploy.mock.episode import load_episode
-from maniskill_tomato.deploy.mock.options import twin_options, twin_world
+from maniskill_tomato.deploy.mock.twin_options import twin_options, twin_world
 from maniskill_tomato.deploy.policies import TASK
 from maniskill_tomato.deploy.robot_perception import TruthPerception
 from maniskill_tomato.deploy.safety import Safety

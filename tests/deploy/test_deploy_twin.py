@@ -10,8 +10,8 @@ import pytest
 import torch
 
 from maniskill_tomato.deploy.clock import SimulatedClock
+from maniskill_tomato.deploy.deploy_errors import NotConnectedError, PerceptionError, ProfileError
 from maniskill_tomato.deploy.drivers import DriverContext, make_arm, make_camera
-from maniskill_tomato.deploy.errors import NotConnectedError, PerceptionError, ProfileError
 from maniskill_tomato.deploy.interface import JointMove
 from maniskill_tomato.deploy.mock.dynamics import ArmDynamics
 from maniskill_tomato.deploy.mock.episode import load_episode

@@ -15,9 +15,9 @@ from maniskill_tomato.deploy.move_choice import MoveChooser, MoveRequest
 from maniskill_tomato.deploy.safety import Safety
 from maniskill_tomato.deploy.safety_config import Box, SafetyConfig
 from maniskill_tomato.robot.d435 import T_flange_camera_color_optical
-from maniskill_tomato.robot.description import link_meshes, urdf_path
 from maniskill_tomato.robot.iiwa14 import LINK_NAMES, READY_QPOS
 from maniskill_tomato.robot.kinematics import forward_kinematics, link_transforms
+from maniskill_tomato.robot.robot_description import link_meshes, urdf_path
 
 mj: Any = mujoco
 

@@ -12,14 +12,14 @@ from torch.nn.utils.rnn import pack_sequence, unpack_sequence
 
 from maniskill_tomato.errors import InvalidInputError, PolicyError
 from maniskill_tomato.experiments.rollout import run_episode
-from maniskill_tomato.learning.imitation.collect import ImitationData, collect_demonstrations
-from maniskill_tomato.learning.imitation.fit import (
+from maniskill_tomato.learning.imitation.imitation_config import ImitationConfig, ImitationFitConfig
+from maniskill_tomato.learning.imitation.imitation_fit import (
     direction_loss,
     fit_actor,
     fit_recurrent,
 )
-from maniskill_tomato.learning.imitation.imitation_config import ImitationConfig, ImitationFitConfig
-from maniskill_tomato.learning.imitation.training import train_imitation
+from maniskill_tomato.learning.imitation.imitation_training import train_imitation
+from maniskill_tomato.learning.imitation.teacher_episodes import ImitationData, collect_demonstrations
 from maniskill_tomato.learning.rl.envs import make_env
 from maniskill_tomato.policies.lattice_oracle import LatticeOracle
 from maniskill_tomato.policies.opening import open_policy

@@ -15,10 +15,10 @@ from maniskill_tomato.errors import CheckpointError, InvalidInputError, PolicyEr
 from maniskill_tomato.experiments.metrics import summarise
 from maniskill_tomato.experiments.rollout import run_episode, run_episodes
 from maniskill_tomato.learning.rl.envs import make_env
-from maniskill_tomato.learning.view_quality.collect import QualityData, collect_episodes
-from maniskill_tomato.learning.view_quality.fit import fit, judge, mirrored
 from maniskill_tomato.learning.view_quality.quality_config import FitConfig, QualityTrainConfig
-from maniskill_tomato.learning.view_quality.training import train_view_quality
+from maniskill_tomato.learning.view_quality.quality_episodes import QualityData, collect_episodes
+from maniskill_tomato.learning.view_quality.quality_fit import fit, judge, mirrored
+from maniskill_tomato.learning.view_quality.quality_training import train_view_quality
 from maniskill_tomato.policies.adapters import as_state_policy
 from maniskill_tomato.policies.moves import move_towards
 from maniskill_tomato.policies.next_best_view import NextBestView

@@ -11,7 +11,11 @@ import trimesh
 from numpy.typing import NDArray
 
 from maniskill_tomato.errors import InvalidInputError
-from maniskill_tomato.plants.config import (
+from maniskill_tomato.plants.fruit import classify
+from maniskill_tomato.plants.generator import generate_plant
+from maniskill_tomato.plants.materials import MATERIALS
+from maniskill_tomato.plants.organs import Organ, Plant, SemanticClass
+from maniskill_tomato.plants.plant_config import (
     PRESETS,
     FruitConfig,
     HidingConfig,
@@ -22,10 +26,6 @@ from maniskill_tomato.plants.config import (
     make_config,
     make_full_config,
 )
-from maniskill_tomato.plants.fruit import classify
-from maniskill_tomato.plants.generator import generate_plant
-from maniskill_tomato.plants.materials import MATERIALS
-from maniskill_tomato.plants.organs import Organ, Plant, SemanticClass
 from maniskill_tomato.plants.stem import grow_shoot
 
 Float64 = NDArray[np.float64]

@@ -12,9 +12,9 @@ from maniskill_tomato.plants.generator import generate_plant
 from maniskill_tomato.plants.organs import Plant
 from maniskill_tomato.raycast.scene import CLEARANCE_RANGE, PATH_SAMPLES, RayScene
 from maniskill_tomato.robot.d435 import color_intrinsics
-from maniskill_tomato.robot.description import link_meshes
 from maniskill_tomato.robot.iiwa14 import LINK_NAMES
 from maniskill_tomato.robot.kinematics import link_transforms
+from maniskill_tomato.robot.robot_description import link_meshes
 from maniskill_tomato.robot.spheres import LINK_SPHERES, sphere_table
 from maniskill_tomato.tasks.maniskill.agent import READY_QPOS
 

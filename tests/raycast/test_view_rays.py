@@ -23,9 +23,9 @@ from maniskill_tomato.raycast.view_rays import (
 )
 from maniskill_tomato.raycast.warp_scene import VIEWS_AT_ONCE
 from maniskill_tomato.robot.d435 import CameraIntrinsics, color_intrinsics
-from maniskill_tomato.robot.description import link_meshes
 from maniskill_tomato.robot.iiwa14 import LINK_NAMES
 from maniskill_tomato.robot.look_at import look_at_pose, look_frame
+from maniskill_tomato.robot.robot_description import link_meshes
 
 RAYS = RAYS_PER_SIDE**2
 RADIUS = 0.035

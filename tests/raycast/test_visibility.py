@@ -21,9 +21,9 @@ from maniskill_tomato.robot.d435 import (
     T_flange_camera_color_optical,
     color_intrinsics,
 )
-from maniskill_tomato.robot.description import link_meshes
 from maniskill_tomato.robot.iiwa14 import LINK_NAMES
 from maniskill_tomato.robot.kinematics import link_transforms
+from maniskill_tomato.robot.robot_description import link_meshes
 
 Float = NDArray[np.float64]
 FRUIT_CLASS: dict[Ripeness, SemanticClass] = {

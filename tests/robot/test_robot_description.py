@@ -14,7 +14,7 @@ import trimesh
 from build_robot import build
 from maniskill_tomato import assets
 from maniskill_tomato.errors import InvalidInputError
-from maniskill_tomato.robot import d435, description, iiwa14
+from maniskill_tomato.robot import d435, iiwa14, robot_description
 from maniskill_tomato.robot.kinematics import link_transforms
 from robot_model import glb, meshes, solids, urdf
 
@@ -46,12 +46,12 @@ HOME, BENT = np.zeros(7), np.deg2rad([0, 20, 0, -70, 0, 90, 0])
 
 @pytest.fixture(scope="module")
 def root() -> ET.Element:
-    return ET.parse(description.urdf_path()).getroot()
+    return ET.parse(robot_description.urdf_path()).getroot()
 
 
 @pytest.fixture(scope="module")
 def model() -> Any:
-    return mj.MjModel.from_xml_path(description.urdf_path())
+    return mj.MjModel.from_xml_path(robot_description.urdf_path())
 
 
 @pytest.fixture
@@ -181,7 +181,7 @@ def test_camera_frames_stand_where_the_constants_say(model: Any, data: Any) -> N
 
 
 def test_every_link_that_one_sees_can_be_hit(root: ET.Element) -> None:
-    for name in description.VISIBLE_LINK_NAMES:
+    for name in robot_description.VISIBLE_LINK_NAMES:
         link = element(root, f"link[@name='{name}']")
         assert link.findall("collision"), name
         assert not link.findall("collision/geometry/mesh"), name
@@ -225,7 +225,7 @@ def distance_to_shapes(points: np.ndarray, shapes: tuple[urdf.Primitive, ...]) -
 
 
 def test_collision_shapes_hold_the_visible_shells() -> None:
-    for name, (vertices, _) in description.link_meshes().items():
+    for name, (vertices, _) in robot_description.link_meshes().items():
         distances = distance_to_shapes(vertices, urdf.COLLISION_SHAPES[name])
         if name == "link_ee":
             camera = (vertices - d435.T_flange_camera[:3, 3]) @ d435.T_flange_camera[:3, :3]
@@ -236,7 +236,7 @@ def test_collision_shapes_hold_the_visible_shells() -> None:
 
 
 def test_link_meshes_are_closed_sets_of_triangles_within_the_budget() -> None:
-    shapes = description.link_meshes()
+    shapes = robot_description.link_meshes()
     assert tuple(shapes) == iiwa14.LINK_NAMES
     for name, (vertices, faces) in shapes.items():
         assert vertices.dtype == np.float32 and vertices.shape[1:] == (3,), name
@@ -249,7 +249,9 @@ def test_link_meshes_are_closed_sets_of_triangles_within_the_budget() -> None:
         volume = np.einsum("fi,fi->", corners[:, 0], np.cross(corners[:, 1], corners[:, 2])) / 6
         assert volume > 0, f"{name} is inside out"
     total = sum(
-        path.stat().st_size for path in Path(description.urdf_path()).parent.rglob("*") if path.is_file()
+        path.stat().st_size
+        for path in Path(robot_description.urdf_path()).parent.rglob("*")
+        if path.is_file()
     )
     assert total < 3_000_000
 
@@ -258,7 +260,7 @@ def test_link_meshes_meet_at_the_joints_in_the_home_pose() -> None:
     poses = link_transforms(torch.zeros(1, 7, dtype=torch.float64))[0].numpy()
     placed = {
         name: vertices @ poses[i, :3, :3].T + poses[i, :3, 3]
-        for i, (name, (vertices, _)) in enumerate(description.link_meshes().items())
+        for i, (name, (vertices, _)) in enumerate(robot_description.link_meshes().items())
     }
     assert placed["link_0"][:, 2].min() == pytest.approx(0.0, abs=1e-6)
     for name, (below, above, height) in {
@@ -276,7 +278,7 @@ def test_link_meshes_meet_at_the_joints_in_the_home_pose() -> None:
 
 
 def test_nothing_of_the_robot_is_in_front_of_the_camera() -> None:
-    vertices, _ = description.link_meshes()["link_ee"]
+    vertices, _ = robot_description.link_meshes()["link_ee"]
     optical = (vertices - d435.T_flange_camera_color_optical[:3, 3]) @ d435.T_flange_camera_color_optical[
         :3, :3
     ]
@@ -284,13 +286,13 @@ def test_nothing_of_the_robot_is_in_front_of_the_camera() -> None:
 
 
 def test_link_meshes_can_be_changed_without_harm() -> None:
-    vertices, _ = description.link_meshes()["link_3"]
+    vertices, _ = robot_description.link_meshes()["link_3"]
     vertices += 1.0
-    assert np.abs(description.link_meshes()["link_3"][0] - vertices).min() > 0.5
+    assert np.abs(robot_description.link_meshes()["link_3"][0] - vertices).min() > 0.5
 
 
 def test_the_generator_gives_the_shipped_files(tmp_path: Path) -> None:
-    shipped = Path(description.urdf_path()).parent
+    shipped = Path(robot_description.urdf_path()).parent
     files = build(tmp_path)
     assert {f.relative_to(tmp_path) for f in files} == {
         f.relative_to(shipped) for f in shipped.rglob("*") if f.is_file()
@@ -306,7 +308,7 @@ def test_the_generator_gives_the_shipped_files(tmp_path: Path) -> None:
 def test_a_missing_urdf_is_said_and_not_asked_about(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(assets, "ASSETS_DIR", tmp_path)
     with pytest.raises(FileNotFoundError, match="iiwa14.urdf"):
-        description.urdf_path()
+        robot_description.urdf_path()
 
 
 def test_an_unknown_link_has_no_parts() -> None:

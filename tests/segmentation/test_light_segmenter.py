@@ -438,6 +438,38 @@ def test_two_looks_at_one_image_are_joined_in_order_and_sizes_are_shared_out() -
         LightSegmenter(network, scales=(0.5, 1.0))
 
 
+def square(size: int, left: float, side: float) -> TrainingPicture:
+    """A picture with one square fruit in the middle of its height."""
+    top = (size - side) / 2
+    box = np.array([[left, top, left + side, top + side]], np.float32)
+    labels = np.zeros((size, size), np.int16)
+    labels[round(top) : round(top + side), round(left) : round(left + side)] = 1
+    return TrainingPicture(
+        image=np.zeros((size, size, 3), np.uint8),
+        boxes=box,
+        ignored=np.zeros(1, bool),
+        labels=labels,
+        whole_boxes=box,
+        categories=np.zeros(1, np.int64),
+    )
+
+
+@pytest.mark.parametrize(("side", "found_at"), [(40, [20]), (120, [20, 400]), (240, [400])])
+def test_fruits_too_large_for_the_fine_look_are_left_to_the_coarse_one_and_the_other_way_round(
+    monkeypatch: pytest.MonkeyPatch, side: float, found_at: list[float]
+) -> None:
+    """A network that finds a fruit of one size, at the left in the fine image and at the right in the coarse one."""
+
+    def look(image: torch.Tensor) -> FruitMaps:
+        size = image.shape[3]
+        return perfect_maps(square(size, 20.0 if size == 704 else 200.0, side * size / 704))
+
+    monkeypatch.setattr("maniskill_tomato.segmentation.light_segmenter.FruitSession", lambda network: look)
+    segmenter = LightSegmenter(FruitNetwork(SMALL), longest_side=704)
+    found = segmenter(np.zeros((704, 704, 3), np.uint8))
+    assert sorted(found.boxes[:, 0].round().tolist()) == found_at
+
+
 def turned(boxes: NDArray[np.float32], width: int) -> NDArray[np.float32]:
     """Boxes of a mirror image."""
     return np.asarray(

@@ -14,7 +14,8 @@ from mani_skill.utils.registration import register_env
 from mani_skill.utils.structs import Pose
 
 from maniskill_tomato.errors import InvalidInputError
-from maniskill_tomato.robot import d435, description, iiwa14
+from maniskill_tomato.robot import d435, iiwa14
+from maniskill_tomato.robot import robot_description as description
 from maniskill_tomato.robot.kinematics import link_transforms
 from maniskill_tomato.tasks.maniskill import agent as agent_module
 from maniskill_tomato.tasks.maniskill.agent import READY_QPOS, REST_QPOS, D435CameraConfig, Iiwa14D435

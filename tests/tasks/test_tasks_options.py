@@ -14,13 +14,30 @@ import torch
 import maniskill_tomato  # noqa: F401
 from maniskill_tomato.errors import InvalidInputError
 from maniskill_tomato.plants.spec import SEED_SPLITS, PlantPose, PlantSpec
+from maniskill_tomato.tasks import TASK_IDS
 
-GUIDED = "TomatoViewpointGuided-v1"
+GUIDED, SPARSE = TASK_IDS[:2]
 
 
 def make(**kwargs: Any) -> Any:
     options: dict[str, Any] = {"num_envs": 1, "obs_mode": "state", "render_backend": "none"} | kwargs
     return gym.make(GUIDED, **options)
+
+
+@pytest.mark.parametrize("env_id", TASK_IDS)
+def test_the_normalised_reward_is_the_reward_over_the_largest_that_a_move_can_have(env_id: str) -> None:
+    """The largest are Eq. 5-1's and Eq. 5-7's bounds, and in the other tasks a gain of 1 with the success reward."""
+    largest = {GUIDED: 1.5, SPARSE: 1.0}.get(env_id, 0.0)
+    rewards = []
+    for mode in ("dense", "normalized_dense"):
+        env: Any = gym.make(env_id, obs_mode="state", render_backend="none", reward_mode=mode)
+        env.reset(seed=3)
+        actions = [torch.full(env.action_space.shape, size) for size in (0.05, 1.0)]
+        rewards.append([float(env.step(action)[1]) for action in actions])
+        largest = largest or 1.0 + env.unwrapped.task.success_reward
+        env.close()
+    assert any(abs(reward) > 0.01 for reward in rewards[0])
+    np.testing.assert_allclose(np.multiply(rewards[1], largest), rewards[0], rtol=1e-5)
 
 
 @pytest.mark.parametrize(

@@ -10,7 +10,13 @@ from typing import Literal
 import numpy as np
 from numpy.random import Generator
 
-from maniskill_tomato.plants.config import FruitConfig, LeafConfig, PlantConfig, TrussConfig, make_full_config
+from maniskill_tomato.plants.plant_config import (
+    FruitConfig,
+    LeafConfig,
+    PlantConfig,
+    TrussConfig,
+    make_full_config,
+)
 
 Colour = tuple[float, float, float]
 Backdrop = Literal["foliage", "gutters", "bright"]

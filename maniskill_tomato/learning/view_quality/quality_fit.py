@@ -8,8 +8,8 @@ from torch import Tensor
 from torch.nn import functional
 
 from maniskill_tomato.errors import TrainingDivergedError
-from maniskill_tomato.learning.view_quality.collect import QualityData
 from maniskill_tomato.learning.view_quality.quality_config import FitConfig
+from maniskill_tomato.learning.view_quality.quality_episodes import QualityData
 from maniskill_tomato.policies.quality_network import ViewQualityNetwork
 from maniskill_tomato.policies.view_quality import new_network
 

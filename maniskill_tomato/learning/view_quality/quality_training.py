@@ -16,9 +16,9 @@ from maniskill_tomato.errors import CheckpointError, InvalidInputError
 from maniskill_tomato.files import write_atomically
 from maniskill_tomato.learning.blocks import Block, run_blocks
 from maniskill_tomato.learning.rl.envs import make_env
-from maniskill_tomato.learning.view_quality.collect import QualityData, collect_episodes
-from maniskill_tomato.learning.view_quality.fit import fit
 from maniskill_tomato.learning.view_quality.quality_config import VALIDATION_SEED, QualityTrainConfig
+from maniskill_tomato.learning.view_quality.quality_episodes import QualityData, collect_episodes
+from maniskill_tomato.learning.view_quality.quality_fit import fit
 from maniskill_tomato.policies.quality_network import ViewQualityNetwork
 from maniskill_tomato.policies.view_quality import ViewQuality, load_view_quality, save_view_quality
 

@@ -14,7 +14,7 @@ import torch
 
 from maniskill_tomato.deploy.capture import Capture
 from maniskill_tomato.deploy.clock import SimulatedClock
-from maniskill_tomato.deploy.errors import CutOffError, NotConnectedError, RecordingError
+from maniskill_tomato.deploy.deploy_errors import CutOffError, NotConnectedError, RecordingError
 from maniskill_tomato.deploy.guarded_arm import GuardedArm
 from maniskill_tomato.deploy.interface import Arm, ArmState, Camera, Float64, Frame, FrameTruth, JointMove
 from maniskill_tomato.deploy.loop import Loop

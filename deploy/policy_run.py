@@ -9,7 +9,7 @@ from typing import Any
 
 from maniskill_tomato import __version__
 from maniskill_tomato.deploy.clock import Clock
-from maniskill_tomato.deploy.errors import ProfileError, RecordingError
+from maniskill_tomato.deploy.deploy_errors import ProfileError, RecordingError
 from maniskill_tomato.deploy.loop_config import Mode, Proposal
 from maniskill_tomato.deploy.policies import TASK, default_policy
 from maniskill_tomato.deploy.profile import Profile

@@ -19,7 +19,7 @@ from maniskill_tomato.deploy.calibration.hand_eye import (
 from maniskill_tomato.deploy.calibration.rigid import inverse, rotation_from_vector, transform
 from maniskill_tomato.deploy.calibration.view_folder import RecordedView, board_view, flange_pose, write_views
 from maniskill_tomato.deploy.clock import Clock
-from maniskill_tomato.deploy.errors import StoppedError
+from maniskill_tomato.deploy.deploy_errors import StoppedError
 from maniskill_tomato.deploy.guarded_arm import GuardedArm
 from maniskill_tomato.deploy.interface import ArmState, Camera, Float64, JointMove
 from maniskill_tomato.deploy.stops import Stops

@@ -8,8 +8,8 @@ from torch.nn import functional
 from torch.nn.utils.rnn import pack_padded_sequence, pad_packed_sequence
 
 from maniskill_tomato.errors import TrainingDivergedError
-from maniskill_tomato.learning.imitation.collect import ImitationData
 from maniskill_tomato.learning.imitation.imitation_config import ImitationFitConfig
+from maniskill_tomato.learning.imitation.teacher_episodes import ImitationData
 
 MAGNITUDE_WEIGHT = 0.2
 """Weight of the error in the length of a move beside that of its direction."""

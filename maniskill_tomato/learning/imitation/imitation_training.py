@@ -14,9 +14,9 @@ import maniskill_tomato
 from maniskill_tomato.errors import InvalidInputError
 from maniskill_tomato.files import write_atomically
 from maniskill_tomato.learning.blocks import Block, run_blocks
-from maniskill_tomato.learning.imitation.collect import ImitationData, collect_demonstrations
-from maniskill_tomato.learning.imitation.fit import fit_actor, fit_recurrent
 from maniskill_tomato.learning.imitation.imitation_config import ImitationConfig
+from maniskill_tomato.learning.imitation.imitation_fit import fit_actor, fit_recurrent
+from maniskill_tomato.learning.imitation.teacher_episodes import ImitationData, collect_demonstrations
 from maniskill_tomato.learning.rl.agent import make_agent
 from maniskill_tomato.learning.rl.checkpoint import make_checkpoint, save_checkpoint
 from maniskill_tomato.learning.rl.envs import make_env

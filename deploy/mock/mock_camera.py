@@ -6,12 +6,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from maniskill_tomato.deploy.deploy_errors import DeviceTimeoutError, NotConnectedError
 from maniskill_tomato.deploy.drivers import DriverContext
-from maniskill_tomato.deploy.errors import DeviceTimeoutError, NotConnectedError
 from maniskill_tomato.deploy.interface import Camera, Frame
 from maniskill_tomato.deploy.mock.faults import CameraFault
-from maniskill_tomato.deploy.mock.options import TwinOptions, twin_options, twin_world
 from maniskill_tomato.deploy.mock.painter import Painter, make_painter
+from maniskill_tomato.deploy.mock.twin_options import TwinOptions, twin_options, twin_world
 from maniskill_tomato.deploy.mock.world import TwinWorld
 from maniskill_tomato.raycast.view_rays import DEPTH_MODE
 from maniskill_tomato.robot.d435 import CameraIntrinsics, min_depth

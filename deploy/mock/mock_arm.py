@@ -6,16 +6,16 @@ from typing import Any, Final
 
 import numpy as np
 
-from maniskill_tomato.deploy.drivers import DriverContext
-from maniskill_tomato.deploy.errors import (
+from maniskill_tomato.deploy.deploy_errors import (
     DeployError,
     DeviceTimeoutError,
     NotConnectedError,
     RefusedError,
 )
+from maniskill_tomato.deploy.drivers import DriverContext
 from maniskill_tomato.deploy.interface import Arm, ArmState, JointMove
 from maniskill_tomato.deploy.mock.faults import ArmFault, Faults
-from maniskill_tomato.deploy.mock.options import twin_options, twin_world
+from maniskill_tomato.deploy.mock.twin_options import twin_options, twin_world
 from maniskill_tomato.deploy.mock.world import TwinWorld
 
 TICK: Final = 0.02
