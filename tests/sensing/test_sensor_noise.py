@@ -71,25 +71,17 @@ def test_noise_that_makes_no_sense_is_refused() -> None:
 
 
 def test_every_environment_has_its_own_errors() -> None:
-    """What one environment draws depends on its own seed and on how often it looked, not on the others."""
+    """What one environment measures follows from its own seed, not from the others' or from how often they look."""
     there = ViewRays(
         torch.tensor([0.0, 0.0, 1.0]).expand(2, 64, 3),
         torch.full((2, 64), 0.5),
         torch.full((2, 64), int(RayLabel.OTHER), dtype=torch.int8),
     )
     noise = SensorNoise(depth_noise=1.0, dropout=0.2, false_target=0.1)
-
-    def errors(seeds: tuple[int, int]) -> SensorErrors:
-        made = SensorErrors(noise, 2, torch.device("cpu"))
-        for k, seed in enumerate(seeds):
-            made.begin(k, np.random.RandomState(seed))
-        return made
-
-    both, other = errors((1, 2)), errors((1, 3))
-    first, beside = both.rays(there), other.rays(there)
-    assert torch.equal(first.distance[0], beside.distance[0]) and torch.equal(first.label[0], beside.label[0])
-    assert not torch.equal(first.distance[1], beside.distance[1])
-    # The second environment looks alone: the first one's next view is the same as without that.
-    alone = both.rays(there, torch.tensor([False, True]))
+    errors = SensorErrors(noise, torch.device("cpu"))
+    both, other = errors.rays(there, {0: 1, 1: 2}), errors.rays(there, {0: 1, 1: 3})
+    assert torch.equal(both.distance[0], other.distance[0]) and torch.equal(both.label[0], other.label[0])
+    assert not torch.equal(both.distance[1], other.distance[1])
+    alone = errors.rays(there, {1: 2})
     assert torch.equal(alone.distance[0], there.distance[0])
-    assert torch.equal(both.rays(there).distance[0], other.rays(there).distance[0])
+    assert torch.equal(alone.distance[1], both.distance[1])
