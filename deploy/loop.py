@@ -1,9 +1,9 @@
-"""The loop: look, decide, check, move, settle, until the target is seen or something speaks against going on.
+"""The control loop: take a picture, decide, check, move, settle, until the target is seen or a reason to stop occurs.
 
     capture -> perceive -> observe -> policy -> kinematics -> safety -> arm -> settle -> capture
 
-A move that the kinematics or `safety` refuse counts as one, as in the simulated task: the policy sees that the camera
-has not moved and tries something else.
+A move that the kinematics or `safety` refuses counts as a move, as in the simulated task. The policy sees that the
+camera has not moved and tries something else.
 """
 
 import logging

@@ -1,4 +1,6 @@
-"""A profile: which devices, where the camera sits, what is safe, when to end. TOML; errors name the key."""
+"""Profiles: TOML files that name the devices, the camera's pose on the flange, the safety limits and the end of a run.
+
+Errors name the key."""
 
 import json
 import tomllib

@@ -1,7 +1,7 @@
-"""A recorded run through today's code: the real loop over devices that play it, and what comes out otherwise.
+"""Replays a recorded run through the current code and reports where its decisions differ.
 
-The arm stands where it stood, whatever is commanded now, and the camera shows what it showed. So every decision is
-compared on the same pictures, also after one that differs.
+The arm stands where it stood then, whatever is commanded now, and the camera shows the recorded pictures. Every decision
+is therefore compared on the same pictures, even after one that differs.
 """
 
 from collections.abc import Iterator

@@ -1,4 +1,4 @@
-"""The devices of a profile with everything that stands between them and the policy."""
+"""The devices of a profile, and what connects them to the policy."""
 
 from collections.abc import Callable
 from dataclasses import dataclass

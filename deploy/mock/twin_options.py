@@ -1,4 +1,4 @@
-"""What a profile may say about the twin; its arm and its camera share one world."""
+"""The twin's options in a profile. Its arm and its camera share one world."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass

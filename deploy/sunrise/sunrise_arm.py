@@ -1,4 +1,4 @@
-"""The driver `sunrise`: an iiwa as an `Arm`, every reading checked, every move short, guarded by torque and verified.
+"""The driver `sunrise`: an iiwa as an `Arm`. Readings are checked; moves are short, guarded by torque and verified.
 
 A point-to-point move of the controller cannot be stopped over the network: only the smartPAD or the emergency stop
 halts it. Moves are therefore sent in pieces, and `stop` keeps the next piece back.
