@@ -34,9 +34,9 @@ from maniskill_tomato.deploy.plant_points import PlantPoints
 from maniskill_tomato.deploy.policies import decide
 from maniskill_tomato.deploy.robot_belief import RobotBelief
 from maniskill_tomato.deploy.robot_perception import Perception
+from maniskill_tomato.deploy.run_records import Recorder, RunResult, Step
 from maniskill_tomato.deploy.safety import Refusal
 from maniskill_tomato.deploy.stage_times import StageTimes
-from maniskill_tomato.deploy.steps import Recorder, RunResult, Step
 from maniskill_tomato.deploy.stops import Stops
 from maniskill_tomato.errors import PolicyError, TomatoError
 from maniskill_tomato.policies.protocol import Policy
