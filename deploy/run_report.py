@@ -10,17 +10,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from maniskill_tomato.deploy.deploy_errors import RecordingError
-from maniskill_tomato.deploy.steps import RunResult, Step
+from maniskill_tomato.deploy.run_records import RunResult, Step
 from maniskill_tomato.errors import TomatoError
 from maniskill_tomato.files import write_atomically
+from maniskill_tomato.report_design import INK, rgb
 
 TILE: Final = (320, 240)
 """Largest size of one look, in [px]."""
 BAR: Final = 34
 """Height of the caption below it, in [px]."""
 COLUMNS: Final = 5
-INK, PAPER, MARK = (40, 40, 40), (255, 255, 255), (0, 230, 255)
-"""Text, background, outline of the target; RGB."""
+MARK = (0, 230, 255)
+"""Outline of the target; RGB."""
 
 
 class Contact:
@@ -110,4 +111,4 @@ def _tile(step: Step) -> NDArray[np.uint8]:
 
 
 def _write(image: NDArray[np.uint8], text: str, at: tuple[int, int], size: float) -> None:
-    cv2.putText(image, text, at, cv2.FONT_HERSHEY_SIMPLEX, size, INK, 1, cv2.LINE_AA)
+    cv2.putText(image, text, at, cv2.FONT_HERSHEY_SIMPLEX, size, rgb(INK), 1, cv2.LINE_AA)

@@ -4,7 +4,7 @@ simulation.
 What the base class would do wrong here, and what is done instead:
 
 - State observations would be the simulated robot's: they are made from the measured joints and the picture.
-- Kinematic tasks set no drive targets: the goal is read from the controller.
+- Kinematic tasks set no drive targets: the goal is the world's plan.
 - The picture would be cropped to a square and depth lose an axis: the agent delivers what the simulation has.
 - A dense reward would raise, `evaluate`'s numbers be missing: both are computed from what the camera sees.
 - A reset would wait for the enter key and send the arm to a simulated start: the arm stays where it is.
@@ -28,8 +28,11 @@ from maniskill_tomato.deploy.real_agent import IiwaRealAgent
 from maniskill_tomato.deploy.robot_belief import RobotBelief
 from maniskill_tomato.deploy.robot_perception import Sighting
 from maniskill_tomato.robot.inverse_kinematics import Reach
-from maniskill_tomato.tasks.maniskill.look_at_controller import LookAtController
-from maniskill_tomato.tasks.maniskill.viewpoint_controller import ViewpointController
+from maniskill_tomato.robot.viewpoint_move import viewpoint_of
+from maniskill_tomato.tasks.arm_moves import ACTION_SIZES
+from maniskill_tomato.tasks.maniskill.controllers import CONTROL_MODES
+from maniskill_tomato.tasks.row.config import GeneralTaskConfig
+from maniskill_tomato.tasks.world import World, check_action
 
 logger = logging.getLogger(__name__)
 
@@ -59,9 +62,9 @@ class TomatoSim2RealEnv(Sim2RealEnv):  # type: ignore[misc]
             DeployError: A device fails.
         """
         base: Any = sim_env.unwrapped
-        if not isinstance(base.agent.controller, ViewpointController):
+        if base.control_mode not in CONTROL_MODES:
             raise ProfileError(
-                f"control_mode must be pd_viewpoint or pd_look_at on hardware, got {base.agent.control_mode!r}"
+                f"control_mode must be {' or '.join(CONTROL_MODES)} on hardware, got {base.control_mode!r}"
             )
         self._robot_belief: RobotBelief | None = None
         self._view: Sighting | None = None
@@ -98,6 +101,7 @@ class TomatoSim2RealEnv(Sim2RealEnv):  # type: ignore[misc]
         workcell = self.agent.workcell
         workcell.perception.begin(workcell.target_position())
         self._moves, self._refused, self._fraction_before = 0, False, 0.0
+        self._viewpoint: Tensor = self._world.state.viewpoint.clone()
         layout = getattr(self.base_sim_env, "layout", None)
         if layout is not None:
             self._robot_belief = RobotBelief(workcell.profile.T_flange_camera, self._max_moves, layout)
@@ -114,22 +118,18 @@ class TomatoSim2RealEnv(Sim2RealEnv):  # type: ignore[misc]
     def _step_action(self, action: Any) -> Any:
         if action is None:
             return None
-        base: Any = self.base_sim_env
-        batch: Tensor = base._checked_action(action)
-        self._follow_the_arm()
-        controller: Any = base.agent.controller
-        controller.viewpoint = base._viewpoint
-        if isinstance(controller, LookAtController):
-            controller.target_position = self._target_tensor()
-        controller.set_action(batch)
-        self._reach = controller.reach.clone()
+        moves = self._world.moves
+        batch = check_action(action, 1, ACTION_SIZES[moves.control], self._world.device)
+        qpos = self._follow_the_arm()
+        plan = moves.plan(qpos, self._viewpoint, self._target_tensor(), batch)
+        self._reach = plan.reach.clone()
         self._moves += 1
         assert self._view is not None
         self._fraction_before = self._view.visible_fraction
         self._refused = False
         try:
-            self.agent.set_target_qpos(controller.target_qpos)
-            base._viewpoint = controller.viewpoint
+            self.agent.set_target_qpos(plan.target_qpos)
+            self._viewpoint = plan.viewpoint
         except RefusedError as error:
             self._refused = True
             logger.warning("the arm stays: %s", error)
@@ -165,17 +165,17 @@ class TomatoSim2RealEnv(Sim2RealEnv):  # type: ignore[misc]
 
     def compute_dense_reward(self, obs: Any, action: Tensor, info: Mapping[str, Tensor]) -> Tensor:
         """The task's reward of what the camera sees, without contact. Shape (1,)."""
-        known = {"plant_contact": torch.zeros(1, dtype=torch.bool), **info}
-        task: Any = type(self.base_sim_env)
-        reward: Tensor = task.compute_dense_reward(self, obs, action, known)
-        return reward
+        task = self._world.task
+        if not isinstance(task, GeneralTaskConfig):
+            reward: Tensor = task.reward(info["reward_visual"], info["reward_penalty"])
+            return reward
+        fraction, success = info["visible_fraction"], info["success"]
+        before = torch.full_like(fraction, self._fraction_before)
+        return task.reward(fraction, before, success, torch.zeros_like(success))
 
     def compute_normalized_dense_reward(self, obs: Any, action: Tensor, info: Mapping[str, Tensor]) -> Tensor:
         """The reward over its largest value. Shape (1,)."""
-        known = {"plant_contact": torch.zeros(1, dtype=torch.bool), **info}
-        task: Any = type(self.base_sim_env)
-        reward: Tensor = task.compute_normalized_dense_reward(self, obs, action, known)
-        return reward
+        return self.compute_dense_reward(obs, action, info) / float(self._world.task.largest_reward)
 
     def _get_obs_state_dict(self, info: Mapping[str, Any]) -> dict[str, Any]:
         return {"agent": self._get_obs_agent(), "extra": self._get_obs_extra(info)}
@@ -185,10 +185,9 @@ class TomatoSim2RealEnv(Sim2RealEnv):  # type: ignore[misc]
         if self._robot_belief is not None:
             vector = self._vector
             return {name: vector[:, part].clone() for name, part in base.layout.slices.items()}
-        viewpoint: Tensor = base._viewpoint
         return {
-            "ee_position": viewpoint[:, :3].clone(),
-            "ee_rpy": viewpoint[:, 3:].clone(),
+            "ee_position": self._viewpoint[:, :3].clone(),
+            "ee_rpy": self._viewpoint[:, 3:].clone(),
             "target_position": self._target_tensor(),
         }
 
@@ -210,12 +209,20 @@ class TomatoSim2RealEnv(Sim2RealEnv):  # type: ignore[misc]
             left = max(0, self._max_moves - self._moves)
             self._vector = self._robot_belief.observe(joints, view, left).observation
 
-    def _follow_the_arm(self) -> None:
-        """Puts the simulated arm where the real one stands."""
+    def _follow_the_arm(self) -> Tensor:
+        """Puts the simulated arm where the real one stands; returns the joint positions. Shape (1, 7)."""
         base: Any = self.base_sim_env
         _, joints = self.agent.look()
-        base.agent.robot.set_qpos(torch.as_tensor(np.array(joints), dtype=torch.float32)[None])
-        base._observe_viewpoint()
+        qpos = torch.as_tensor(np.array(joints), dtype=torch.float32)[None]
+        base.agent.robot.set_qpos(qpos)
+        self._viewpoint = viewpoint_of(qpos, self._viewpoint[:, 3:])
+        return qpos
+
+    @property
+    def _world(self) -> World:
+        base: Any = self.base_sim_env
+        world: World = base.world
+        return world
 
     def _target_tensor(self) -> Tensor:
         return torch.as_tensor(self.target_position, dtype=torch.float32)[None]

@@ -47,15 +47,10 @@ def _register(env_id: str, entry_point: str, max_episode_steps: int) -> None:
     )
 
 
-_register(
-    "TomatoViewpointGuided-v1",
-    "maniskill_tomato.tasks.thesis.env:TomatoViewpointGuidedEnv",
-    MAX_EPISODE_STEPS,
-)
-_register(
-    "TomatoViewpointSparse-v1",
-    "maniskill_tomato.tasks.thesis.env:TomatoViewpointSparseEnv",
-    MAX_EPISODE_STEPS,
-)
-_register("TomatoViewpoint-v1", "maniskill_tomato.tasks.row.env:TomatoViewpointGeneralEnv", MAX_GENERAL_STEPS)
-_register("TomatoViewpointRow-v1", "maniskill_tomato.tasks.row.row_env:TomatoViewpointRowEnv", MAX_ROW_STEPS)
+for _env_id, _env_class, _steps in (
+    ("TomatoViewpointGuided-v1", "TomatoViewpointGuidedEnv", MAX_EPISODE_STEPS),
+    ("TomatoViewpointSparse-v1", "TomatoViewpointSparseEnv", MAX_EPISODE_STEPS),
+    ("TomatoViewpoint-v1", "TomatoViewpointGeneralEnv", MAX_GENERAL_STEPS),
+    ("TomatoViewpointRow-v1", "TomatoViewpointRowEnv", MAX_ROW_STEPS),
+):
+    _register(_env_id, f"maniskill_tomato.tasks.maniskill.registered_envs:{_env_class}", _steps)

@@ -1,5 +1,6 @@
 """The pages of the documentation: every relative link leads somewhere."""
 
+import ast
 import re
 from pathlib import Path
 
@@ -30,3 +31,79 @@ def test_every_relative_link_leads_to_a_file_and_a_heading(page: Path) -> None:
         if not target.exists() or (anchor and anchor not in anchors(target)):
             broken.append(link)
     assert broken == []
+
+
+ROOMS = (
+    "assets",
+    "cli",
+    "deploy",
+    "experiments",
+    "learning",
+    "plants",
+    "policies",
+    "raycast",
+    "rendering",
+    "robot",
+    "segmentation",
+    "sensing",
+    "tasks",
+)
+
+
+def defined_names(path: Path) -> set[str]:
+    """What a module defines or imports at its top, and the members of its classes as `Class.member`."""
+    names: set[str] = set()
+    for node in ast.parse(path.read_text(encoding="utf-8")).body:
+        if isinstance(node, ast.FunctionDef):
+            names.add(node.name)
+        elif isinstance(node, ast.ClassDef):
+            names.add(node.name)
+            names.update(f"{node.name}.{name}" for name in _targets(node.body))
+            names.update(f"{node.name}.{m.name}" for m in node.body if isinstance(m, ast.FunctionDef))
+        elif isinstance(node, ast.Import | ast.ImportFrom):
+            names.update(alias.asname or alias.name for alias in node.names)
+    return names | _targets(ast.parse(path.read_text(encoding="utf-8")).body)
+
+
+def _targets(body: list[ast.stmt]) -> set[str]:
+    found = {n.target.id for n in body if isinstance(n, ast.AnnAssign) and isinstance(n.target, ast.Name)}
+    for node in body:
+        if isinstance(node, ast.Assign):
+            found.update(target.id for target in node.targets if isinstance(target, ast.Name))
+    return found
+
+
+def exists(dotted: str) -> bool:
+    """Whether a dotted name below the package is a folder, a module, or something that a module defines."""
+    parts = dotted.split(".")
+    for length in range(len(parts), 0, -1):
+        place = ROOT / "maniskill_tomato" / Path(*parts[:length])
+        rest = ".".join(parts[length:])
+        if place.with_suffix(".py").is_file():
+            return not rest or rest in defined_names(place.with_suffix(".py"))
+        if place.is_dir():
+            return (
+                not rest or (place / "__init__.py").is_file() and rest in defined_names(place / "__init__.py")
+            )
+    return False
+
+
+@pytest.mark.skipif(not (ROOT / "pyproject.toml").is_file(), reason="the tests run outside a checkout")
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
+def test_names_of_modules_in_the_text_exist(page: Path) -> None:
+    if page.name == "CHANGELOG.md":
+        pytest.skip("it also names what is gone")
+    text = page.read_text(encoding="utf-8")
+    rooms = "|".join(ROOMS)
+    pattern = rf"(?:maniskill_tomato\.|(?<![-\w./]))((?:{rooms})(?:\.[A-Za-z_]\w*)+)\b"
+    dotted = re.findall(pattern, text)
+    missing = {
+        name for name in dotted if not exists(name) and not name.endswith((".md", ".py", ".json", ".png"))
+    }
+    files = re.findall(rf"`((?:{rooms}|scripts|tools|tests|examples)/[\w/]+\.\w+)`", text)
+    gone = {
+        name
+        for name in files
+        if not (ROOT / name).exists() and not (ROOT / "maniskill_tomato" / name).exists()
+    }
+    assert missing | gone == set()

@@ -46,7 +46,7 @@ EXCEPTIONS = {
 SIMULATOR_USERS = (
     "rendering",
     "segmentation.synthesis",
-    "tasks",
+    "tasks.maniskill",
     "learning.rl.envs",
     "learning.rl.gymnasium_env",
     "learning.imitation.demonstrations",

@@ -18,8 +18,8 @@ import tyro
 from numpy.typing import NDArray
 
 import maniskill_tomato  # noqa: F401
-from maniskill_tomato.assets import asset_path
-from maniskill_tomato.policies.trained_actor import load_actor
+from maniskill_tomato.policies.adapters import as_state_policy
+from maniskill_tomato.policies.opening import open_policy, shipped_policy
 
 TASK = "TomatoViewpointGuided-v1"
 
@@ -48,7 +48,7 @@ def main(args: Args) -> int:
         human_render_camera_configs=dict(size),
         enable_shadow=True,
     )
-    policy = load_actor(asset_path(f"policies/{TASK}.pt"), "cpu", TASK)
+    policy = as_state_policy(open_policy(shipped_policy(TASK), env_id=TASK), env)
     obs, info = env.reset(seed=args.seed)
     first, first_fraction = _wrist(obs), float(info["visible_fraction"])
     moves, done = 0, False

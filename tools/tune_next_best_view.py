@@ -4,11 +4,9 @@ Usage:
     python tools/tune_next_best_view.py --episodes 120 --first-seed 50000
 """
 
-import itertools
 import json
-import math
 import sys
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -19,12 +17,12 @@ from maniskill_tomato.experiments.episode_record import EpisodeRecord
 from maniskill_tomato.experiments.metrics import summarise_policy
 from maniskill_tomato.experiments.rollout import run_episode
 from maniskill_tomato.learning.rl.envs import make_env
-from maniskill_tomato.policies.next_best_view import NextBestDirection, NextBestView, NextBestViewConfig
+from maniskill_tomato.policies.next_best_view import NextBestDirection, NextBestView
 
 
 @dataclass(frozen=True, kw_only=True)
 class Args:
-    """Options; every combination is tried."""
+    """Options."""
 
     episodes: int = 120
     """Episodes on validation plants, the same for all."""
@@ -33,8 +31,7 @@ class Args:
     planner: str = "nbv"
     """nbv or nbv_direction."""
     move_cost: tuple[float, ...] = (0.02, 0.05, 0.1, 0.15, 0.2)
-    unknown_gain: tuple[float, ...] = (0.0,)
-    similar_angle_deg: tuple[float, ...] = (8.0,)
+    """Costs of a move that are tried, in expected V_f."""
     out: Path | None = None
     """JSON file of the figures."""
 
@@ -42,23 +39,18 @@ class Args:
 def main(args: Args) -> None:
     """Runs all settings on each plant in turn, so that it grows once, and prints a line for each."""
     kind = NextBestDirection if args.planner == NextBestDirection.name else NextBestView
-    configs = [
-        NextBestViewConfig(move_cost=cost, unknown_gain=gain, similar_angle=math.radians(angle))
-        for cost, gain, angle in itertools.product(args.move_cost, args.unknown_gain, args.similar_angle_deg)
-    ]
     env: Any = make_env("TomatoViewpoint-v1", plant={"seed": "validation", "pool": None})
-    planners = [kind(config) for config in configs]
-    found: list[list[EpisodeRecord]] = [[] for _ in configs]
+    planners = [kind(cost) for cost in args.move_cost]
+    found: list[list[EpisodeRecord]] = [[] for _ in planners]
     for seed in range(args.first_seed, args.first_seed + args.episodes):
         for planner, episodes in zip(planners, found, strict=True):
             episodes.append(run_episode(env, planner, seed))
     rows = []
-    for config, episodes in zip(configs, found, strict=True):
+    for planner, episodes in zip(planners, found, strict=True):
         figures = summarise_policy(kind.name, episodes, int(env.unwrapped.task.max_moves))
-        rows.append({**asdict(config), **figures})
+        rows.append({"move_cost": planner.move_cost, **figures})
         print(
-            f"move_cost {config.move_cost:g}  unknown_gain {config.unknown_gain:g}  "
-            f"similar_angle {math.degrees(config.similar_angle):.0f}  success {figures['success_rate']:.3f}  "
+            f"move_cost {planner.move_cost:g}  success {figures['success_rate']:.3f}  "
             f"within 5 {figures['success_rate_within_moves']['5']:.3f}  moves {figures['mean_moves']:.2f}  "
             f"path {figures['mean_path_m']:.2f} m  contact {figures['contact_episode_rate']:.2f}"
         )

@@ -7,11 +7,16 @@ from matplotlib import font_manager
 from numpy.typing import NDArray
 from PIL import Image, ImageDraw, ImageFont
 
+from maniskill_tomato import report_design as design
+from maniskill_tomato.report_design import rgb
+
 BAND = 64
 """Height of the caption under the pictures, in [px]."""
 
-PAPER, INK, MUTED, TRACK = (250, 250, 247), (31, 42, 36), (107, 119, 112), (222, 228, 222)
-TOMATO, LEAF = (200, 64, 44), (63, 125, 78)
+PAPER, INK, MUTED, TRACK, TOMATO, LEAF = (
+    rgb(colour)
+    for colour in (design.PAPER, design.INK, design.MUTED, design.GRID, design.TOMATO, design.LEAF)
+)
 
 
 def annotate(

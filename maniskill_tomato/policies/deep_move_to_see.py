@@ -19,6 +19,7 @@ from typing import Any, Final
 import torch
 from torch import Tensor, nn
 
+from maniskill_tomato.policies.moves import shortened
 from maniskill_tomato.policies.network_file import load_network, save_network
 from maniskill_tomato.policies.protocol import Planner
 from maniskill_tomato.raycast.view_rays import RAYS_PER_SIDE, RayLabel, ViewRays
@@ -89,8 +90,7 @@ class DeepMoveToSee(Planner):
         """The network's move, cut to a full one."""
         with torch.no_grad():
             move: Tensor = self.network(*network_input(belief))
-        shortened: Tensor = move / move.norm(dim=-1, keepdim=True).clamp_min(1.0)
-        return shortened
+        return shortened(move)
 
 
 def network_input(belief: Belief) -> tuple[Tensor, Tensor]:

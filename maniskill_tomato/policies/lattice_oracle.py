@@ -3,14 +3,15 @@
 import torch
 from torch import Tensor
 
-from maniskill_tomato.policies.moves import Candidates, moves_needed
-from maniskill_tomato.policies.protocol import GroundTruth, Planner
+from maniskill_tomato.policies.lattice_planner import LatticePlanner, way_to
+from maniskill_tomato.policies.moves import moves_needed
+from maniskill_tomato.policies.protocol import GroundTruth
 from maniskill_tomato.robot.look_at import look_at_pose
 from maniskill_tomato.robot.look_at_move import MAX_MOVE
 from maniskill_tomato.sensing.belief import Belief
 
 
-class LatticeOracle(Planner):
+class LatticeOracle(LatticePlanner):
     """Goes to the reachable candidate above the threshold that the fewest moves reach, among those the nearest.
 
     It knows the true V_f of the candidates alone, where the oracle knows that of any place; what it needs beyond the
@@ -21,8 +22,8 @@ class LatticeOracle(Planner):
     needs_truth = True
 
     def __init__(self, ground_truth: GroundTruth) -> None:
+        super().__init__()
         self._truth = ground_truth
-        self.tried = Candidates()
         self.seen = torch.zeros(0, 0)
         """True V_f of every candidate. Shape (B, K)."""
 
@@ -33,14 +34,10 @@ class LatticeOracle(Planner):
         for i in rows.tolist():
             poses = look_at_pose(candidates[i], belief.target_position[i])
             self.seen[i] = self._truth.visible_fraction(poses, i)
-        self.tried.begin(belief, rows)
+        super().begin(belief, rows)
 
-    def act(self, belief: Belief) -> Tensor:
-        """Towards that candidate."""
-        position, target = belief.camera_position, belief.target_position
-        self.tried.note_refusals(belief)
-        candidates = belief.lattice.positions(target)
-        way = (candidates - position[:, None]).norm(dim=-1)
+    def worth(self, belief: Belief, views: Tensor) -> Tensor:
+        """Nearness where the target shows, and little where it does not. Shape (B, K)."""
+        way = way_to(belief, views)
         near = -moves_needed(way) - way / (1e3 * MAX_MOVE)
-        worth = torch.where(self.seen > self._truth.threshold, near, self.seen - 1e3)
-        return self.tried.move_to_best(belief, candidates, worth, belief.reachable)
+        return torch.where(self.seen > self._truth.threshold, near, self.seen - 1e3)

@@ -28,6 +28,7 @@ from abc import abstractmethod
 import torch
 from torch import Tensor
 
+from maniskill_tomato.policies.moves import shortened
 from maniskill_tomato.policies.protocol import GroundTruth, Planner
 from maniskill_tomato.robot.look_at import look_at_pose, look_frame
 from maniskill_tomato.robot.look_at_move import MAX_MOVE
@@ -91,9 +92,7 @@ class _ArrayPlanner(Planner):
 
     def act(self, belief: Belief) -> Tensor:
         """Along the gradient."""
-        move = STEP_SIZE / MAX_MOVE * self.gradient(belief)
-        shortened: Tensor = move / move.norm(dim=-1, keepdim=True).clamp_min(1.0)
-        return shortened
+        return shortened(STEP_SIZE / MAX_MOVE * self.gradient(belief))
 
 
 class MoveToSee(_ArrayPlanner):

@@ -12,38 +12,20 @@ distance.
 """
 
 import math
-from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
 from maniskill_tomato.errors import InvalidInputError
-from maniskill_tomato.policies.moves import Candidates
-from maniskill_tomato.policies.protocol import Planner
+from maniskill_tomato.policies.lattice_planner import LatticePlanner, way_to
 from maniskill_tomato.robot.look_at_move import MAX_MOVE
 from maniskill_tomato.sensing.belief import Belief
 
+SIMILAR_ANGLE = math.radians(8.0)
+"""Views within about this angle, seen from the target, show the same, in [rad]."""
 
-@dataclass(frozen=True, kw_only=True)
-class NextBestViewConfig:
-    """What a view is worth."""
-
-    move_cost: float = 0.1
-    """Expected V_f that one move of the way is worth; tuned on validation plants (`docs/planners.md`)."""
-    unknown_gain: float = 0.0
-    """Worth of a way from target to view that is wholly unknown."""
-    similar_angle: float = math.radians(8.0)
-    """Views within about this angle, seen from the target, show the same, in [rad]."""
-    similar_distance: float = 0.1
-    """And within about this difference of distance, in [m]."""
-
-    def __post_init__(self) -> None:
-        for name in ("move_cost", "unknown_gain"):
-            if not math.isfinite(getattr(self, name)):
-                raise InvalidInputError(f"{name} must be a finite number, got {getattr(self, name)}")
-        for name in ("similar_angle", "similar_distance"):
-            if not 0.0 < getattr(self, name) < math.inf:
-                raise InvalidInputError(f"{name} must be a positive number, got {getattr(self, name)}")
+SIMILAR_DISTANCE = 0.1
+"""And within about this difference of distance, in [m]."""
 
 
 class MeasuredViews:
@@ -73,13 +55,12 @@ class MeasuredViews:
         self._seen[rows, at] = belief.visible_fraction.to(self._seen)
         self._count += 1
 
-    def correct(self, predicted: Tensor, offsets: Tensor, config: NextBestViewConfig) -> Tensor:
+    def correct(self, predicted: Tensor, offsets: Tensor) -> Tensor:
         """Predictions moved towards the measurement of the most similar view.
 
         Args:
             predicted: Expected V_f. Shape (B, K).
             offsets: The candidates' positions relative to the target, in [m]. Shape (B, K, 3).
-            config: What is similar.
 
         Returns:
             Shape (B, K).
@@ -88,8 +69,8 @@ class MeasuredViews:
         taken, seen = self._offset[:, :most], self._seen[:, :most]
         distance, taken_distance = offsets.norm(dim=-1), taken.norm(dim=-1)
         cosine = (offsets @ taken.mT) / (distance[:, :, None] * taken_distance[:, None]).clamp_min(1e-9)
-        angle = torch.acos(cosine.clamp(-1.0, 1.0)) / config.similar_angle
-        nearer = (distance[:, :, None] - taken_distance[:, None]) / config.similar_distance
+        angle = torch.acos(cosine.clamp(-1.0, 1.0)) / SIMILAR_ANGLE
+        nearer = (distance[:, :, None] - taken_distance[:, None]) / SIMILAR_DISTANCE
         similar = torch.exp(-0.5 * (angle.square() + nearer.square())).nan_to_num(0.0)
         weight, which = similar.max(dim=-1)
         measured = seen.gather(1, which)
@@ -97,53 +78,41 @@ class MeasuredViews:
         return corrected
 
 
-class NextBestView(Planner):
+class NextBestView(LatticePlanner):
     """Chooses direction and distance."""
 
     name = "nbv"
 
-    def __init__(self, config: NextBestViewConfig | None = None) -> None:
-        self.config = config or NextBestViewConfig()
+    def __init__(self, move_cost: float = 0.1) -> None:
+        """Begins without a view.
+
+        Args:
+            move_cost: Expected V_f that one move of the way is worth; tuned on validation plants (`docs/planners.md`).
+
+        Raises:
+            InvalidInputError: The cost is not a finite number.
+        """
+        if not math.isfinite(move_cost):
+            raise InvalidInputError(f"move_cost must be a finite number, got {move_cost}")
+        super().__init__()
+        self.move_cost = move_cost
         self._measured = MeasuredViews()
-        self.tried = Candidates()
 
     def begin(self, belief: Belief, rows: Tensor) -> None:
         self._measured.begin(belief, rows)
-        self.tried.begin(belief, rows)
+        super().begin(belief, rows)
 
     def act(self, belief: Belief) -> Tensor:
         """Towards the best view."""
         self._measured.add(belief)
-        self.tried.note_refusals(belief)
-        candidates = self._candidates(belief)
-        utility = self.utility(belief, candidates)
-        return self.tried.move_to_best(belief, candidates, utility, self._allowed(belief))
+        return super().act(belief)
 
-    def utility(self, belief: Belief, candidates: Tensor) -> Tensor:
-        """What views are worth now.
-
-        Args:
-            belief: What is known.
-            candidates: Positions in the world frame, in [m]. Shape (B, K, 3).
-
-        Returns:
-            Shape (B, K).
-        """
-        expected, unknown = belief.memory.predict(candidates).unbind(-1)
-        offsets = candidates - belief.target_position[:, None]
-        worth = self._measured.correct(expected, offsets, self.config)
-        way = (candidates - belief.camera_position[:, None]).norm(dim=-1) / MAX_MOVE
-        utility: Tensor = worth + self.config.unknown_gain * unknown - self.config.move_cost * way
-        return utility
-
-    def _candidates(self, belief: Belief) -> Tensor:
-        """Positions of the views to choose from. Shape (B, K, 3)."""
-        positions: Tensor = belief.lattice.positions(belief.target_position)
-        return positions
-
-    def _allowed(self, belief: Belief) -> Tensor:
-        """Which of them may be chosen. Shape (B, K), bool."""
-        return belief.reachable
+    def worth(self, belief: Belief, views: Tensor) -> Tensor:
+        """Expected V_f less the cost of the way. Shape (B, K)."""
+        expected, _ = belief.memory.predict(views).unbind(-1)
+        expected = self._measured.correct(expected, views - belief.target_position[:, None])
+        worth: Tensor = expected - self.move_cost * (way_to(belief, views) / MAX_MOVE)
+        return worth
 
 
 class NextBestDirection(NextBestView):
@@ -151,21 +120,24 @@ class NextBestDirection(NextBestView):
 
     name = "nbv_direction"
 
-    def __init__(self, config: NextBestViewConfig | None = None) -> None:
-        """Begins with its own tuned cost of a move, 0.05."""
-        super().__init__(config or NextBestViewConfig(move_cost=0.05))
+    def __init__(self, move_cost: float = 0.05) -> None:
+        """Begins with its own tuned cost of a move."""
+        super().__init__(move_cost)
 
-    def _candidates(self, belief: Belief) -> Tensor:
-        offsets = super()._candidates(belief) - belief.target_position[:, None]
-        distance = (belief.camera_position - belief.target_position).norm(dim=-1)
+    def views(self, belief: Belief) -> Tensor:
+        offsets, distance = self._offsets(belief)
         on_sphere = offsets * (distance[:, None] / offsets.norm(dim=-1))[..., None]
-        candidates: Tensor = belief.target_position[:, None] + on_sphere
-        return candidates
+        views: Tensor = belief.target_position[:, None] + on_sphere
+        return views
 
-    def _allowed(self, belief: Belief) -> Tensor:
+    def allowed(self, belief: Belief) -> Tensor:
         # Of the views in one direction, which now stand on each other, the one whose own distance is nearest.
-        offsets = super()._candidates(belief) - belief.target_position[:, None]
-        distance = (belief.camera_position - belief.target_position).norm(dim=-1)
+        offsets, distance = self._offsets(belief)
         gap = (offsets.norm(dim=-1) - distance[:, None]).abs()
         nearest: Tensor = gap <= gap.min(dim=1, keepdim=True).values + 1e-3
         return belief.reachable & nearest
+
+    def _offsets(self, belief: Belief) -> tuple[Tensor, Tensor]:
+        """The lattice's views relative to the target, and the camera's distance from it. Shapes (B, K, 3) and (B,)."""
+        target = belief.target_position
+        return super().views(belief) - target[:, None], (belief.camera_position - target).norm(dim=-1)

@@ -5,6 +5,7 @@ from typing import Final
 import torch
 from torch import Tensor
 
+from maniskill_tomato.policies.lattice_planner import distance_to_taken, way_to
 from maniskill_tomato.robot.look_at_move import MAX_MOVE
 from maniskill_tomato.sensing.belief import Belief
 from maniskill_tomato.sensing.observation import WORKSPACE_HALF_SIZE, WORKSPACE_MIDDLE
@@ -35,12 +36,8 @@ def quality_features(belief: Belief, max_moves: int = 20) -> tuple[Tensor, Tenso
     position, target = belief.camera_position, belief.target_position
     candidates = belief.lattice.positions(target)
     expected, unknown = belief.memory.predict(candidates).unbind(-1)
-    most = max(int(belief.memory.visits.max()), 1)
-    taken = belief.memory.visited[:, :most]
-    # A missing view is NaN.
-    gap = torch.cdist(candidates, taken).nan_to_num(1.0e3).amin(dim=-1)
-    looked_from = torch.exp(-(gap / SAME_VIEW).square())
-    moves = (candidates - position[:, None]).norm(dim=-1) / (10.0 * MAX_MOVE)
+    looked_from = torch.exp(-(distance_to_taken(belief, candidates) / SAME_VIEW).square())
+    moves = way_to(belief, candidates) / (10.0 * MAX_MOVE)
     values = torch.stack([expected, unknown, looked_from, belief.reachable.float(), moves], dim=1)
     batch = len(position)
     maps = values.view(batch, len(FEATURES), AZIMUTHS, ELEVATIONS, DISTANCES).permute(0, 1, 4, 2, 3)

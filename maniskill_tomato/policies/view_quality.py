@@ -15,9 +15,9 @@ import torch
 from torch import Tensor
 
 from maniskill_tomato.errors import InvalidInputError
-from maniskill_tomato.policies.moves import Candidates, moves_needed
+from maniskill_tomato.policies.lattice_planner import LatticePlanner, way_to
+from maniskill_tomato.policies.moves import moves_needed
 from maniskill_tomato.policies.network_file import load_network, save_network
-from maniskill_tomato.policies.protocol import Planner
 from maniskill_tomato.policies.quality_features import MAP_CHANNELS, SCALARS, quality_features
 from maniskill_tomato.policies.quality_network import ViewQualityNetwork
 from maniskill_tomato.sensing.belief import Belief
@@ -38,7 +38,7 @@ class ViewQualityConfig:
             raise InvalidInputError(f"patience must be a positive number, got {self.patience}")
 
 
-class ViewQuality(Planner):
+class ViewQuality(LatticePlanner):
     """Moves towards the view that the network thinks most of."""
 
     name = "view_quality"
@@ -56,13 +56,10 @@ class ViewQuality(Planner):
             config: How the policy weighs.
             facts: Numbers and strings about its training.
         """
+        super().__init__()
         self.network = network.eval().requires_grad_(False)
         self.config = config or ViewQualityConfig()
         self.facts = facts or {}
-        self.tried = Candidates()
-
-    def begin(self, belief: Belief, rows: Tensor) -> None:
-        self.tried.begin(belief, rows)
 
     def describe(self) -> dict[str, Any]:
         """Its kind and its training."""
@@ -75,14 +72,9 @@ class ViewQuality(Planner):
         probability: Tensor = logits.flatten(1).sigmoid()
         return probability
 
-    def act(self, belief: Belief) -> Tensor:
-        """Towards the best view."""
-        position, target = belief.camera_position, belief.target_position
-        self.tried.note_refusals(belief)
-        candidates = belief.lattice.positions(target)
-        way = (candidates - position[:, None]).norm(dim=-1)
-        worth = self.config.patience * self.success_probability(belief) - moves_needed(way)
-        return self.tried.move_to_best(belief, candidates, worth, belief.reachable)
+    def worth(self, belief: Belief, views: Tensor) -> Tensor:
+        """P(full view) x patience - moves. Shape (B, K)."""
+        return self.config.patience * self.success_probability(belief) - moves_needed(way_to(belief, views))
 
 
 def save_view_quality(path: Path, policy: ViewQuality) -> None:

@@ -4,7 +4,6 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass, fields
 
-import numpy as np
 import torch
 from torch import Tensor
 
@@ -57,51 +56,39 @@ class SensorNoise:
 
 
 class SensorErrors:
-    """Draws the errors of N environments, each from its own random numbers."""
+    """Makes the errors of views; those of one view follow from its seed alone."""
 
-    def __init__(self, noise: SensorNoise, num_envs: int, device: torch.device) -> None:
-        """Begins without errors.
+    def __init__(self, noise: SensorNoise, device: torch.device) -> None:
+        """Keeps how much is wrong.
 
         Args:
-            noise: How much is wrong.
-            num_envs: Number of environments B.
+            noise: How much.
             device: Where tensors live.
         """
         self._noise = noise
-        self._generators = [torch.Generator(device=device) for _ in range(num_envs)]
-        self._offset = torch.zeros(num_envs, 3, device=device)
-        self._errs_in_rays = any((noise.depth_noise, noise.dropout, noise.false_target, noise.missed_target))
+        self._generator = torch.Generator(device=device)
 
-    def begin(self, env_index: int, rng: np.random.RandomState) -> None:
-        """Draws the errors of an episode."""
-        if self._noise.target_position:
-            offset = rng.normal(0.0, self._noise.target_position, 3)
-            self._offset[env_index] = torch.as_tensor(offset).to(self._offset)
-        if self._errs_in_rays:
-            self._generators[env_index].manual_seed(int(rng.randint(2**31 - 1)))
+    @property
+    def are_in_rays(self) -> bool:
+        """Whether rays are disturbed at all."""
+        noise = self._noise
+        return any((noise.depth_noise, noise.dropout, noise.false_target, noise.missed_target))
 
-    def known_target(self, target_position: Tensor) -> Tensor:
-        """Where targets are believed to be. Shape (B, 3)."""
-        return target_position + self._offset if self._noise.target_position else target_position
-
-    def rays(self, rays: ViewRays, mask: Tensor | None = None) -> ViewRays:
+    def rays(self, rays: ViewRays, seeds: Mapping[int, int]) -> ViewRays:
         """The rays as they are measured.
 
         Args:
-            rays: What is there.
-            mask: The environments that look, all if None; the rays of the others stay as they are. Shape (B,), bool.
+            rays: What is there, in B environments.
+            seeds: Of each environment that looks, by its index; the rays of the others stay as they are.
         """
-        if not self._errs_in_rays:
-            return rays
         noise = self._noise
-        direction_c, distance, label = rays.direction_c.clone(), rays.distance.clone(), rays.label.clone()
-        for k, generator in enumerate(self._generators):
-            if mask is not None and not bool(mask[k]):
-                continue
+        direction_c, distance, label = rays.direction_c, rays.distance.clone(), rays.label.clone()
+        for k, seed in seeds.items():
+            self._generator.manual_seed(seed)
             own = slice(k, k + 1)
             measured = disturb(
                 ViewRays(direction_c[own], distance[own], label[own]),
-                generator,
+                self._generator,
                 depth_noise=noise.depth_noise,
                 dropout=noise.dropout,
                 false_target=noise.false_target,

@@ -20,8 +20,7 @@ from maniskill_tomato.robot import d435, iiwa14
 from maniskill_tomato.robot.iiwa14 import READY_QPOS as READY_QPOS
 from maniskill_tomato.robot.iiwa14 import REST_QPOS as REST_QPOS
 from maniskill_tomato.robot.robot_description import urdf_path
-from maniskill_tomato.tasks.maniskill.look_at_controller import LookAtControllerConfig
-from maniskill_tomato.tasks.maniskill.viewpoint_controller import ViewpointControllerConfig
+from maniskill_tomato.tasks.maniskill.controllers import ArmMoveControllerConfig
 
 STIFFNESS = (10000.0, 10000.0, 5000.0, 5000.0, 2500.0, 1600.0, 800.0)
 """Proportional gain of each joint's drive, in [N m / rad]."""
@@ -157,10 +156,9 @@ class Iiwa14D435(BaseAgent):  # type: ignore[misc]
             **end_effector,
         )
         delta_pose.controller_cls = EEDeltaPoseController
-        viewpoint = ViewpointControllerConfig(joints, **drives)
         return {
-            "pd_viewpoint": viewpoint,
-            "pd_look_at": LookAtControllerConfig(joints, **drives),
+            "pd_viewpoint": ArmMoveControllerConfig(joints, **drives, control="viewpoint"),
+            "pd_look_at": ArmMoveControllerConfig(joints, **drives, control="look_at"),
             "pd_joint_pos": PDJointPosControllerConfig(joints, None, None, normalize_action=False, **drives),
             "pd_joint_delta_pos": PDJointPosControllerConfig(
                 joints, -JOINT_STEP, JOINT_STEP, use_delta=True, **drives

@@ -2,9 +2,12 @@
 
 from dataclasses import dataclass, replace
 
+from torch import Tensor
+
 from maniskill_tomato.errors import InvalidInputError
 from maniskill_tomato.plants.spec import ROW_PLANT, PlantPose, PlantSpec
 from maniskill_tomato.tasks import MAX_GENERAL_STEPS
+from maniskill_tomato.tasks.row.rewards import view_gain_reward
 
 Range = tuple[float, float]
 
@@ -45,3 +48,20 @@ class GeneralTaskConfig:
         for name in ("step_cost", "success_reward", "contact_penalty"):
             if not 0.0 <= getattr(self, name) <= 100.0:
                 raise InvalidInputError(f"{name} must be from 0 to 100; got {getattr(self, name)!r}")
+
+    def reward(self, after: Tensor, before: Tensor, success: Tensor, contact: Tensor) -> Tensor:
+        """`view_gain_reward` of a move with this task's weights. Each of shape (B,)."""
+        return view_gain_reward(
+            after,
+            before,
+            success,
+            contact,
+            step_cost=self.step_cost,
+            success_reward=self.success_reward,
+            contact_penalty=self.contact_penalty,
+        )
+
+    @property
+    def largest_reward(self) -> float:
+        """Of one move."""
+        return 1.0 + self.success_reward

@@ -4,11 +4,10 @@ from collections.abc import Callable, Collection
 from dataclasses import replace
 from typing import Any
 
-import gymnasium as gym
-import torch
-
 from maniskill_tomato.plants.episode_list import Episode
 from maniskill_tomato.plants.row import leaf_density_of
+from maniskill_tomato.tasks.making import make_world
+from maniskill_tomato.tasks.world import World
 
 CHUNK = 100
 """Episodes drawn before they are looked at again, so that their plants are still at hand."""
@@ -29,30 +28,27 @@ def draw_episodes(split: str, count: int, first_seed: int = 0, taken: Collection
         first_seed: Seed of the first reset; the next ones follow.
         taken: Seeds of plants that are not drawn.
     """
-    make: dict[str, Any] = {"num_envs": 1, "obs_mode": "state", "render_backend": "none"}
-    env: Any = gym.make("TomatoViewpoint-v1", plant={"seed": split, "pool": None}, **make)
-    base = env.unwrapped
+    world = make_world("TomatoViewpoint-v1", plant={"seed": split, "pool": None})
+    game: Any = world.game
     episodes: list[Episode] = []
     plants = set(taken)
     seed = first_seed
     while len(episodes) < count:
         drawn: list[Episode] = []
         while len(drawn) < min(CHUNK, count - len(episodes)):
-            soft = base.soft_starts
-            env.reset(seed=seed)
+            soft = game.soft_starts
+            world.reset(seed)
             seed += 1
-            plant_seed = int(base.planting.seeds[0])
-            if plant_seed in plants or base.soft_starts > soft:
+            plant_seed = int(world.state.plant_seed[0])
+            if plant_seed in plants or game.soft_starts > soft:
                 continue
             plants.add(plant_seed)
-            drawn.append(_episode(base, plant_seed))
-        replayed: Any = gym.make("TomatoViewpoint-v1", episodes=drawn, **make)
+            drawn.append(_episode(world, plant_seed))
+        replayed = make_world("TomatoViewpoint-v1", episodes=drawn)
         for i, episode in enumerate(drawn):
-            _, info = replayed.reset(options={"episode": i})
-            start = round(float(info["visible_fraction"][0]), 4)
+            replayed.reset(options={"episode": i})
+            start = round(float(replayed.state.visible_fraction[0]), 4)
             episodes.append(replace(episode, start_visibility=start))
-        replayed.close()
-    env.close()
     return episodes
 
 
@@ -79,15 +75,15 @@ def extend_episodes(
     return longer
 
 
-def _episode(base: Any, plant_seed: int) -> Episode:
-    pose = torch.cat([base.planting.position_w[0, :2], base.planting.yaw]).tolist()
-    camera = base.belief.camera_position[0].tolist()
-    density = leaf_density_of(base._choice.leaf_density, plant_seed)
+def _episode(world: World, plant_seed: int) -> Episode:
+    x, y, yaw = world.state.plant_pose[0].tolist()
+    camera = world.belief.camera_position[0].tolist()
+    density = leaf_density_of(world.planting.spec.leaf_density, plant_seed)
     return Episode(
         plant_seed=plant_seed,
         leaf_density=1.0 if density is None else density,
-        plant_pose=(round(pose[0], 5), round(pose[1], 5), round(pose[2], 5)),
-        target=int(base.target_fruit[0]),
+        plant_pose=(round(x, 5), round(y, 5), round(yaw, 5)),
+        target=int(world.state.target[0]),
         camera_position=(round(camera[0], 5), round(camera[1], 5), round(camera[2], 5)),
         start_visibility=0.0,
     )

@@ -10,10 +10,10 @@ from torch import Tensor
 
 from maniskill_tomato.errors import InvalidInputError
 from maniskill_tomato.raycast.scene import RayScene
+from maniskill_tomato.robot.iiwa14 import READY_QPOS
 from maniskill_tomato.robot.inverse_kinematics import Reach
 from maniskill_tomato.robot.kinematics import link_transforms
 from maniskill_tomato.robot.look_at_move import LookAtMove, LookAtMover
-from maniskill_tomato.tasks.maniskill.agent import Iiwa14D435
 from maniskill_tomato.tasks.row.config import GeneralTaskConfig
 
 CANDIDATES = 64
@@ -43,12 +43,7 @@ class Start:
 class HardStarts:
     """Draws starts for one environment at a time."""
 
-    def __init__(
-        self,
-        task: GeneralTaskConfig,
-        scene: RayScene,
-        device: torch.device,
-    ) -> None:
+    def __init__(self, task: GeneralTaskConfig, scene: RayScene, device: torch.device) -> None:
         """Keeps the ranges.
 
         Args:
@@ -61,8 +56,7 @@ class HardStarts:
         self._device = device
         self._low, self._high = np.array(task.start_box).T
         self._mover = LookAtMover(device)
-        ready = Iiwa14D435.keyframes["ready"].qpos
-        self._ready = torch.tensor(ready, dtype=torch.float64, device=device)
+        self._ready = torch.tensor(READY_QPOS, dtype=torch.float64, device=device)
 
     def draw(
         self,

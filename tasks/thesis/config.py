@@ -42,6 +42,15 @@ class ViewpointTaskConfig:
     reward_bounds: Range
     """R = R_v + P_p is clipped to these; the upper one is the best reward of a step."""
 
+    def reward(self, visual: Tensor, penalty: Tensor) -> Tensor:
+        """R = R_v + P_p (Eq. 4-5), clipped to the bounds. Each of shape (B,)."""
+        return (visual + penalty).clamp(*self.reward_bounds)
+
+    @property
+    def largest_reward(self) -> float:
+        """Of one step."""
+        return self.reward_bounds[1]
+
 
 def guided_task() -> ViewpointTaskConfig:
     """The guided-reward task (section 5-1, Eq. 5-1 ... 5-6, Table 5-1).

@@ -8,9 +8,9 @@ import torch
 from torch import Tensor
 
 from maniskill_tomato.errors import InvalidInputError
+from maniskill_tomato.robot.iiwa14 import READY_QPOS
 from maniskill_tomato.robot.inverse_kinematics import IkSolution, InverseKinematics, Reach
 from maniskill_tomato.robot.kinematics import viewpoint_transform
-from maniskill_tomato.tasks.maniskill.agent import Iiwa14D435
 from maniskill_tomato.tasks.thesis.config import ViewpointTaskConfig
 
 CANDIDATES = 16
@@ -34,8 +34,7 @@ class Starts:
         self._device = device
         self._low, self._high = np.array((*task.start_position, *task.start_rpy)).T
         self._inverse_kinematics = InverseKinematics(device=str(device))
-        ready = Iiwa14D435.keyframes["ready"].qpos
-        self._ready = torch.tensor(ready, dtype=torch.float64, device=device)
+        self._ready = torch.tensor(READY_QPOS, dtype=torch.float64, device=device)
 
     def draw(self, rngs: Sequence[np.random.RandomState]) -> tuple[Tensor, Tensor]:
         """One start per generator, uniform over the part of the ranges in reach (Eq. 5-1, 5-2, 5-7, 5-8).
@@ -52,19 +51,19 @@ class Starts:
         b, device = len(rngs), self._device
         viewpoint = torch.zeros(b, 6, device=device)
         qpos = torch.zeros(b, 7, device=device)
-        found = torch.zeros(b, dtype=torch.bool, device=device)
-        rows = torch.arange(b, device=device)
+        rows = torch.arange(b, device=device)  # Those without a start so far.
         for _ in range(MAX_DRAWS):
-            draws = np.stack([rng.uniform(self._low, self._high, (CANDIDATES, 6)) for rng in rngs])
+            open_rngs = [rngs[i] for i in rows.tolist()]
+            draws = np.stack([rng.uniform(self._low, self._high, (CANDIDATES, 6)) for rng in open_rngs])
             candidates = torch.as_tensor(draws, dtype=torch.float32, device=device)
             solution = self._solve(candidates.reshape(-1, 6))
-            reachable = (solution.reach == int(Reach.REACHABLE)).reshape(b, CANDIDATES)
-            first = reachable.int().argmax(dim=-1)
-            new = reachable.any(dim=-1) & ~found
-            viewpoint[new] = candidates[rows, first][new]
-            qpos[new] = solution.qpos.reshape(b, CANDIDATES, 7)[rows, first][new].float()
-            found |= new
-            if bool(found.all()):
+            reachable = (solution.reach == int(Reach.REACHABLE)).reshape(-1, CANDIDATES)
+            found = reachable.any(dim=-1)
+            first = reachable.int().argmax(dim=-1)[found]
+            viewpoint[rows[found]] = candidates[found, first]
+            qpos[rows[found]] = solution.qpos.reshape(-1, CANDIDATES, 7)[found, first].float()
+            rows = rows[~found]
+            if not len(rows):
                 return viewpoint, qpos
         raise InvalidInputError(
             f"none of {MAX_DRAWS * CANDIDATES} start poses could be reached; the task's ranges "

@@ -38,7 +38,7 @@ def learner_env() -> Iterator[LearnerEnv]:
 
 def walk(env: LearnerEnv, config: TrainConfig, steps: int) -> tuple[Any, list[dict[str, Any]]]:
     """Random steps through `Experience`; the replay buffer and, for every step, the state and action it began with."""
-    base: Any = env.base_env  # type: ignore[attr-defined]
+    world: Any = env.unwrapped  # type: ignore[attr-defined]
     replay = make_replay(config, 9, 6)
     experience = Experience(config, replay, 1, (9, 6))
     generator = torch.Generator().manual_seed(4)
@@ -51,7 +51,7 @@ def walk(env: LearnerEnv, config: TrainConfig, steps: int) -> tuple[Any, list[di
         actions = (torch.randn(1, 6, generator=generator) * 0.25 + torch.tensor([0.1, 0, 0, 0, 0, 0])).clamp(
             -1, 1
         )
-        before, own = base.get_state_dict(), int(base.target_fruit)
+        before, own = (world.saved_rows(), world.qpos), int(world.target_fruit)
         next_observations, rewards, terminations, truncations, next_info = env.step(actions * scale)
         step_info = next_info.get("final_info", next_info)
         reached = next_info.get("final_observation", next_observations)
@@ -86,12 +86,9 @@ def test_a_relabelled_transition_is_what_the_task_gives_with_that_target(
     for number, move in enumerate(moves):
         for place in (1, 2):
             other = (move["own"] + place) % 3
-            state = {
-                **move["state"],
-                "task": {**move["state"]["task"], "target": torch.tensor([[float(other)]])},
-            }
+            saved, qpos = move["state"]
             judge.reset(seed=0)
-            base.set_state_dict(state)
+            base.world.take_up(torch.tensor([0]), {**saved, "target": torch.tensor([[float(other)]])}, qpos)
             before = base.evaluate()["visible_fraction"]
             start = base.get_obs(base.get_info())
             reached, task_reward, terminated, _, info = judge.step(move["action"])
@@ -120,7 +117,7 @@ def test_the_environment_tells_the_same_when_reset_with_that_target_at_that_view
     for seed in range(12):
         _, info = env.reset(seed=seed)
         base = env.unwrapped
-        viewpoint, own = base._viewpoint[0].tolist(), int(base.target_fruit)
+        viewpoint, own = base.world.state.viewpoint[0].tolist(), int(base.target_fruit)
         for place in (1, 2):
             options = {"target": (own + place) % 3, "viewpoint": viewpoint}
             observation, truth = judge.reset(seed=seed, options=options)

@@ -26,7 +26,7 @@ from maniskill_tomato.robot.look_at import look_at_pose, look_frame
 from maniskill_tomato.sensing.observation import MAP_SIDE, NEAR_MAP_SIDE, ObservationLayout
 from maniskill_tomato.sensing.true_views import TRUE_VIEWS, TrueViews, map_positions
 from maniskill_tomato.sensing.view_lattice import ViewLattice
-from maniskill_tomato.tasks.row.env import TomatoViewpointGeneralEnv
+from maniskill_tomato.tasks.row.search_game import SearchGame
 
 SIZE = ObservationLayout().size
 SMALL = replace(
@@ -201,9 +201,7 @@ def test_plants_keep_to_the_limit_of_leaf_density(env: Any) -> None:
 
 def test_a_run_with_a_curriculum_meets_sparse_plants_first(tmp_path: Path, monkeypatch: Any) -> None:
     asked: list[float] = []
-    monkeypatch.setattr(
-        TomatoViewpointGeneralEnv, "limit_leaf_density", lambda self, highest: asked.append(highest)
-    )
+    monkeypatch.setattr(SearchGame, "limit_leaf_density", lambda self, highest: asked.append(highest))
     config = replace(SMALL, privileged_critic=False, leaf_density_start=1.3, leaf_density_steps=20)
     train("TomatoViewpoint-v1", config, tmp_path / "run", 0, {"plant": {"pool": 2}}, show_progress=False)
     # Before the first reset, then before each of the 40 steps.

@@ -361,8 +361,8 @@ def test_when_all_checkpoints_are_damaged_the_run_is_not_begun_again_by_itself(t
         ({"env_id": "Other-v0"}, "a run on Other-v0, not on Walk-v0"),
         ({"package_version": "0.0.1"}, "written by version 0.0.1"),
         ({"format": 99}, "format 99.*upgrade"),
-        ({"run": {"format": 99}}, "run state 2"),
-        ({"run": None}, "run state 2"),
+        ({"run": {"format": 99}}, "run state 3"),
+        ({"run": None}, "run state 3"),
         ({"counters": {"seed": 8}}, "a run with seed 8, not 3"),
         ({"critics": {}}, "does not fit this run"),
     ],
@@ -532,7 +532,7 @@ def start(*arguments: str) -> Any:
     """The command in a process of its own, forked from one that has loaded the simulator already."""
     context = multiprocessing.get_context("forkserver")
     context.set_forkserver_preload(
-        ["maniskill_tomato.cli", "maniskill_tomato.learning.rl.run", "maniskill_tomato.tasks.thesis.env"]
+        ["maniskill_tomato.cli", "maniskill_tomato.learning.rl.run", "maniskill_tomato.tasks.vector_env"]
     )
     process = context.Process(target=cli.main, args=(list(arguments),))
     process.start()

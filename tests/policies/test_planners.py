@@ -29,9 +29,9 @@ from maniskill_tomato.policies.deep_move_to_see import (
 )
 from maniskill_tomato.policies.gradient_view import GradientView, expected_visible_share
 from maniskill_tomato.policies.greedy_truth import GreedyTruth, greedy_directions
+from maniskill_tomato.policies.lattice_planner import Candidates
 from maniskill_tomato.policies.move_to_see import MoveToSee, MoveToSeeOnMemory, camera_array, size_gradient
-from maniskill_tomato.policies.moves import Candidates
-from maniskill_tomato.policies.next_best_view import NextBestDirection, NextBestView, NextBestViewConfig
+from maniskill_tomato.policies.next_best_view import NextBestDirection, NextBestView
 from maniskill_tomato.policies.opening import open_policy
 from maniskill_tomato.policies.oracle import Oracle, OracleSearch
 from maniskill_tomato.policies.protocol import Planner
@@ -365,7 +365,7 @@ def test_a_costly_way_keeps_the_next_best_view_near(world: FreeWorld) -> None:
     world.reset(seed=7)
     ways = []
     for cost in (0.0, 10.0):
-        planner = NextBestView(config=NextBestViewConfig(move_cost=cost))
+        planner = NextBestView(move_cost=cost)
         planner.begin(world.belief, torch.tensor([0]))
         planner.act(world.belief)
         candidates = world.belief.lattice.positions(world.belief.target_position)[0]
@@ -382,14 +382,14 @@ def test_a_costly_way_keeps_the_next_best_view_near(world: FreeWorld) -> None:
 def test_a_view_that_was_looked_from_is_worth_what_was_measured(world: FreeWorld) -> None:
     world.reset(seed=7)
     belief = world.belief
-    planner = NextBestView(config=NextBestViewConfig(move_cost=0.0))
+    planner = NextBestView(move_cost=0.0)
     planner.begin(belief, torch.tensor([0]))
     planner.act(belief)
     here = belief.camera_position[:, None]
-    assert float(planner.utility(belief, here)) == pytest.approx(float(belief.visible_fraction), abs=1e-4)
+    assert float(planner.worth(belief, here)) == pytest.approx(float(belief.visible_fraction), abs=1e-4)
     opposite = 2.0 * belief.target_position[:, None] - here
     predicted = float(belief.memory.predict(opposite)[0, 0, 0])
-    assert float(planner.utility(belief, opposite)) == pytest.approx(predicted, abs=1e-4)
+    assert float(planner.worth(belief, opposite)) == pytest.approx(predicted, abs=1e-4)
 
 
 def test_the_next_best_direction_keeps_its_distance(world: FreeWorld) -> None:
@@ -402,9 +402,7 @@ def test_the_next_best_direction_keeps_its_distance(world: FreeWorld) -> None:
 
 def test_settings_out_of_range_are_refused() -> None:
     with pytest.raises(InvalidInputError, match="move_cost"):
-        NextBestViewConfig(move_cost=math.nan)
-    with pytest.raises(InvalidInputError, match="similar_angle"):
-        NextBestViewConfig(similar_angle=0.0)
+        NextBestView(move_cost=math.nan)
     with pytest.raises(InvalidInputError, match="batch_size"):
         RegressionConfig(batch_size=0)
 

@@ -185,7 +185,7 @@ def test_a_state_after_a_transit_continues_exactly(row: Any) -> None:
 
 def test_a_row_without_moves_left_fails(row: Any) -> None:
     row.reset(seed=0)
-    row.unwrapped._moves[:] = 118
+    row.unwrapped.world.state.moves[:] = 118
     _, _, terminated, _, info = row.step(np.zeros(3, dtype=np.float32))
     assert not bool(terminated)
     _, _, terminated, _, info = row.step(np.zeros(3, dtype=np.float32))

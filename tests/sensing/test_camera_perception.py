@@ -37,7 +37,7 @@ def test_what_the_camera_measures_is_near_the_truth() -> None:
             true.append(float(info["true_visible_fraction"][0]))
         if max(measured[-5:]) > 0.2:
             # A target that was seen as well as that has been located.
-            offsets.append(float((env.belief.target_position - env._target_position_w).norm()))
+            offsets.append(float((env.belief.target_position - env.target_position_w).norm()))
     errors = np.abs(np.array(measured) - np.array(true))
     assert max(true) > 0.3, "the views must not all be blind"
     assert errors.mean() < 0.1
@@ -69,7 +69,7 @@ def test_an_unseen_target_is_known_from_afar_only() -> None:
     for seed in range(5):
         env.reset(seed=seed)
         assert float(env.belief.visible_fraction[0]) == 0.0
-        offsets.append((env.belief.target_position - env._target_position_w)[0].numpy())
+        offsets.append((env.belief.target_position - env.target_position_w)[0].numpy())
     # 15 draws: the standard deviation is known to 18 %, three times which is 55 %.
     assert np.std(offsets) == pytest.approx(COARSE_POSITION, rel=0.55)
     env.close()
@@ -110,13 +110,13 @@ def test_rendered_perceptions_run_and_their_pictures_lie_on_the_cast_labels(perc
     *_, info = task.step(torch.tensor([0.0, 0.6, 0.3]))
     assert 0.0 <= float(info["visible_fraction"][0]) <= 1.0
     assert set(info) >= {"true_visible_fraction", "true_success"}
-    picture = task._wrist_picture(0).astype(int)
+    picture = task._wrist_picture(0, task.qpos[0]).astype(int)
     assert picture.shape == (240, 320, 3)
     T_w_links = link_transforms(task.agent.robot.get_qpos())
-    images = task._ray_scene.image(
+    images = task.world.scene.image(
         task.camera_intrinsics,
-        T_w_links[:, -1] @ task._T_ee_camera,
-        task._target,
+        task.world.camera_poses(T_w_links),
+        task.target_fruit,
         task.planting.T_world_plant,
         T_w_links,
     )
@@ -139,14 +139,16 @@ class Eye:
         self.env = env
         width, height = IMAGE_SIZE
         self.camera = SimulatedCamera(
-            env._ray_scene, picture=lambda k: np.zeros((height, width, 3), np.uint8)
+            env.world.scene, picture=lambda k: np.zeros((height, width, 3), np.uint8)
         )
         self.perception = CameraPerception(1, FruitDetector(LabelSegmenter(env, order)))
 
     def look(self) -> float:
         T_w_links = link_transforms(self.env.agent.robot.get_qpos())
-        T_w_camera = T_w_links[:, -1] @ self.env._T_ee_camera
-        frames = self.camera.take(T_w_camera, self.env._target, self.env.planting.T_world_plant, T_w_links)
+        T_w_camera = self.env.world.camera_poses(T_w_links)
+        frames = self.camera.take(
+            T_w_camera, self.env.target_fruit, self.env.planting.T_world_plant, T_w_links
+        )
         self.perception.look(frames)
         return float(self.perception.visible_fraction[0])
 
@@ -154,7 +156,7 @@ class Eye:
 def test_of_several_fruits_found_the_one_near_the_known_place_is_the_target() -> None:
     env = make(perception="occlusion_model")
     env.reset(seed=2)
-    place = env._target_position_w[0].numpy()
+    place = env.target_position_w[0].numpy()
     seen = []
     for order in (1, -1):
         eye = Eye(env, order)
@@ -175,7 +177,7 @@ def test_what_the_first_view_of_a_hidden_target_shows_well_is_not_taken_for_it()
     seen = []
     for hidden_below in (None, 0.3):
         eye = Eye(env)
-        eye.perception.begin(0, env._target_position_w[0].numpy(), hidden_below=hidden_below)
+        eye.perception.begin(0, env.target_position_w[0].numpy(), hidden_below=hidden_below)
         seen += [eye.look(), eye.look()]
     assert min(seen[:2]) > 0.45
     assert seen[2:] == [0.0, 0.0]
@@ -187,10 +189,10 @@ class LabelSegmenter:
 
     def __init__(self, env: Any, order: int) -> None:
         T_w_links = link_transforms(env.agent.robot.get_qpos())
-        images = env._ray_scene.image(
+        images = env.world.scene.image(
             color_intrinsics(*IMAGE_SIZE),
-            T_w_links[:, -1] @ env._T_ee_camera,
-            env._target,
+            env.world.camera_poses(T_w_links),
+            env.target_fruit,
             env.planting.T_world_plant,
             T_w_links,
         )

@@ -350,8 +350,8 @@ def test_a_row_is_searched_fruit_by_fruit(row: Any) -> None:
             # The next target is new, and nothing is remembered but the look from where the camera stands.
             assert target not in visited and target in ripe
             assert int(base.belief.memory.visits[0]) == 1
-            left = [j for j in ripe if j not in visited and bool(base._open[0, j])]
-            positions = base._fruit_positions(0, left)
+            left = [j for j in ripe if j not in visited and j in base.open_targets(0)]
+            positions = base.planting.fruit_positions_w(0, left)
             nearest = left[int((positions - base.belief.camera_position[0]).norm(dim=-1).argmin())]
             assert target == nearest
             visited.append(target)

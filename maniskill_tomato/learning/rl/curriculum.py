@@ -5,6 +5,7 @@ from typing import Any, Protocol, runtime_checkable
 from maniskill_tomato.errors import InvalidInputError
 from maniskill_tomato.learning.rl.envs import LearnerEnv
 from maniskill_tomato.learning.rl.train_config import TrainConfig
+from maniskill_tomato.tasks.vector_env import VectorEnv
 
 
 @runtime_checkable
@@ -37,14 +38,14 @@ class LeafDensityCurriculum:
         self._start, self._steps = config.leaf_density_start, config.leaf_density_steps
         if self._start is None:
             return
-        world: Any = getattr(env, "base_env", env)
-        if not isinstance(world, LimitsLeafDensity):
+        game: Any = env.world.game if isinstance(env, VectorEnv) else getattr(env, "base_env", env)
+        if not isinstance(game, LimitsLeafDensity):
             raise InvalidInputError(
                 "leaf_density_start needs a task whose plants differ in leaf density: TomatoViewpoint-v1 or "
                 "TomatoViewpointRow-v1; leave it out"
             )
-        self._world: LimitsLeafDensity = world
-        low, self._highest = self._world.leaf_density_range
+        self._game: LimitsLeafDensity = game
+        low, self._highest = self._game.leaf_density_range
         if not low < self._start < self._highest:
             raise InvalidInputError(
                 f"leaf_density_start must lie within the plants' leaf density, {low} to {self._highest}; got "
@@ -61,4 +62,4 @@ class LeafDensityCurriculum:
         """Tells the environment the limit of a step."""
         limit = self.limit(step)
         if limit is not None:
-            self._world.limit_leaf_density(limit)
+            self._game.limit_leaf_density(limit)

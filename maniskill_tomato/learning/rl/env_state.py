@@ -9,12 +9,7 @@ from torch import Tensor
 
 from maniskill_tomato.errors import CheckpointError
 from maniskill_tomato.learning.rl.envs import LearnerEnv
-from maniskill_tomato.learning.rl.random_state import (
-    generator_state,
-    random_state,
-    set_generator_state,
-    set_random_state,
-)
+from maniskill_tomato.tasks.numpy_streams import random_state, set_random_state
 
 logger = logging.getLogger(__name__)
 
@@ -32,43 +27,31 @@ class KeepsState(Protocol):
         ...
 
 
-def seed_action_spaces(env: LearnerEnv, seed: int) -> None:
-    """Makes what the action spaces of `env` draw repeatable; ManiSkill's reset leaves them unseeded."""
-    base: Any = getattr(env, "base_env", None)
-    if base is not None:
-        base.action_space.seed(seed)
-        base.single_action_space.seed(seed)
-
-
 def env_state(env: LearnerEnv) -> dict[str, Any] | None:
     """The state of `env` as plain data, or None where it cannot be known.
 
-    ManiSkill's own state is completed by its step counters, the seeds and generators of the run and of the
-    episode, and the generators of the action spaces.
+    That of ManiSkill's shell is the world's, completed by the joints' speeds, step counters, and the seeds and
+    generators that the world's follow from.
     """
     if isinstance(env, KeepsState):
         return env.get_run_state()
-    base: Any = getattr(env, "base_env", None)
-    if base is None:
+    shell: Any = getattr(env, "base_env", None)
+    if shell is None:
         return None
     return {
-        "sim": _map_tensors(base.get_state_dict(), "cpu"),
-        "elapsed_steps": base._elapsed_steps.cpu().clone(),
-        "reconfig_counter": int(base._reconfig_counter),
-        "main_seed": [int(seed) for seed in base._main_seed],
-        "episode_seed": [int(seed) for seed in base._episode_seed],
-        "main_rng": random_state(base._main_rng),
-        "batched_main_rng": [random_state(rng) for rng in base._batched_main_rng.rngs],
-        "batched_episode_rng": [random_state(rng) for rng in base._batched_episode_rng.rngs],
-        "action_space": generator_state(base.action_space.np_random),
-        "single_action_space": generator_state(base.single_action_space.np_random),
+        "world": shell.world.save(),
+        "qvel": shell.agent.robot.get_qvel().cpu().clone(),
+        "elapsed_steps": shell._elapsed_steps.cpu().clone(),
+        "reconfig_counter": int(shell._reconfig_counter),
+        "main_seed": [int(seed) for seed in shell._main_seed],
+        "episode_seed": [int(seed) for seed in shell._episode_seed],
+        "main_rng": random_state(shell._main_rng),
+        "batched_main_rng": [random_state(rng) for rng in shell._batched_main_rng.rngs],
     }
 
 
 def set_env_state(env: LearnerEnv, state: dict[str, Any] | None) -> None:
     """Puts `env`, made with the same options, where it was; its global random generators are left to the caller.
-
-    An episode is begun from the same seed, its plants are grown, and it is then moved on to the saved state.
 
     Raises:
         CheckpointError: The environment's state was not saved.
@@ -82,37 +65,21 @@ def set_env_state(env: LearnerEnv, state: dict[str, Any] | None) -> None:
         env.set_run_state(state)
         return
     anything: Any = env
-    base: Any = anything.base_env
-    if getattr(base, "motion", None) == "dynamic":
+    shell: Any = anything.base_env
+    if shell.motion == "dynamic":
         logger.warning(
             "the physics engine keeps numbers that cannot be saved; last digits may differ from here on"
         )
-    options = {"reconfigure": True} if base.reconfiguration_freq else {}
+    # An episode is begun from the same seed, so that the scene holds its plants, and then moved on.
+    options = {"reconfigure": True} if shell.reconfiguration_freq else {}
     anything.reset(seed=list(state["episode_seed"]), options=options)
-    if getattr(base, "_swaps_plants", False):
-        for i, seed in enumerate(int(s) for s in state["sim"]["task"]["plant_seed"][:, 0]):
-            if seed != base.planting.seeds[i]:
-                base._ray_scene.replace_plant(i, base.planting.replace(i, seed))
-    base.set_state_dict(_map_tensors(state["sim"], base.device))
-    base._elapsed_steps[:] = state["elapsed_steps"].to(base.device)
-    base._reconfig_counter = state["reconfig_counter"]
-    base._main_seed = list(state["main_seed"])
-    set_random_state(base._main_rng, state["main_rng"])
-    for name in ("batched_main_rng", "batched_episode_rng"):
-        rngs = getattr(base, f"_{name}").rngs
-        for rng, saved in zip(rngs, state[name], strict=True):
-            set_random_state(rng, saved)
-    set_generator_state(base.action_space.np_random, state["action_space"])
-    set_generator_state(base.single_action_space.np_random, state["single_action_space"])
-
-
-def _map_tensors(tree: Mapping[str, Any], device: torch.device | str) -> dict[str, Any]:
-    return {
-        name: _map_tensors(value, device)
-        if isinstance(value, Mapping)
-        else torch.as_tensor(value).detach().to(device).clone()
-        for name, value in tree.items()
-    }
+    shell.restore_world(state["world"], state["qvel"])
+    shell._elapsed_steps[:] = state["elapsed_steps"].to(shell.device)
+    shell._reconfig_counter = state["reconfig_counter"]
+    shell._main_seed = list(state["main_seed"])
+    set_random_state(shell._main_rng, state["main_rng"])
+    for rng, saved in zip(shell._batched_main_rng.rngs, state["batched_main_rng"], strict=True):
+        set_random_state(rng, saved)
 
 
 def tensor_attributes(thing: object) -> dict[str, Tensor | int | float | bool | None]:

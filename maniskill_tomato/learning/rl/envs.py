@@ -8,11 +8,14 @@ import torch
 from torch import Tensor
 
 from maniskill_tomato.errors import InvalidInputError
+from maniskill_tomato.sensing.simulated_camera import RENDERED
 from maniskill_tomato.tasks import TASK_IDS
+from maniskill_tomato.tasks.making import option_names
+from maniskill_tomato.tasks.vector_env import make_vector_env
 
 
 class LearnerEnv(Protocol):
-    """What a learner needs of an environment; ManiSkill's `ManiSkillVectorEnv` offers it.
+    """What a learner needs of an environment; `tasks.vector_env.VectorEnv` offers it, and ManiSkill's wrapper.
 
     Environments that are done are reset within `step`: the returned observation is the first of the new
     episode and `info["final_observation"]`, `info["final_info"]` are what the step itself gave.
@@ -70,7 +73,19 @@ def make_env(env_id: str, num_envs: int = 1, **options: Any) -> gym.Env[Any, Any
 
 
 def make_learner_env(env_id: str, num_envs: int = 1, **options: Any) -> LearnerEnv:
-    """The same, wrapped for a learner; see `make_env`."""
+    """N environments of a task for a learner.
+
+    They are worlds in this process, on the first GPU if there is one and N is above 1. Options that only a simulator
+    has, such as `motion`, or perception that renders colours, make it ManiSkill's instead.
+
+    Raises:
+        InvalidInputError: The id or an option is not allowed, or the simulator cannot run that many.
+    """
+    check_env_id(env_id)
+    needs_simulator = set(options) - option_names(env_id) or options.get("perception") in RENDERED
+    if not needs_simulator:
+        device = "cuda" if num_envs > 1 and torch.cuda.is_available() else "cpu"
+        return make_vector_env(env_id, num_envs, device, **options)
     env = make_env(env_id, num_envs, **options)
     # ManiSkill takes seconds to import; commands that do not simulate need not wait for it.
     from mani_skill.vector.wrappers.gymnasium import ManiSkillVectorEnv

@@ -18,7 +18,7 @@ from maniskill_tomato.policies.trained_actor import load_checkpoint
 
 logger = logging.getLogger(__name__)
 
-RUN_STATE_FORMAT = 2
+RUN_STATE_FORMAT = 3
 """Version of the layout of a checkpoint's `run` entry."""
 
 LOG_NAME = "train.log"

@@ -18,7 +18,6 @@ from maniskill_tomato.learning.interrupt import StopRequest, stop_on_signals
 from maniskill_tomato.learning.rl.agent import update
 from maniskill_tomato.learning.rl.checkpoint import make_checkpoint, save_checkpoint
 from maniskill_tomato.learning.rl.curriculum import LeafDensityCurriculum
-from maniskill_tomato.learning.rl.env_state import seed_action_spaces
 from maniskill_tomato.learning.rl.envs import LearnerEnv
 from maniskill_tomato.learning.rl.initial_policy import begin_with, check_fits
 from maniskill_tomato.learning.rl.presets import TrainConfig
@@ -166,7 +165,6 @@ class Trainer:
     def _run(self) -> TrainResult:
         torch.set_num_threads(self._config.torch_threads)
         seed_global_random_state(self._seed)
-        seed_action_spaces(self._env, self._seed)
         saved = self._saved_run()
         self._curriculum.apply(0)
         observations, info = self._env.reset(seed=self._seed)

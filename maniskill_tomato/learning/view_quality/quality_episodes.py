@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from maniskill_tomato.policies.moves import Goals
-from maniskill_tomato.policies.next_best_view import NextBestView, NextBestViewConfig
+from maniskill_tomato.policies.next_best_view import NextBestView
 from maniskill_tomato.policies.protocol import Planner
 from maniskill_tomato.policies.quality_features import quality_features
 from maniskill_tomato.policies.quality_network import ViewQualityNetwork
@@ -56,18 +56,17 @@ class _Wanderer(Planner):
         self._rng = rng
         self._network = network
 
-    def begin(self, belief: Belief, env_idx: Tensor) -> None:
+    def begin(self, belief: Belief, rows: Tensor) -> None:
         rng = self._rng
         self._astray = rng.uniform(0.0, 0.5)
         if self._network is None or rng.uniform() < 0.25:
-            config = NextBestViewConfig(move_cost=10.0 ** rng.uniform(-2.0, -0.7))
-            self._planner: Planner = NextBestView(config)
+            self._planner: Planner = NextBestView(10.0 ** rng.uniform(-2.0, -0.7))
         else:
             patience = 10.0 ** rng.uniform(0.5, 1.2)
             self._planner = ViewQuality(self._network, ViewQualityConfig(patience=patience))
-        self._planner.begin(belief, env_idx)
+        self._planner.begin(belief, rows)
         self._goals = Goals()
-        self._goals.begin(belief, env_idx)
+        self._goals.begin(belief, rows)
         self._on_goal = False
 
     def act(self, belief: Belief) -> Tensor:

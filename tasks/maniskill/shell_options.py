@@ -1,7 +1,6 @@
-"""The checks of what a user may pass to `gymnasium.make`: every refusal names the allowed values."""
+"""The checks of what ManiSkill's shell takes beside the task's options: every refusal names the allowed values."""
 
-import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from typing import Literal, get_args
 
 import torch
@@ -9,6 +8,7 @@ from mani_skill.envs.utils.observations import ALL_VISUAL_TEXTURES
 
 from maniskill_tomato.errors import InvalidInputError
 from maniskill_tomato.rendering.vulkan_probe import NO_RENDERING_HINT
+from maniskill_tomato.tasks.option_checks import check_choice
 
 Motion = Literal["kinematic", "dynamic"]
 
@@ -28,12 +28,6 @@ def check_obs_mode(obs_mode: str | None) -> None:
         f"obs_mode must be one of {_listed(PLAIN_OBS_MODES)}, or textures joined by '+' out of {_listed(textures)}; "
         f"got {obs_mode!r}"
     )
-
-
-def check_choice(name: str, value: str | None, allowed: Iterable[str]) -> None:
-    """Accepts None and the `allowed` values of the option `name`."""
-    if value is not None and value not in tuple(allowed):
-        raise InvalidInputError.choice(name, value, allowed)
 
 
 def check_motion(motion: str) -> None:
@@ -59,29 +53,6 @@ def needs_rendering(obs_mode: str | None, render_mode: str | None) -> bool:
 
 def _listed(values: Iterable[str]) -> str:
     return ", ".join(repr(v) for v in values)
-
-
-def check_rays_per_side(rays_per_side: int) -> None:
-    """Accepts 4 to 256."""
-    if isinstance(rays_per_side, bool) or not isinstance(rays_per_side, int) or not 4 <= rays_per_side <= 256:
-        raise InvalidInputError(f"rays_per_side must be an integer from 4 to 256; got {rays_per_side!r}")
-
-
-def check_other_targets(count: object) -> None:
-    """Accepts how many other fruits are judged."""
-    if isinstance(count, bool) or not isinstance(count, int) or count < 0:
-        raise InvalidInputError(f"other_targets must be an integer of 0 or more, got {count!r}")
-
-
-def check_half_ranges(name: str, values: Sequence[float], size: int) -> tuple[float, ...]:
-    """`values` as `size` finite numbers of 0 or more."""
-    try:
-        numbers = tuple(float(v) for v in values)
-    except (TypeError, ValueError):
-        numbers = ()
-    if len(numbers) != size or not all(math.isfinite(v) and v >= 0.0 for v in numbers):
-        raise InvalidInputError(f"{name} must be {size} finite numbers of 0 or more; got {values!r}")
-    return numbers
 
 
 def pick_sim_backend(sim_backend: str, num_envs: int) -> str:
@@ -113,12 +84,22 @@ def rendering_failure(error: RuntimeError) -> str | None:
     return None
 
 
-def check_range(name: str, values: Sequence[float]) -> tuple[float, float]:
-    """`values` as two finite numbers, the first below the second."""
-    try:
-        numbers = tuple(float(v) for v in values)
-    except (TypeError, ValueError):
-        numbers = ()
-    if len(numbers) != 2 or not all(math.isfinite(v) for v in numbers) or numbers[0] >= numbers[1]:
-        raise InvalidInputError(f"{name} must be a range (low, high) of finite numbers; got {values!r}")
-    return numbers[0], numbers[1]
+def pick_reconfiguration_freq(freq: int | None, *, new_actors: bool, follows_list: bool) -> int:
+    """How often the scene is built anew: at every reset where new plants need new actors, else never.
+
+    Args:
+        freq: What the user wants, None for that.
+        new_actors: Whether plants change and are rendered.
+        follows_list: Whether episodes come from a fixed list, each with its own plant.
+
+    Raises:
+        InvalidInputError: The plants that are drawn would never, or not always, be shown.
+    """
+    if freq is None:
+        return 1 if new_actors else 0
+    if new_actors and (freq == 0 or (follows_list and freq != 1)):
+        raise InvalidInputError(
+            f"reconfiguration_freq={freq} would keep showing the same plant where every episode has its own; leave it "
+            "out or set it to 1, or do not render (obs_mode='state', render_mode=None)"
+        )
+    return freq

@@ -1,7 +1,5 @@
 """What only the simulator knows: how much of the target would be seen from elsewhere, and what would be touched."""
 
-from collections.abc import Callable
-
 import torch
 from torch import Tensor
 
@@ -10,35 +8,27 @@ from maniskill_tomato.raycast.scene import RayScene
 from maniskill_tomato.robot.inverse_kinematics import Reach
 from maniskill_tomato.robot.kinematics import link_transforms
 from maniskill_tomato.robot.look_at_move import LookAtMover
-from maniskill_tomato.tasks.maniskill.planting import Planting
+from maniskill_tomato.tasks.planting import Planting
+from maniskill_tomato.tasks.world_state import WorldState
 
 
 class GroundTruth:
-    """Asks the plants themselves: the `policies.protocol.GroundTruth` of an environment."""
+    """Asks the plants themselves: the `policies.protocol.GroundTruth` of a world."""
 
-    def __init__(
-        self,
-        scene: RayScene,
-        planting: Callable[[], Planting],
-        target: Callable[[], Tensor],
-        qpos: Callable[[], Tensor],
-        threshold: float,
-    ) -> None:
-        """Follows an environment's plants, targets and arms.
+    def __init__(self, scene: RayScene, planting: Planting, state: WorldState, threshold: float) -> None:
+        """Follows a world's plants, targets and arms.
 
         Args:
-            scene: The plants and links.
-            planting: Gives the plants as they are now.
-            target: Gives the indices of the targets in `Plant.fruits`. Shape (num_envs,).
-            qpos: Gives the joint positions, in [rad]. Shape (num_envs, 7).
+            scene: Casts the rays and measures distances.
+            planting: The plants.
+            state: Of the world.
             threshold: V_f above which the task counts the target as fully visible.
         """
-        self._scene = scene
-        self._planting = planting
-        self._target = target
-        self._qpos = qpos
         self.threshold = threshold
         self._mover: LookAtMover | None = None
+        self._scene = scene
+        self._planting = planting
+        self._state = state
 
     def visible_fraction(
         self,
@@ -60,11 +50,9 @@ class GroundTruth:
             In [0, 1]. Shape (K,).
         """
         links = None if qpos is None else link_transforms(qpos.float())
-        target = int(self._target()[env_index]) if fruit is None else fruit
-        T_world_plant = self._planting().T_world_plant[env_index]
-        return self._scene.visible_fraction_from(
-            T_world_camera.float(), target, T_world_plant, links, env_index
-        )
+        target = int(self._state.target[env_index]) if fruit is None else fruit
+        T_w_plant = self._planting.T_world_plant[env_index]
+        return self._scene.visible_fraction_from(T_world_camera.float(), target, T_w_plant, links, env_index)
 
     def clearance(self, start_qpos: Tensor, end_qpos: Tensor, env_index: int = 0) -> Tensor:
         """How near the arm comes to an environment's plants on K moves; see `RayScene.clearance_along`.
@@ -78,9 +66,9 @@ class GroundTruth:
             In [m], negative in contact. Shape (K,).
         """
         count = len(start_qpos)
-        T_world_plant = self._planting().T_world_plant[env_index].expand(count, 4, 4)
+        T_w_plant = self._planting.T_world_plant[env_index].expand(count, 4, 4)
         env_idx = torch.full((count,), env_index, device=start_qpos.device)
-        return self._scene.clearance_along(start_qpos.float(), end_qpos.float(), T_world_plant, env_idx)
+        return self._scene.clearance_along(start_qpos.float(), end_qpos.float(), T_w_plant, env_idx)
 
     def can_follow(
         self, start: Tensor, way: Tensor, target: Tensor, env_index: int = 0, *, contact_free: bool = False
@@ -99,7 +87,7 @@ class GroundTruth:
         if self._mover is None:
             self._mover = LookAtMover(start.device)
         position, target = start[None].double(), target[None].double()
-        joints = [self._qpos()[env_index][None].double()]
+        joints = [self._state.qpos[env_index][None].double()]
         for stop in way.double():
             move = self._mover.move(joints[-1], position, target, move_towards(position, target, stop[None]))
             if int(move.reach[0]) != int(Reach.REACHABLE):

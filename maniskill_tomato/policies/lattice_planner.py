@@ -1,0 +1,136 @@
+"""Planners that choose from the candidate views of the lattice, and what they do not try again."""
+
+import math
+from abc import abstractmethod
+
+import torch
+from torch import Tensor
+
+from maniskill_tomato.policies.moves import move_towards
+from maniskill_tomato.policies.protocol import Planner
+from maniskill_tomato.robot.look_at_move import MAX_MOVE
+from maniskill_tomato.sensing.belief import Belief
+
+TAKEN = 0.25 * MAX_MOVE
+"""Cameras this near to each other, in [m], have the same view."""
+
+REFUSED_ANGLE = math.radians(30.0)
+"""Moves from one place within this angle of a refused one are taken to be refused too."""
+
+
+def distance_to_taken(belief: Belief, positions: Tensor) -> Tensor:
+    """How far places are from the nearest view that was taken.
+
+    Args:
+        belief: Its memory knows the views.
+        positions: In the world frame, in [m]. Shape (B, K, 3).
+
+    Returns:
+        In [m]. Shape (B, K).
+    """
+    most = max(int(belief.memory.visits.max()), 1)
+    # A missing view is NaN.
+    return torch.cdist(positions, belief.memory.visited[:, :most]).nan_to_num(1.0e3).amin(dim=-1)
+
+
+class Candidates:
+    """Which candidate of the lattice each environment goes to, and which ones are not tried any more.
+
+    A view that was taken, or one within `TAKEN` of it, is not taken again: it was not enough. A candidate towards which
+    the camera moved less than a tenth of a move is not tried again in the episode. Nor is, until the camera has moved,
+    any other one that lies within `REFUSED_ANGLE` of that direction: the arm would refuse nearly the same move.
+    """
+
+    def __init__(self) -> None:
+        self.refused = torch.zeros(0, 0, dtype=torch.bool)
+        """Shape (B, K)."""
+        self.chosen = torch.zeros(0, dtype=torch.int64)
+        """Shape (B,)."""
+        self._before = torch.zeros(0, 3)
+        self._direction = torch.zeros(0, 3)
+        self._refused_directions: list[list[Tensor]] = []
+
+    def begin(self, belief: Belief, rows: Tensor) -> None:
+        """Forgets the episodes of some environments."""
+        if self.refused.shape != belief.reachable.shape:
+            self.refused = torch.zeros_like(belief.reachable)
+            self.chosen = torch.zeros_like(belief.reachable[:, 0], dtype=torch.int64)
+            self._before = torch.full_like(belief.camera_position, math.nan)
+            self._direction = torch.zeros_like(belief.camera_position)
+            self._refused_directions = [[] for _ in range(len(self.chosen))]
+        self.refused[rows] = False
+        self._before[rows] = math.nan
+        for i in rows.tolist():
+            self._refused_directions[i].clear()
+
+    def note_refusals(self, belief: Belief) -> None:
+        """Looks whether the last moves were made; to be called before the next choice."""
+        stuck = (belief.camera_position - self._before).norm(dim=-1) < 0.1 * MAX_MOVE
+        for i, stayed in enumerate(stuck.tolist()):
+            if stayed:
+                self.refused[i, self.chosen[i]] = True
+                self._refused_directions[i].append(self._direction[i].clone())
+            else:
+                self._refused_directions[i].clear()
+
+    def move_to_best(self, belief: Belief, positions: Tensor, worth: Tensor, allowed: Tensor) -> Tensor:
+        """The moves towards the best candidates that are allowed, were not taken and not refused.
+
+        Args:
+            belief: What is known.
+            positions: Of the candidates, in the world frame, in [m]. Shape (B, K, 3).
+            worth: Shape (B, K).
+            allowed: Shape (B, K), bool.
+
+        Returns:
+            Shape (B, 3).
+        """
+        position = belief.camera_position
+        directions = torch.nn.functional.normalize(positions - position[:, None], dim=-1)
+        allowed = allowed & ~self.refused & (distance_to_taken(belief, positions) > TAKEN)
+        for i, refused in enumerate(self._refused_directions):
+            if refused:
+                near = (directions[i] @ torch.stack(refused).mT).amax(dim=-1) > math.cos(REFUSED_ANGLE)
+                # Where all directions were refused, those of the other candidates are tried after all.
+                if bool((allowed[i] & ~near).any()):
+                    allowed[i] &= ~near
+        self.chosen = torch.where(allowed, worth, -math.inf).argmax(dim=1)
+        self._before = position.clone()
+        rows = torch.arange(len(position), device=position.device)
+        self._direction = directions[rows, self.chosen]
+        return move_towards(position, belief.target_position, positions[rows, self.chosen])
+
+
+class LatticePlanner(Planner):
+    """Moves towards the view of the lattice that is worth most, among those worth trying."""
+
+    def __init__(self) -> None:
+        self.tried = Candidates()
+
+    def begin(self, belief: Belief, rows: Tensor) -> None:
+        self.tried.begin(belief, rows)
+
+    def act(self, belief: Belief) -> Tensor:
+        """Towards the best view."""
+        self.tried.note_refusals(belief)
+        views = self.views(belief)
+        return self.tried.move_to_best(belief, views, self.worth(belief, views), self.allowed(belief))
+
+    @abstractmethod
+    def worth(self, belief: Belief, views: Tensor) -> Tensor:
+        """What each view is worth now, in the planner's own unit. Shapes (B, K, 3) to (B, K)."""
+
+    def views(self, belief: Belief) -> Tensor:
+        """Positions of the views to choose from, in the world frame, in [m]. Shape (B, K, 3)."""
+        positions: Tensor = belief.lattice.positions(belief.target_position)
+        return positions
+
+    def allowed(self, belief: Belief) -> Tensor:
+        """Which of them may be chosen. Shape (B, K), bool."""
+        return belief.reachable
+
+
+def way_to(belief: Belief, views: Tensor) -> Tensor:
+    """Straight distance from the camera to each view, in [m]. Shapes (B, K, 3) to (B, K)."""
+    way: Tensor = (views - belief.camera_position[:, None]).norm(dim=-1)
+    return way

@@ -1,0 +1,303 @@
+"""The four tasks as configurations of a world."""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, fields, replace
+from typing import Any, get_args
+
+import torch
+
+from maniskill_tomato.errors import InvalidInputError
+from maniskill_tomato.plants.episode_list import Episode
+from maniskill_tomato.plants.spec import PlantPose, PlantSpec
+from maniskill_tomato.robot.d435 import CameraIntrinsics, color_intrinsics
+from maniskill_tomato.robot.viewpoint_move import OutsideWorkspace
+from maniskill_tomato.sensing.observation import ObservationLayout
+from maniskill_tomato.sensing.sensor_noise import SensorNoise
+from maniskill_tomato.sensing.simulated_camera import RENDERED, Perception
+from maniskill_tomato.tasks import (
+    MAX_EPISODE_STEPS,
+    MAX_GENERAL_STEPS,
+    MAX_ROW_STEPS,
+    TASK_IDS,
+    option_checks,
+)
+from maniskill_tomato.tasks.arm_moves import ArmMoves, Control
+from maniskill_tomato.tasks.row.config import GeneralTaskConfig
+from maniskill_tomato.tasks.row.episode_selection import EpisodeChoice
+from maniskill_tomato.tasks.row.search_game import SearchGame
+from maniskill_tomato.tasks.row.target_sequence import Transits
+from maniskill_tomato.tasks.thesis.config import ViewpointTaskConfig, guided_task, sparse_task
+from maniskill_tomato.tasks.thesis.thesis_game import ThesisGame
+from maniskill_tomato.tasks.world import Game, Picture, TaskConfig, World
+
+IMAGE_SIZE = (160, 120)
+"""Width and height of the wrist camera's picture unless somebody says otherwise, in [px]."""
+
+MAX_STEPS: Mapping[str, int] = dict(
+    zip(TASK_IDS, (MAX_EPISODE_STEPS, MAX_EPISODE_STEPS, MAX_GENERAL_STEPS, MAX_ROW_STEPS), strict=True)
+)
+"""Steps after which an episode is cut off, by task."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class WorldOptions:
+    """Options of all tasks."""
+
+    plant: PlantSpec | Mapping[str, object] | str | None = None
+    """A preset's name or a mapping of `PlantSpec` fields; the task's own if None."""
+    plant_pose: PlantPose | Sequence[float] | None = None
+    """`(x, y, yaw)` of the stem in the world frame, in [m, m, rad]; the task's own if None."""
+    plant_pose_noise: Sequence[float] | None = None
+    """Half ranges of a uniform addition to it at every reset, in [m, m, rad]; the task's own if None."""
+    rays_per_side: int = 16
+    """A visible fraction is counted with this number of rays squared."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class ThesisOptions(WorldOptions):
+    """Options of the thesis's tasks."""
+
+    task: ViewpointTaskConfig
+    """Which."""
+    other_targets: int = 0
+    """How many other ripe fruits are judged at every step as if each were the target."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class SearchOptions(WorldOptions):
+    """Options of the general tasks."""
+
+    task: GeneralTaskConfig = GeneralTaskConfig()
+    """Starts, thresholds and rewards."""
+    episodes: str | Sequence[Episode] | None = None
+    """Name of a fixed list, a `.json` file of one, or `Episode` objects."""
+    layout: ObservationLayout | Sequence[str] | None = None
+    """What the observation holds, or the names of its parts."""
+    start_visibility: Sequence[float] | None = None
+    """Range of V_f of the first view; the task's own if None."""
+    contact_penalty: float | None = None
+    """What a move with plant contact costs; the task's own if None."""
+    sensor_noise: SensorNoise | Mapping[str, float] | None = None
+    """What camera and segmenter get wrong about exact labels."""
+    perception: Perception = "ground_truth"
+    """Where V_f, the target's position and the rays' labels come from."""
+    privileged: bool = False
+    """Whether the observation ends with the truth about the views around."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class RowOptions(SearchOptions):
+    """Options of the row."""
+
+    transits: Transits = "both"
+    """When an arm goes by its ready posture."""
+
+    def __post_init__(self) -> None:
+        if self.episodes is not None:
+            raise InvalidInputError("TomatoViewpointRow-v1 has no episode lists; choose plants with plant=")
+        option_checks.check_choice("transits", self.transits, get_args(Transits))
+
+
+def make_options(env_id: str, **options: Any) -> ThesisOptions | SearchOptions:
+    """The options of a task, checked for their names.
+
+    Raises:
+        InvalidInputError: The id or an option's name is unknown.
+    """
+    kinds: dict[str, type[ThesisOptions] | type[SearchOptions]] = dict(
+        zip(TASK_IDS, (ThesisOptions, ThesisOptions, SearchOptions, RowOptions), strict=True)
+    )
+    if env_id not in kinds:
+        raise InvalidInputError.choice("the environment id", env_id, TASK_IDS)
+    kind = kinds[env_id]
+    known = option_names(env_id)
+    for name in options:
+        if name not in known:
+            raise InvalidInputError.choice(f"an option of {env_id}", name, sorted(known))
+    if kind is ThesisOptions:
+        options.setdefault("task", guided_task() if env_id == TASK_IDS[0] else sparse_task())
+    if options.get("task", True) is None:
+        del options["task"]
+    return kind(**options)
+
+
+def option_names(env_id: str) -> frozenset[str]:
+    """Names of the options of a task that a world takes."""
+    kind = ThesisOptions if env_id in TASK_IDS[:2] else RowOptions if env_id == TASK_IDS[3] else SearchOptions
+    return frozenset(field.name for field in fields(kind))
+
+
+def default_control(env_id: str) -> Control:
+    """What an action of a task is unless somebody says otherwise."""
+    return "viewpoint" if env_id in TASK_IDS[:2] else "look_at"
+
+
+def wrist_intrinsics(width: int = IMAGE_SIZE[0], height: int = IMAGE_SIZE[1]) -> CameraIntrinsics:
+    """The wrist's colour camera at a size in [px]."""
+    fov_y = color_intrinsics(width, height).fov_y
+    return CameraIntrinsics.from_fov(width=width, height=height, fov_y=fov_y)
+
+
+@dataclass(frozen=True, kw_only=True)
+class TaskSetup:
+    """A task with checked options, from which worlds are built."""
+
+    make_game: Callable[[World], Game]
+    """Makes the task's rules over a world."""
+    plant: PlantSpec
+    """The plants."""
+    plant_pose: PlantPose
+    """Where they stand."""
+    plant_pose_noise: tuple[float, ...]
+    """Half ranges of a uniform addition to it at every reset, in [m, m, rad]."""
+    rays_per_side: int
+    """A visible fraction is counted with this number of rays squared."""
+    needs_pictures: bool = False
+    """Whether a world needs a renderer."""
+    follows_list: bool = False
+    """Whether episodes come from a fixed list."""
+    neighbour_poses: bool = True
+    """As for `ArmMoves`, like the next."""
+    outside_workspace: OutsideWorkspace = "stay"
+
+    def build(
+        self,
+        num_envs: int,
+        device: str | torch.device,
+        *,
+        control: Control,
+        intrinsics: CameraIntrinsics,
+        picture: Picture | None = None,
+    ) -> World:
+        """A world; see `make_world`."""
+        moves = ArmMoves(
+            control,
+            device,
+            neighbour_poses=self.neighbour_poses,
+            outside_workspace=self.outside_workspace,
+        )
+        return World(
+            self.make_game,
+            moves=moves,
+            plant=self.plant,
+            plant_pose=self.plant_pose,
+            plant_pose_noise=self.plant_pose_noise,
+            intrinsics=intrinsics,
+            rays_per_side=self.rays_per_side,
+            num_envs=num_envs,
+            device=device,
+            picture=picture,
+        )
+
+
+def make_world(
+    env_id: str,
+    num_envs: int = 1,
+    device: str | torch.device = "cpu",
+    *,
+    control: Control | None = None,
+    intrinsics: CameraIntrinsics | None = None,
+    picture: Picture | None = None,
+    **options: Any,
+) -> World:
+    """N environments of a task without a simulator.
+
+    Args:
+        env_id: One of `tasks.TASK_IDS`.
+        num_envs: N.
+        device: Where all tensors live.
+        control: What an action is; the task's own if None.
+        intrinsics: Of the wrist's camera; the D435's colour camera at `IMAGE_SIZE` if None.
+        picture: A renderer, for perception that needs colours.
+        options: `ThesisOptions`, `SearchOptions` or `RowOptions`.
+
+    Raises:
+        InvalidInputError: An option cannot be used.
+    """
+    return make_setup(env_id, **options).build(
+        num_envs,
+        device,
+        control=control or default_control(env_id),
+        intrinsics=intrinsics or wrist_intrinsics(),
+        picture=picture,
+    )
+
+
+def make_setup(env_id: str, **options: Any) -> TaskSetup:
+    """A task with its options checked.
+
+    Raises:
+        InvalidInputError: The id or an option cannot be used.
+    """
+    checked = make_options(env_id, **options)
+    option_checks.check_rays_per_side(checked.rays_per_side)
+    return _thesis_setup(checked) if isinstance(checked, ThesisOptions) else _search_setup(checked)
+
+
+def _thesis_setup(options: ThesisOptions) -> TaskSetup:
+    task, others = options.task, options.other_targets
+    option_checks.check_other_targets(others)
+    return TaskSetup(
+        make_game=lambda world: ThesisGame(world, task, others),
+        neighbour_poses=task.neighbour_poses,
+        outside_workspace="home" if task.outside_workspace == "home" else "stay",
+        **_standing(options, task, options.plant, (0.0, 0.0, 0.0)),
+    )
+
+
+def _search_setup(options: SearchOptions) -> TaskSetup:
+    option_checks.check_choice("perception", options.perception, get_args(Perception))
+    noise = SensorNoise.parse(options.sensor_noise)
+    if options.perception != "ground_truth" and noise != SensorNoise():
+        raise InvalidInputError(
+            "sensor_noise disturbs ground truth; leave it out with perception='occlusion_model', "
+            "whose depth has noise of its own"
+        )
+    task = options.task
+    if options.start_visibility is not None:
+        start_visibility = option_checks.check_range("start_visibility", options.start_visibility)
+        task = replace(task, start_visibility=start_visibility)
+    if options.contact_penalty is not None:
+        task = replace(task, contact_penalty=float(options.contact_penalty))
+    episodes = EpisodeChoice(options.episodes)
+    plant = PlantSpec.parse(options.plant, task.plant)
+    if episodes.episodes is not None:
+        plant = replace(plant, seed=episodes.split, pool=None)
+    layout = options.layout
+    if layout is not None and not isinstance(layout, ObservationLayout):
+        layout = ObservationLayout(parts=tuple(layout))  # type: ignore[arg-type]
+    shape = layout or ObservationLayout()
+    transits = options.transits if isinstance(options, RowOptions) else None
+    return TaskSetup(
+        make_game=lambda world: SearchGame(
+            world,
+            task,
+            episodes=episodes,
+            layout=shape,
+            noise=noise,
+            perception=options.perception,
+            privileged=options.privileged,
+            transits=transits,
+        ),
+        needs_pictures=options.perception in RENDERED,
+        follows_list=episodes.episodes is not None,
+        **_standing(options, task, plant, task.plant_pose_noise),
+    )
+
+
+def _standing(
+    options: WorldOptions,
+    task: TaskConfig,
+    plant: PlantSpec | Mapping[str, object] | str | None,
+    noise: Sequence[float],
+) -> dict[str, Any]:
+    """Which plants stand where, and how their fruits are judged."""
+    given = options.plant_pose_noise
+    return {
+        "plant": PlantSpec.parse(plant, task.plant),
+        "plant_pose": PlantPose.parse(options.plant_pose, task.plant_pose),
+        "plant_pose_noise": option_checks.check_half_ranges(
+            "plant_pose_noise", noise if given is None else given, 3
+        ),
+        "rays_per_side": options.rays_per_side,
+    }

@@ -1,0 +1,440 @@
+"""The rules of the general tasks: a hidden tomato, a memory of what was seen, a reward for every gain in sight.
+
+With a `TargetSequence` all ripe fruits of a row in reach are looked for, one after the other.
+"""
+
+import math
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from maniskill_tomato.errors import InvalidInputError
+from maniskill_tomato.plants.episode_list import Episode
+from maniskill_tomato.plants.row import Row, leaf_density_of
+from maniskill_tomato.robot.kinematics import link_transforms
+from maniskill_tomato.robot.look_at import camera_to_viewpoint
+from maniskill_tomato.robot.transit import TRANSIT_MOVES
+from maniskill_tomato.sensing.belief import Belief
+from maniskill_tomato.sensing.observation import ObservationLayout, ViewpointObserver
+from maniskill_tomato.sensing.sensor_noise import SensorNoise
+from maniskill_tomato.sensing.simulated_camera import Perception
+from maniskill_tomato.sensing.true_views import TRUE_VIEWS, TrueViews
+from maniskill_tomato.tasks import MAX_ROW_STEPS
+from maniskill_tomato.tasks.arm_moves import Plan
+from maniskill_tomato.tasks.row.camera_senses import make_senses
+from maniskill_tomato.tasks.row.config import GeneralTaskConfig
+from maniskill_tomato.tasks.row.episode_selection import EpisodeChoice
+from maniskill_tomato.tasks.row.hidden_starts import HardStarts, Start
+from maniskill_tomato.tasks.row.senses import Sight, Vantage
+from maniskill_tomato.tasks.row.target_sequence import TargetSequence, Transits, with_transits
+from maniskill_tomato.tasks.world import World
+from maniskill_tomato.tasks.world_state import MAX_VIEWS
+
+MAX_PLANT_DRAWS = 1000
+"""Plants drawn under a limit of leaf density before there is held to be none."""
+
+START_RPY = (0.0, torch.pi / 2, 0.0)
+"""The angles that those of a first view are near to, in [rad]: along +x, upright."""
+
+
+class SearchGame:
+    """The general task, and the row where `transits` says how arms get from target to target."""
+
+    saved_columns: tuple[str, ...] = (
+        *(
+            "viewpoint",
+            "reach",
+            "target",
+            "plant_pose",
+            "plant_seed",
+            "views",
+            "view_count",
+            "looks",
+            "moves",
+        ),
+        *("clearance", "path_length", "joint_path_length", "fraction_before", "fraction_after"),
+        *("noise_seed", "position_error", "hidden_below", "open_targets", "targets_begun", "seen_count"),
+        *("target_count", "target_moves", "target_done", "transits"),
+    )
+
+    def __init__(
+        self,
+        world: World,
+        task: GeneralTaskConfig,
+        *,
+        episodes: EpisodeChoice,
+        layout: ObservationLayout,
+        noise: SensorNoise,
+        perception: Perception,
+        privileged: bool,
+        transits: Transits | None,
+    ) -> None:
+        """Plays in a world.
+
+        Args:
+            world: The plants and arms.
+            task: Starts, thresholds and rewards.
+            episodes: A fixed list, if there is one.
+            layout: What the observation holds.
+            noise: What is wrong with exact labels.
+            perception: Where labels and V_f come from.
+            privileged: Whether the observation ends with the truth about the views around.
+            transits: When arms go by their ready posture in a row; None for the task with one target.
+        """
+        self.task = task
+        self.layout = layout
+        self.episodes = episodes
+        self._world = world
+        self._leaf_density_limit = math.inf
+        self._observer = ViewpointObserver(world.num_envs, world.device, layout, task.max_moves)
+        self._senses = make_senses(perception, world, noise)
+        self._is_camera = perception != "ground_truth"
+        self._starts = HardStarts(task, world.scene, world.device)
+        self.sequence = None if transits is None else TargetSequence(world, self._observer.lattice, transits)
+        self._true_views = TrueViews(world.num_envs, self._observer.lattice) if privileged else None
+        self._sight: Sight | None = None
+        self._seen_from = torch.zeros(0)
+        """Poses of the cameras at the last views. Shape (N, 4, 4)."""
+        self.soft_starts = 0
+        """Episodes so far that no drawn start made as hard as asked for."""
+
+    # ---------------------------------------------------------------- episode
+
+    @property
+    def belief(self) -> Belief:
+        """What is known after the last look."""
+        return self._observer.belief
+
+    def episode(self, env_index: int, options: Mapping[str, Any]) -> Episode | None:
+        """The episode of the list that a reset with these options begins; None without a list."""
+        return self.episodes.at(env_index, self._world.seeds[env_index], options)
+
+    def draw_plant(self, env_index: int, rng: np.random.RandomState, options: Mapping[str, Any]) -> int:
+        """The seed of an environment's next plant, the first draw of its episode."""
+        episode = self.episode(env_index, options)
+        if episode is not None:
+            return episode.plant_seed
+        spec = self._world.planting.spec
+        # Without a limit, or with that of the task's highest density, the first draw is taken.
+        for _ in range(MAX_PLANT_DRAWS):
+            seed = spec.draw_seed(rng)
+            if (leaf_density_of(spec.leaf_density, seed) or 0.0) <= self._leaf_density_limit:
+                return seed
+        raise InvalidInputError(
+            f"none of {MAX_PLANT_DRAWS} drawn plants has a leaf density of {self._leaf_density_limit} or less; "
+            "raise the limit (leaf_density_start) or the plants' pool"
+        )
+
+    @property
+    def leaf_density_range(self) -> tuple[float, float]:
+        """Of the plants that are drawn without a limit; equal numbers where all plants have one density."""
+        density = self._world.planting.spec.leaf_density
+        if isinstance(density, tuple):
+            return density
+        return (1.0, 1.0) if density is None else (density, density)
+
+    def limit_leaf_density(self, highest: float) -> None:
+        """From the next reset on, draws only plants whose leaf density is at most this.
+
+        Raises:
+            InvalidInputError: No plant of the range is as sparse as that.
+        """
+        low, _ = self.leaf_density_range
+        if highest <= low:
+            raise InvalidInputError(f"the highest leaf density must be above {low}, got {highest}")
+        self._leaf_density_limit = highest
+
+    def begin(
+        self, env_idx: Tensor, rngs: Sequence[np.random.RandomState], options: Mapping[str, Any]
+    ) -> None:
+        """Begins with a hidden target each, or with the episodes of the list."""
+        world, state, indices = self._world, self._world.state, env_idx.tolist()
+        episodes = [self.episode(i, options) for i in indices]
+        listed = [e for e in episodes if e is not None]
+        if listed:
+            world.place_plants(env_idx, np.array([e.plant_pose for e in listed]))
+        starts = [
+            self._start(i, rng, episode, options)
+            for i, rng, episode in zip(indices, rngs, episodes, strict=True)
+        ]
+        self.soft_starts += sum(not start.is_hard for start in starts)
+        world.set_target(env_idx, [start.target for start in starts])
+        poses = torch.stack([start.T_world_camera for start in starts]).double()
+        near = torch.tensor([START_RPY], dtype=torch.float64, device=world.device).expand(len(starts), 3)
+        viewpoint = camera_to_viewpoint(poses, near).float()
+        world.set_arm(env_idx, torch.stack([start.qpos for start in starts]), viewpoint)
+        for i, rng, start in zip(indices, rngs, starts, strict=True):
+            hidden = start.is_hard and options.get("camera_position") is None
+            self._senses.begin(i, rng, self.task.start_visibility[1] if hidden else 0.0)
+        for column in (state.moves, state.looks, state.targets_begun, state.transits):
+            column[env_idx] = 0
+        for length in (state.path_length, state.joint_path_length):
+            length[env_idx] = 0.0
+        clearance = world.scene.clearance_at(
+            state.qpos[env_idx], world.planting.T_world_plant[env_idx], env_idx
+        )
+        state.clearance[env_idx] = clearance
+        if self.sequence is not None:
+            self.sequence.begin(env_idx)
+        self._forget(env_idx)
+        self._begin_targets(env_idx)
+        started = self._mask(env_idx)
+        first = state.visible_fraction
+        state.fraction_before = torch.where(started, first, state.fraction_before)
+        state.fraction_after = torch.where(started, first, state.fraction_after)
+
+    def _candidates(self, env_index: int) -> list[int]:
+        """The fruits that can become targets."""
+        if self.sequence is not None:
+            return self.sequence.in_reach(env_index)
+        plant, ripe = self._world.planting.plants[env_index], self._world.planting.ripe_fruits[env_index]
+        return [j for j in ripe if j < plant.middle_fruits] if isinstance(plant, Row) else ripe
+
+    def _start(
+        self, env_index: int, rng: np.random.RandomState, episode: Episode | None, options: Mapping[str, Any]
+    ) -> Start:
+        planting = self._world.planting
+        targets = [episode.target] if episode is not None else self._candidates(env_index)
+        camera_position = options.get("camera_position", None)
+        if camera_position is None and episode is not None:
+            camera_position = episode.camera_position
+        if "target" in options:
+            targets = [self._world.checked_target(env_index, options["target"])]
+        positions = planting.fruit_positions_w(env_index, targets)
+        if camera_position is not None:
+            k = int(rng.randint(len(targets))) if len(targets) > 1 else 0
+            return self._starts.given(camera_position, targets[k], positions[k])
+        return self._starts.draw(env_index, rng, targets, positions, planting.T_world_plant[env_index])
+
+    def _forget(self, env_idx: Tensor) -> None:
+        """Begins with other targets. Shape (b,)."""
+        self._senses.begin_targets(env_idx)
+        self._world.state.targets_begun[env_idx] += 1
+
+    def _begin_targets(self, env_idx: Tensor) -> None:
+        """Takes a first look at the targets of some environments, of which nothing is known. Shape (b,)."""
+        state = self._world.state
+        self._ask_truth(env_idx)
+        self._observer.begin(env_idx, self.known_target()[env_idx])
+        state.view_count[env_idx] = 0
+        state.views[env_idx] = 0.0
+        self._look(self._mask(env_idx))
+
+    def _ask_truth(self, env_idx: Tensor) -> None:
+        if self._true_views is not None:
+            world = self._world
+            self._true_views.begin(env_idx, world.target_position_w, world.ground_truth.visible_fraction)
+
+    def _mask(self, env_idx: Tensor) -> Tensor:
+        mask = torch.zeros(self._world.num_envs, dtype=torch.bool, device=self._world.device)
+        mask[env_idx] = True
+        return mask
+
+    # ------------------------------------------------------------------- step
+
+    def known_target(self) -> Tensor:
+        """Where the targets are believed to be, world frame, in [m]. Shape (N, 3)."""
+        return self._senses.known_target()
+
+    def amend(self, plan: Plan, action: Tensor) -> Plan:
+        """The plan, with a transit where a row's look-at move is refused."""
+        if self.sequence is None or self._world.moves.control != "look_at":
+            return plan
+        return self.sequence.ways_of_refused(plan, action, self.known_target())
+
+    def look(self, before: Tensor, plan: Plan | None) -> Plan | None:
+        """Counts a move, or a turn to the next target, and looks."""
+        if plan is not None and plan.turned is not None:
+            self._count_transits(plan)
+            self._begin_targets(plan.turned)
+            return None
+        state = self._world.state
+        state.fraction_before = state.visible_fraction
+        state.transits = torch.zeros_like(state.transits)
+        self._count_move(before, plan)
+        self._look(None)
+        state.fraction_after = state.visible_fraction
+        return None if self.sequence is None else self._turn(self.sequence)
+
+    def _count_move(self, before: Tensor, plan: Plan | None) -> None:
+        """Clearance, way and number of the last move."""
+        world, state = self._world, self._world.state
+        ways = {} if plan is None else plan.transits
+        T_w_camera, qpos = world.T_w_camera, state.qpos
+        if ways:
+            # These went another way, which is counted below.
+            qpos = qpos.clone()
+            rows = list(ways)
+            qpos[rows] = before[rows]
+            T_w_camera = T_w_camera.clone()
+            T_w_camera[rows] = self._seen_from[rows]
+        state.clearance = world.scene.clearance_along(before, qpos, world.planting.T_world_plant)
+        moved = (T_w_camera[:, :3, 3] - self._seen_from[:, :3, 3]).norm(dim=-1)
+        state.path_length = state.path_length + moved
+        state.moves = state.moves + 1
+        if self.sequence is not None:
+            state.joint_path_length = state.joint_path_length + (qpos - before).abs().sum(-1)
+            state.target_moves = state.target_moves + 1
+        if plan is not None:
+            self._count_transits(plan)
+
+    def _count_transits(self, plan: Plan) -> None:
+        world, state = self._world, self._world.state
+        for i, way in plan.transits.items():
+            passed = way.passed.float()
+            legs = len(passed) - 1
+            T_w_plant = world.planting.T_world_plant[i].expand(legs, 4, 4)
+            env_idx = torch.full((legs,), i, device=world.device)
+            clearance = world.scene.clearance_along(passed[:-1], passed[1:], T_w_plant, env_idx).min()
+            state.clearance[i] = torch.minimum(state.clearance[i], clearance)
+            state.path_length[i] += way.camera_path_m
+            state.joint_path_length[i] += way.joint_path_rad
+            state.moves[i] += TRANSIT_MOVES
+            state.target_moves[i] += TRANSIT_MOVES
+            state.transits[i] += 1
+
+    def _turn(self, sequence: TargetSequence) -> Plan | None:
+        """The turn to the next targets after a move; None where all go on with theirs."""
+        state = self._world.state
+        turned = sequence.finish(self.task.full_visibility, self.task.max_moves)
+        if not turned:
+            return None
+        env_idx = torch.tensor(turned, device=self._world.device)
+        self._forget(env_idx)
+        known = self.known_target()
+        ways = {i: way for i in turned if (way := sequence.way_to_next(i, known[i])) is not None}
+        stay = Plan(target_qpos=state.qpos, reach=state.reach, viewpoint=state.viewpoint, turned=env_idx)
+        return with_transits(stay, ways)
+
+    def _moves_left(self) -> Tensor:
+        state = self._world.state
+        if self.sequence is None:
+            return (self.task.max_moves - state.moves).clamp_min(0)
+        left = torch.minimum(self.task.max_moves - state.target_moves, MAX_ROW_STEPS - state.moves)
+        return left.clamp_min(0)
+
+    def _look(self, mask: Tensor | None) -> None:
+        """Looks from where the arms stand and takes the view into the memory, once for every view."""
+        world, state = self._world, self._world.state
+        rows = torch.arange(world.num_envs, device=world.device) if mask is None else mask.nonzero()[:, 0]
+        state.views[rows, state.view_count[rows].clamp_max(MAX_VIEWS - 1)] = state.qpos[rows]
+        vantage = Vantage(
+            T_w_camera=world.T_w_camera,
+            T_w_links=world.T_w_links,
+            qpos=state.qpos,
+            look=state.looks.clone(),
+            mask=mask,
+        )
+        state.view_count[rows] += 1
+        state.looks[rows] += 1
+        self._sense(vantage)
+
+    def _sense(self, vantage: Vantage) -> None:
+        """Senses one view of some environments and observes it."""
+        state, mask = self._world.state, vantage.mask
+        sight, located = self._senses.look(vantage)
+        seen_from = vantage.T_w_camera
+        if mask is not None and self._sight is not None:
+            sight = sight.where(mask, self._sight)
+            seen_from = torch.where(mask[:, None, None], seen_from, self._seen_from)
+        self._sight, self._seen_from = sight, seen_from
+        state.visible_fraction = sight.visible_fraction
+        if located is not None and len(located):
+            # What was seen before stood about the place where the target was thought to be.
+            self._senses.revise(self._observer, located)
+        self._observer.observe(
+            state.viewpoint, seen_from, sight.rays, sight.told_fraction, self._moves_left(), mask
+        )
+
+    def recall(self, env_idx: Tensor) -> None:
+        """Looks again from where some environments looked, so that all is known of their targets that was known."""
+        state = self._world.state
+        self._ask_truth(env_idx)
+        self._senses.recall_targets(env_idx)
+        self._observer.begin(env_idx, self.known_target()[env_idx])
+        chosen = self._mask(env_idx)
+        count = state.view_count.clamp_max(MAX_VIEWS)
+        for k in range(int(count[env_idx].max())):
+            qpos = state.views[:, k]
+            T_w_links = link_transforms(qpos)
+            self._sense(
+                Vantage(
+                    T_w_camera=self._world.camera_poses(T_w_links),
+                    T_w_links=T_w_links,
+                    qpos=qpos,
+                    look=state.looks - state.view_count + k,
+                    mask=chosen & (k < count),
+                )
+            )
+
+    # ---------------------------------------------------------------- outcome
+
+    @property
+    def observation_size(self) -> int:
+        """Numbers of the observer's vector, and of the truth if it is told."""
+        return self.layout.size + (0 if self._true_views is None else TRUE_VIEWS)
+
+    def observation(self) -> dict[str, Tensor]:
+        """The parts of the observer's vector, and the truth for critics that ask for it."""
+        vector = self.belief.observation
+        parts = {str(name): vector[:, part].clone() for name, part in self.layout.slices.items()}
+        if self._true_views is not None:
+            position = self._seen_from[:, :3, 3]
+            parts["truth"] = self._true_views.describe(position, self._world.target_position_w)
+        return parts
+
+    def info(self) -> dict[str, Tensor]:
+        """What came of the last move: V_f, whether that is a success, what it touched, how much of a row is done."""
+        state, sight = self._world.state, self._sight
+        assert sight is not None
+        fraction = state.fraction_after
+        info = {
+            "success": fraction > self.task.full_visibility,
+            "fail": torch.zeros_like(fraction, dtype=torch.bool),
+            "visible_fraction": fraction.clone(),
+            "visible_fraction_gain": fraction - state.fraction_before,
+            "target_id": self._world.target_id,
+            "target_seen": fraction > 0.0,
+            "tomato_seen": sight.tomato_seen.clone(),
+            "reachability": state.reach.clone(),
+            "clearance": state.clearance.clone(),
+            "plant_contact": state.clearance <= 0.0,
+            "moves": state.moves.clone(),
+            "path_length": state.path_length.clone(),
+        }
+        if self._is_camera:
+            info["true_visible_fraction"] = sight.true_fraction.clone()
+            info["true_success"] = sight.true_fraction > self.task.full_visibility
+        if self.sequence is not None:
+            info["success"] = state.seen_count >= state.target_count
+            over = self.sequence.is_over() | (state.moves >= MAX_ROW_STEPS)
+            info["fail"] = over & ~info["success"]
+            info["seen_count"] = state.seen_count.clone()
+            info["target_count"] = state.target_count.clone()
+            info["target_done"] = state.target_done.clone()
+            info["transits"] = state.transits.clone()
+            info["joint_path_length"] = state.joint_path_length.clone()
+        return info
+
+    def reward(self, info: Mapping[str, Tensor]) -> Tensor:
+        """`view_gain_reward` of the last move; in a row each target that was seen is a success, and transits cost what
+        their moves do. Shape (N,)."""
+        state = self._world.state
+        success = info["success"] if self.sequence is None else info["target_done"]
+        reward = self.task.reward(state.fraction_after, state.fraction_before, success, info["plant_contact"])
+        if self.sequence is None:
+            return reward
+        return reward - self.task.step_cost * TRANSIT_MOVES * info["transits"]
+
+    # ------------------------------------------------------------------- rows
+
+    def open_targets(self, env_index: int = 0) -> list[int]:
+        """The fruits that are yet to be looked for, the target among them, as indices in `Plant.fruits`."""
+        return [int(j) for j in self._world.state.open_targets[env_index].nonzero()[:, 0]]
+
+    def fruit_position_w(self, env_index: int, fruit: int) -> Tensor:
+        """Centre of a fruit in the world frame, in [m]. Shape (3,)."""
+        return self._world.planting.fruit_positions_w(env_index, [fruit])[0]

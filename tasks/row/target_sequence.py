@@ -1,0 +1,140 @@
+"""One target of a row after the other: which are in reach, which is next, and how the arm gets there."""
+
+from dataclasses import replace
+from typing import Final, Literal, get_args
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from maniskill_tomato.errors import InvalidInputError
+from maniskill_tomato.robot.inverse_kinematics import Reach
+from maniskill_tomato.robot.look_at_move import moved_position
+from maniskill_tomato.robot.transit import Transit, TransitPlanner
+from maniskill_tomato.sensing.view_lattice import ViewLattice
+from maniskill_tomato.tasks.arm_moves import Plan
+from maniskill_tomato.tasks.world import World
+from maniskill_tomato.tasks.world_state import MAX_TARGETS
+
+REACHABLE_SHARE = 0.1
+"""A fruit is in reach when the arm can look at it from this share of the lattice's candidates or more."""
+
+Transits = Literal["none", "target", "refused", "both"]
+"""When the arm goes by its ready posture (`robot.transit`): never; to the next target, if it cannot look at it from
+where it stands; where a move is refused, if another posture reaches the place; or both."""
+
+STAND_OFF: Final = 0.3
+"""Places for the first view of a target are at least this far from it, in [m]."""
+
+
+class TargetSequence:
+    """The targets of every environment's row."""
+
+    def __init__(self, world: World, lattice: ViewLattice, transits: Transits) -> None:
+        """Follows a world.
+
+        Args:
+            world: The plants and arms.
+            lattice: Says what the arm reaches.
+            transits: When an arm goes by its ready posture.
+        """
+        if transits not in get_args(Transits):
+            raise InvalidInputError.choice("transits", transits, get_args(Transits))
+        self.transits: Transits = transits
+        self._world = world
+        self._lattice = lattice
+        self._planner = TransitPlanner(world.device)
+
+    def in_reach(self, env_index: int) -> list[int]:
+        """The ripe fruits that the arm can look at."""
+        planting = self._world.planting
+        ripe = [j for j in planting.ripe_fruits[env_index] if j < MAX_TARGETS]
+        reachable = self._lattice.reachable(planting.fruit_positions_w(env_index, ripe))
+        shares = reachable.float().mean(dim=-1).tolist()
+        return [j for j, share in zip(ripe, shares, strict=True) if share >= REACHABLE_SHARE]
+
+    def begin(self, env_idx: Tensor) -> None:
+        """Begins rows whose first targets are chosen. Shape (b,)."""
+        state = self._world.state
+        state.open_targets[env_idx] = False
+        for i in env_idx.tolist():
+            state.open_targets[i, self.in_reach(i)] = True
+            state.open_targets[i, int(state.target[i])] = True
+        state.target_count[env_idx] = state.open_targets[env_idx].sum(-1)
+        state.seen_count[env_idx] = 0
+        state.target_moves[env_idx] = 0
+        state.target_done[env_idx] = False
+        state.transits[env_idx] = 0
+
+    def is_over(self) -> Tensor:
+        """Whether no target is left. Shape (N,), bool."""
+        return ~self._world.state.open_targets.any(-1)
+
+    def finish(self, full_visibility: float, max_moves: int) -> list[int]:
+        """Counts what the last move saw; returns the environments that turn to another target."""
+        state = self._world.state
+        state.target_done = state.fraction_after > full_visibility
+        state.seen_count = state.seen_count + state.target_done.long()
+        ended = state.target_done | (state.target_moves >= max_moves)
+        return [i for i in ended.nonzero()[:, 0].tolist() if self._choose_next(i)]
+
+    def _choose_next(self, env_index: int) -> bool:
+        """Chooses the nearest fruit left, if there is one."""
+        world, state = self._world, self._world.state
+        state.open_targets[env_index, state.target[env_index]] = False
+        left: list[int] = state.open_targets[env_index].nonzero()[:, 0].tolist()
+        if not left:
+            return False
+        away = world.planting.fruit_positions_w(env_index, left) - world.T_w_camera[env_index, :3, 3]
+        nearest = left[int(np.argmin(away.norm(dim=-1).tolist()))]
+        world.set_target(torch.tensor([env_index], device=world.device), [nearest])
+        state.target_moves[env_index] = 0
+        return True
+
+    def way_to_next(self, env_index: int, known_target: Tensor) -> Transit | None:
+        """A transit to the nearest place for a first view; None if the camera sees the target from where it is, or if
+        there is none.
+
+        Args:
+            env_index: Which environment.
+            known_target: Where its target is believed to be, in the base frame, in [m]. Shape (3,).
+        """
+        if self.transits not in ("target", "both"):
+            return None
+        qpos = self._world.state.qpos[env_index]
+        if self._planner.can_turn(qpos, known_target):
+            return None
+        position = self._world.T_w_camera[env_index, :3, 3]
+        places = self._lattice.positions(known_target[None])[0]
+        places = places[(places - position).norm(dim=-1).argsort()]
+        away = (places - known_target).norm(dim=-1)
+        return self._planner.plan(qpos, places[away >= STAND_OFF], known_target)
+
+    def ways_of_refused(self, plan: Plan, action: Tensor, known_target: Tensor) -> Plan:
+        """The plan with transits where a look-at move is refused and another posture reaches the place.
+
+        Args:
+            plan: Of the move.
+            action: What was asked for. Shape (N, 3).
+            known_target: In the base frame, in [m]. Shape (N, 3).
+        """
+        if self.transits not in ("refused", "both"):
+            return plan
+        world, ways = self._world, {}
+        for i in (plan.reach == int(Reach.UNREACHABLE)).nonzero()[:, 0].tolist():
+            place = moved_position(world.T_w_camera[i, :3, 3], known_target[i], action[i])
+            way = self._planner.plan(world.state.qpos[i], place[None], known_target[i])
+            if way is not None:
+                ways[i] = way
+        return with_transits(plan, ways)
+
+
+def with_transits(plan: Plan, ways: dict[int, Transit]) -> Plan:
+    """The plan with other ways for some environments, which reach where they go."""
+    if not ways:
+        return plan
+    target_qpos, reach = plan.target_qpos.clone(), plan.reach.clone()
+    for i, way in ways.items():
+        target_qpos[i] = way.waypoints[-1].to(target_qpos)
+        reach[i] = int(Reach.REACHABLE)
+    return replace(plan, target_qpos=target_qpos, reach=reach, transits=ways)

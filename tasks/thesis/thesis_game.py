@@ -1,0 +1,144 @@
+"""The rules of the thesis's tasks: nine observed numbers, increments of the viewpoint, a reward for every view."""
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from maniskill_tomato.robot.inverse_kinematics import Reach
+from maniskill_tomato.tasks.arm_moves import Plan
+from maniskill_tomato.tasks.thesis.config import ViewpointTaskConfig
+from maniskill_tomato.tasks.thesis.other_targets import other_ripe_fruits
+from maniskill_tomato.tasks.thesis.rewards import in_forbidden_zone
+from maniskill_tomato.tasks.thesis.starts import Starts
+from maniskill_tomato.tasks.world import World
+
+
+class ThesisGame:
+    """One class for both tasks; a `ViewpointTaskConfig` tells them apart."""
+
+    saved_columns: tuple[str, ...] = ("viewpoint", "reach", "target", "plant_pose", "plant_seed")
+
+    def __init__(self, world: World, task: ViewpointTaskConfig, other_targets: int = 0) -> None:
+        """Plays in a world.
+
+        Args:
+            world: The plants and arms.
+            task: Starts, thresholds and rewards.
+            other_targets: How many other ripe fruits are judged at every step as if each were the target.
+        """
+        self.task = task
+        self._world = world
+        self._other_targets = other_targets
+        self._starts = Starts(task, world.device)
+        self._view: dict[str, Tensor] = {}
+        self._views_of_others: list[dict[str, Tensor]] = []
+
+    def draw_plant(self, env_index: int, rng: np.random.RandomState, options: Mapping[str, Any]) -> int:
+        """The seed of an environment's next plant, the first draw of its episode."""
+        return self._world.planting.spec.draw_seed(rng)
+
+    def begin(
+        self, env_idx: Tensor, rngs: Sequence[np.random.RandomState], options: Mapping[str, Any]
+    ) -> None:
+        """Draws targets among the ripe fruits, each with the same probability, and starts from the task's ranges."""
+        world, indices = self._world, env_idx.tolist()
+        ripe = [world.planting.ripe_fruits[i] for i in indices]
+        targets = [int(fruits[rng.randint(len(fruits))]) for fruits, rng in zip(ripe, rngs, strict=True)]
+        if "target" in options:
+            targets = [world.checked_target(i, options["target"]) for i in indices]
+        if "viewpoint" in options:
+            viewpoint, qpos = self._starts.given(options["viewpoint"], len(indices))
+        else:
+            viewpoint, qpos = self._starts.draw(rngs)
+        world.set_target(env_idx, targets)
+        world.set_arm(env_idx, qpos, viewpoint)
+        self.recall(env_idx)
+
+    def known_target(self) -> Tensor:
+        """Where the targets are, world frame, in [m]. Shape (N, 3)."""
+        return self._world.target_position_w
+
+    def amend(self, plan: Plan, action: Tensor) -> Plan:
+        """The plan as it is."""
+        return plan
+
+    def look(self, before: Tensor, plan: Plan | None) -> Plan | None:
+        """Looks at the targets; a step is one look."""
+        self._look()
+        return None
+
+    def recall(self, env_idx: Tensor) -> None:
+        """Looks from where the arms are."""
+        if self._other_targets:
+            self._others, self._others_exist = other_ripe_fruits(
+                self._world.planting.ripe_fruits, self._world.state.target, self._other_targets
+            )
+        self._look()
+
+    def _look(self) -> None:
+        state = self._world.state
+        self._view = self._judge(state.target)
+        state.visible_fraction = self._view["visible_fraction"]
+        if self._other_targets:
+            self._views_of_others = [self._judge(fruit) for fruit in self._others.unbind(-1)]
+
+    def _judge(self, target: Tensor) -> dict[str, Tensor]:
+        """The present view as one of `target`, indices in `Plant.fruits`. Shape (N,)."""
+        world, state = self._world, self._world.state
+        seen = world.scene.visibility(world.T_w_camera, target, world.planting.T_world_plant, world.T_w_links)
+        fraction, tomato_seen = seen.visible_fraction, seen.any_visible
+        target_seen = fraction > 0.0
+        forbidden = in_forbidden_zone(state.viewpoint[:, :3])
+        unreachable = state.reach == int(Reach.UNREACHABLE)
+        fail = unreachable if self.task.outside_workspace == "end" else torch.zeros_like(unreachable)
+        return {
+            "success": (fraction > self.task.full_visibility) & ~fail,
+            "fail": fail,
+            "visible_fraction": fraction,
+            "target_seen": target_seen,
+            "tomato_seen": tomato_seen,
+            "reachability": state.reach.clone(),
+            "in_forbidden_zone": forbidden,
+            "reward_visual": self.task.visual_reward(fraction, target_seen, tomato_seen, state.reach),
+            "reward_penalty": self.task.pose_penalty(state.reach, forbidden),
+        }
+
+    @property
+    def observation_size(self) -> int:
+        """The nine numbers of the thesis."""
+        return 9
+
+    def observation(self) -> dict[str, Tensor]:
+        """The nine numbers of the thesis by name."""
+        viewpoint = self._world.state.viewpoint
+        return {
+            "ee_position": viewpoint[:, :3].clone(),
+            "ee_rpy": viewpoint[:, 3:].clone(),
+            "target_position": self._world.target_position_w.clone(),
+        }
+
+    def info(self) -> dict[str, Tensor]:
+        """What the camera sees, and the terms of the reward."""
+        info = {name: value.clone() for name, value in self._view.items()}
+        info["target_id"] = self._world.target_id
+        if self._other_targets:
+            info |= self._info_of_others()
+        return info
+
+    def _info_of_others(self) -> dict[str, Tensor]:
+        judged = self._views_of_others
+        position = self._world.planting.fruit_position_w
+        return {
+            "other_visible_fraction": torch.stack([j["visible_fraction"] for j in judged], dim=-1),
+            "other_success": torch.stack([j["success"] for j in judged], dim=-1),
+            "other_reward": torch.stack([self.reward(j) for j in judged], dim=-1),
+            "other_exists": self._others_exist.clone(),
+            "other_position": torch.stack([position(fruit) for fruit in self._others.unbind(-1)], dim=-2),
+        }
+
+    def reward(self, info: Mapping[str, Tensor]) -> Tensor:
+        """R = R_v + P_p. Shape (N,)."""
+        return self.task.reward(info["reward_visual"], info["reward_penalty"])
