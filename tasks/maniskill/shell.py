@@ -243,13 +243,15 @@ class TomatoEnv(BaseEnv):  # type: ignore[misc]
 
     def _put_joints(self, qpos: Tensor) -> None:
         robot = self.agent.robot
+        if not self.gpu_sim_enabled:
+            robot.set_qpos(qpos)
+            return
+        gpu_system: Any = self.scene.px
         with scene_mask.only(self.scene, None):
             robot.set_qpos(qpos)
-            if self.gpu_sim_enabled:
-                gpu_system: Any = self.scene.px
-                self.scene._gpu_apply_all()
-                gpu_system.gpu_update_articulation_kinematics()
-                self.scene._gpu_fetch_all()
+            self.scene._gpu_apply_all()
+            gpu_system.gpu_update_articulation_kinematics()
+            self.scene._gpu_fetch_all()
 
     # ---------------------------------------------------------------- outcome
 
