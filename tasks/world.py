@@ -404,6 +404,20 @@ class World:
         belief: Belief = self.game.belief  # type: ignore[attr-defined]
         return belief
 
+    @property
+    def open_targets(self) -> Callable[[int], list[int]]:
+        """Tells the fruits of an environment's row that are yet to be looked for, as indices in `Plant.fruits`; tasks
+        with one target have no such attribute."""
+        sequence = getattr(self.game, "sequence", None)
+        if sequence is None:
+            raise AttributeError("open_targets")
+        told: Callable[[int], list[int]] = sequence.open_targets
+        return told
+
+    def fruit_position_w(self, env_index: int, fruit: int) -> Tensor:
+        """Centre of a fruit in the world frame, in [m]. Shape (3,)."""
+        return self.planting.fruit_positions_w(env_index, [fruit])[0]
+
     def observation(self) -> Tensor:
         """The observation of state vectors. Shape (N, D)."""
         return torch.cat(tuple(self.game.observation().values()), dim=-1)

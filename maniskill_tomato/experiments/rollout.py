@@ -180,8 +180,8 @@ def _view(world: Any, observations: Any, info: dict[str, Any]) -> dict[str, Floa
     else:
         view["viewpoint"], view["target"] = _array(belief.viewpoint), _array(belief.target_position)
         view["camera"] = _array(belief.camera_position)
-    if (agent := getattr(world, "agent", None)) is not None:
-        view["qpos"] = _array(agent.robot.get_qpos())
+    if (qpos := getattr(world, "qpos", None)) is not None:
+        view["qpos"] = _array(qpos)
     if (true := info.get("true_visible_fraction")) is not None:
         view["true_visible_fraction"] = _array(true)
         view["true_target"] = _array(world.target_position_w)

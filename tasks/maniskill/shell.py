@@ -421,15 +421,17 @@ class SearchEnv(TomatoEnv):
         """From the next reset on, draws only plants whose leaf density is at most this."""
         self._game.limit_leaf_density(highest)
 
+
+class RowEnv(SearchEnv):
+    """What the shell of the row tells beside."""
+
     def open_targets(self, env_index: int = 0) -> list[int]:
         """The fruits of a row that are yet to be looked for, as indices in `Plant.fruits`."""
-        left: list[int] = self._game.open_targets(env_index)
-        return left
+        return self.world.open_targets(env_index)
 
     def fruit_position_w(self, env_index: int, fruit: int) -> Tensor:
         """Centre of a fruit in the world frame, in [m]. Shape (3,)."""
-        position: Tensor = self._game.fruit_position_w(env_index, fruit)
-        return position
+        return self.world.fruit_position_w(env_index, fruit)
 
 
 def _stages(plan: Plan) -> list[Tensor]:
