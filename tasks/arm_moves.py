@@ -61,7 +61,7 @@ class ArmMoves:
             neighbour_poses: As for `ViewpointMover`, like the next; both are about viewpoints only.
             outside_workspace: What an arm does about a viewpoint that it cannot take.
         """
-        self.control = control
+        self.control: Control = control
         self._viewpoints = ViewpointMover(
             device, neighbour_poses=neighbour_poses, outside_workspace=outside_workspace
         )

@@ -88,13 +88,15 @@ class GroundTruth:
             self._mover = LookAtMover(start.device)
         position, target = start[None].double(), target[None].double()
         joints = [self._state.qpos[env_index][None].double()]
+        T_world_camera = torch.eye(4)[None]
         for stop in way.double():
             move = self._mover.move(joints[-1], position, target, move_towards(position, target, stop[None]))
             if int(move.reach[0]) != int(Reach.REACHABLE):
                 return False
-            position = move.T_world_camera[:, :3, 3]
+            T_world_camera = move.T_world_camera
+            position = T_world_camera[:, :3, 3]
             joints.append(move.qpos)
-        seen = self.visible_fraction(move.T_world_camera, env_index, joints[-1])
+        seen = self.visible_fraction(T_world_camera, env_index, joints[-1])
         if float(seen) <= self.threshold:
             return False
         if not contact_free:

@@ -153,7 +153,7 @@ def _td3_without(experiment: Experiment, name: str) -> Variant:
 
 
 def _read(name: str) -> dict[str, Any]:
-    return tomllib.loads((files(__package__) / name).read_text(encoding="utf-8"))
+    return tomllib.loads((files("maniskill_tomato.experiments") / name).read_text(encoding="utf-8"))
 
 
 def _variants(content: dict[str, Any]) -> tuple[Variant, ...]:
