@@ -411,16 +411,6 @@ class SearchEnv(TomatoEnv):
         episode: Episode | None = self._game.episode(env_index, options)
         return episode
 
-    @property
-    def leaf_density_range(self) -> tuple[float, float]:
-        """Of the plants that are drawn without a limit."""
-        bounds: tuple[float, float] = self._game.leaf_density_range
-        return bounds
-
-    def limit_leaf_density(self, highest: float) -> None:
-        """From the next reset on, draws only plants whose leaf density is at most this."""
-        self._game.limit_leaf_density(highest)
-
     def open_targets(self, env_index: int = 0) -> list[int]:
         """The fruits of a row that are yet to be looked for, as indices in `Plant.fruits`."""
         left: list[int] = self._game.open_targets(env_index)

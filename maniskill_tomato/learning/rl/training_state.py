@@ -49,7 +49,7 @@ class TrainingState:
         self.env = env
         self.agent = make_agent(config, *dims, device)
         self.replay = make_replay(config, *dims, device)
-        self.experience = Experience(config, self.replay, env.num_envs, dims, device)
+        self.experience = Experience(config, self.replay, dims[0])
         self.experience.begin(info)
         self.generator = torch.Generator(device=device).manual_seed(seed)
         self.exploration = make_exploration(config, self.generator, device)
