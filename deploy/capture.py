@@ -1,4 +1,4 @@
-"""A fresh, usable picture, or an error that says what is wrong with it."""
+"""Takes a picture that is recent and usable, or raises an error that says what is wrong with it."""
 
 import logging
 from dataclasses import dataclass

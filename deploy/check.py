@@ -1,4 +1,4 @@
-"""What `deploy check` looks at before a first run: profile, devices, limits, policy, one picture."""
+"""The checks of `deploy check` before a first run: profile, devices, limits, policy, one picture."""
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass

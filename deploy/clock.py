@@ -1,4 +1,4 @@
-"""Time as the loop and the drivers know it: seconds that only grow, real or simulated."""
+"""The clock of the loop and the drivers: monotonic seconds, real or simulated."""
 
 import time
 from typing import Protocol

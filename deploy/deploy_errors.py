@@ -1,4 +1,4 @@
-"""What can go wrong between the policy and the hardware: one family of errors."""
+"""Errors between the policy and the hardware, one family."""
 
 from maniskill_tomato.errors import TomatoError
 

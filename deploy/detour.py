@@ -1,9 +1,9 @@
-"""Ways round what stands in the way of a straight move: mink's collision limits steer the joints past it.
+"""Joint paths around obstacles, planned with mink's collision limits.
 
-A PTP move is a straight line in joint space. Where `safety` refuses that line for a collision, the arm may still get to
+A PTP move is a straight line in joint space. Where `safety` refuses that line for a collision, the arm may still reach
 the same posture by a few shorter lines. mink solves for joint velocities that turn towards the goal, keep the joints
 within their limits and let no pair of shapes come nearer than its clearance; the configurations that it passes are
-then cut to as few straight moves as `safety` lets through. Nothing is trusted to mink: each move is checked in full.
+then shortened to as few straight moves as `safety` accepts. mink only proposes: `safety` checks each move in full.
 """
 
 import math

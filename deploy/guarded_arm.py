@@ -1,4 +1,4 @@
-"""The only way to an arm: every command goes through `Safety`, every state is looked at before it is believed."""
+"""The only way to an arm: `Safety` checks every command, and every reported state is checked before it is used."""
 
 import logging
 from typing import Final

@@ -1,7 +1,7 @@
-"""What an arm and a camera are: LeRobot's verbs with typed, frozen answers.
+"""The interfaces of an arm and a camera, with LeRobot's method names and typed, frozen results.
 
-World is the robot's base frame (`link_0`), z up; metres, radians, seconds. Time stamps are of the `Clock` that the
-driver was made with, and tell when the device measured, as well as the driver knows.
+The world frame is the robot's base frame (`link_0`), z up. Units are metres, radians and seconds. Time stamps come from
+the driver's `Clock` and say when the device took the measurement, as far as the driver knows.
 """
 
 from abc import ABC, abstractmethod

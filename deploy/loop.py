@@ -1,9 +1,9 @@
-"""The loop: look, decide, check, move, settle, until the target is seen or something speaks against going on.
+"""The control loop: take a picture, decide, check, move, settle, until the target is seen or a reason to stop occurs.
 
     capture -> perceive -> observe -> policy -> kinematics -> safety -> arm -> settle -> capture
 
-A move that the kinematics or `safety` refuse counts as one, as in the simulated task: the policy sees that the camera
-has not moved and tries something else.
+A move that the kinematics or `safety` refuses counts as a move, as in the simulated task. The policy sees that the
+camera has not moved and tries something else.
 """
 
 import logging
@@ -34,9 +34,9 @@ from maniskill_tomato.deploy.plant_points import PlantPoints
 from maniskill_tomato.deploy.policies import decide
 from maniskill_tomato.deploy.robot_belief import RobotBelief
 from maniskill_tomato.deploy.robot_perception import Perception
+from maniskill_tomato.deploy.run_records import Recorder, RunResult, Step
 from maniskill_tomato.deploy.safety import Refusal
 from maniskill_tomato.deploy.stage_times import StageTimes
-from maniskill_tomato.deploy.steps import Recorder, RunResult, Step
 from maniskill_tomato.deploy.stops import Stops
 from maniskill_tomato.errors import PolicyError, TomatoError
 from maniskill_tomato.policies.protocol import Policy

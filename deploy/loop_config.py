@@ -1,4 +1,4 @@
-"""What a run is told before it begins, and what a person is asked while it goes on."""
+"""Settings of a run, and the question that an operator is asked before each move."""
 
 from dataclasses import dataclass
 from typing import Literal

@@ -1,4 +1,4 @@
-"""From what the policy wants to joint positions that `safety` lets through."""
+"""Turns the policy's action into joint positions that `safety` accepts."""
 
 import logging
 from dataclasses import dataclass

@@ -1,4 +1,4 @@
-"""What the camera saw of the plant, as points to keep clear of."""
+"""The plant's surface as the camera saw it: a point cloud that the arm keeps clear of."""
 
 from typing import Final
 

@@ -14,8 +14,8 @@ from maniskill_tomato.deploy.loop_config import Mode, Proposal
 from maniskill_tomato.deploy.policies import TASK, default_policy
 from maniskill_tomato.deploy.profile import Profile
 from maniskill_tomato.deploy.recording import McapRecorder
+from maniskill_tomato.deploy.run_records import Recorder, RunResult, Step
 from maniskill_tomato.deploy.run_report import Contact, write_report
-from maniskill_tomato.deploy.steps import Recorder, RunResult, Step
 from maniskill_tomato.deploy.stops import Stops
 from maniskill_tomato.deploy.workcell import make_workcell, prepare_folder
 from maniskill_tomato.policies.opening import open_policy

@@ -1,8 +1,8 @@
 """Other ways to hold the camera at a pose: the arm has seven joints for six numbers, and the picture may be rolled.
 
 The task's kinematics (`robot.look_at_move`) take the posture nearest to the present one and know nothing of collisions.
-Where `safety` refuses that one, these are the next to be tried, all of the same move or a shorter one: nothing is
-clamped, every one is checked in full.
+Where `safety` refuses that one, these are tried next. All belong to the same move or a shorter one. Nothing is
+clamped; each is checked in full.
 """
 
 from collections.abc import Iterator

@@ -1,4 +1,6 @@
-"""A profile: which devices, where the camera sits, what is safe, when to end. TOML; errors name the key."""
+"""Profiles: TOML files that name the devices, the camera's pose on the flange, the safety limits and the end of a run.
+
+Errors name the key."""
 
 import json
 import tomllib
@@ -11,12 +13,12 @@ import numpy as np
 
 from maniskill_tomato.deploy.capture import CaptureConfig
 from maniskill_tomato.deploy.deploy_errors import ProfileError
-from maniskill_tomato.deploy.fields import parse_table
 from maniskill_tomato.deploy.interface import Float64
 from maniskill_tomato.deploy.loop_config import LoopConfig
 from maniskill_tomato.deploy.profile_files import profile_names, profile_path
 from maniskill_tomato.deploy.robot_perception import TRUE_MASKS, Sight
 from maniskill_tomato.deploy.safety_config import SafetyConfig
+from maniskill_tomato.deploy.toml_tables import parse_table
 from maniskill_tomato.errors import InvalidInputError
 from maniskill_tomato.robot.d435 import T_flange_camera_color_optical
 

@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from maniskill_tomato.deploy.deploy_errors import CutOffError, RecordingError
 from maniskill_tomato.deploy.interface import Frame
-from maniskill_tomato.deploy.steps import Step
+from maniskill_tomato.deploy.run_records import Step
 
 _logger = logging.getLogger(__name__)
 

@@ -1,7 +1,7 @@
-"""A recorded run through today's code: the real loop over devices that play it, and what comes out otherwise.
+"""Replays a recorded run through the current code and reports where its decisions differ.
 
-The arm stands where it stood, whatever is commanded now, and the camera shows what it showed. So every decision is
-compared on the same pictures, also after one that differs.
+The arm stands where it stood then, whatever is commanded now, and the camera shows the recorded pictures. Every
+decision is therefore compared on the same pictures, even after one that differs.
 """
 
 from collections.abc import Iterator
@@ -22,8 +22,8 @@ from maniskill_tomato.deploy.policies import TASK
 from maniskill_tomato.deploy.profile import Profile, parse_profile
 from maniskill_tomato.deploy.recording import FORMAT, decode_depth, decode_png, read_messages, unpack
 from maniskill_tomato.deploy.robot_perception import open_perception
+from maniskill_tomato.deploy.run_records import RunResult, Step
 from maniskill_tomato.deploy.safety import Safety
-from maniskill_tomato.deploy.steps import RunResult, Step
 from maniskill_tomato.deploy.stops import Stops
 from maniskill_tomato.policies.opening import open_policy
 from maniskill_tomato.raycast.view_rays import ViewRays

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from maniskill_tomato.deploy.deploy_errors import RecordingError
-from maniskill_tomato.deploy.steps import RunResult, Step
+from maniskill_tomato.deploy.run_records import RunResult, Step
 from maniskill_tomato.errors import TomatoError
 from maniskill_tomato.files import write_atomically
 from maniskill_tomato.report_design import INK, rgb

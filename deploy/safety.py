@@ -1,10 +1,11 @@
-"""Whether a command may go to the arm: pure checks that refuse with a reason and change nothing.
+"""The checks of a command before it goes to the arm. They are pure functions that refuse with a reason.
 
     safety = Safety(config)
     refusal = safety.check(move, state, now, frame_stamp, points_w)
 
-A command passes whole or not at all. Checks run from cheap to dear: numbers, limits, steps, ages, the way of the
-flange, then collisions along the straight line in joint space, which is what a PTP move follows.
+A command is accepted as it is or refused; it is never altered. Cheap checks run first: finite numbers, joint limits,
+step sizes, ages, the path of the flange. Collisions come last, along the straight line in joint space that a PTP move
+follows.
 """
 
 import math

@@ -1,4 +1,4 @@
-"""The envelope that every command must stay in."""
+"""The safety limits that every command must keep."""
 
 from dataclasses import dataclass
 from typing import Final

@@ -1,4 +1,4 @@
-"""Ways to stop a run: Ctrl-C, SIGTERM, a key, a file, and a loop that no longer beats."""
+"""Ways to stop a run: Ctrl-C, SIGTERM, a key, a file, and a missing heartbeat of the loop."""
 
 import select
 import signal

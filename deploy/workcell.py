@@ -1,4 +1,4 @@
-"""The devices of a profile with everything that stands between them and the policy."""
+"""The devices of a profile, and what connects them to the policy."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -17,8 +17,8 @@ from maniskill_tomato.deploy.loop import Loop
 from maniskill_tomato.deploy.loop_config import Mode, Proposal
 from maniskill_tomato.deploy.profile import Profile
 from maniskill_tomato.deploy.robot_perception import Perception, open_perception
+from maniskill_tomato.deploy.run_records import Recorder
 from maniskill_tomato.deploy.safety import Safety
-from maniskill_tomato.deploy.steps import Recorder
 from maniskill_tomato.deploy.stops import Stops
 from maniskill_tomato.policies.protocol import Policy
 

@@ -13,7 +13,7 @@ from maniskill_tomato.tasks.making import MAX_STEPS, make_world
 from maniskill_tomato.tasks.world import World
 
 
-class VectorEnv:
+class VectorEnv(gym.Env[Any, Any]):
     """N environments of one task in this process, without a simulator.
 
     With `auto_reset`, environments that are done are reset within `step`: the returned observation is the first of the
@@ -21,15 +21,19 @@ class VectorEnv:
     environments.
     """
 
-    def __init__(self, world: World, max_steps: int, *, auto_reset: bool = True) -> None:
+    def __init__(
+        self, world: World, max_steps: int, *, auto_reset: bool = True, env_id: str | None = None
+    ) -> None:
         """Takes a world.
 
         Args:
             world: Which.
             max_steps: Steps after which an episode is cut off.
             auto_reset: Whether `step` resets environments that are done.
+            env_id: The task's, for `spec`.
         """
         self.world = world
+        self.spec = None if env_id is None else gym.spec(env_id)
         self.num_envs = world.num_envs
         self.max_steps = max_steps
         self.auto_reset = auto_reset
@@ -38,11 +42,13 @@ class VectorEnv:
         self.single_action_space: gym.Space[Any] = gym.spaces.Box(
             -1.0, 1.0, (ACTION_SIZES[world.moves.control],), np.float32
         )
+        self.observation_space = gym.vector.utils.batch_space(self.single_observation_space, self.num_envs)
+        self.action_space = gym.vector.utils.batch_space(self.single_action_space, self.num_envs)
         self._elapsed = torch.zeros(self.num_envs, dtype=torch.int32, device=world.device)
 
     @property
-    def unwrapped(self) -> World:
-        """The world."""
+    def unwrapped(self) -> Any:
+        """The world, which tells what ManiSkill's shell tells beside pictures."""
         return self.world
 
     def reset(
@@ -55,7 +61,9 @@ class VectorEnv:
         self._elapsed[rows] = 0
         return self.world.observation(), self._info()
 
-    def step(self, actions: Any) -> tuple[Tensor, Tensor, Tensor, Tensor, dict[str, Any]]:
+    def step(  # type: ignore[override]
+        self, actions: Any
+    ) -> tuple[Tensor, Tensor, Tensor, Tensor, dict[str, Any]]:
         """Makes a move in every environment.
 
         Args:
@@ -103,4 +111,4 @@ def make_vector_env(
 ) -> VectorEnv:
     """N environments of a task for a learner; see `making.make_world`."""
     world = make_world(env_id, num_envs, device, **options)
-    return VectorEnv(world, MAX_STEPS[env_id], auto_reset=auto_reset)
+    return VectorEnv(world, MAX_STEPS[env_id], auto_reset=auto_reset, env_id=env_id)

@@ -265,7 +265,7 @@ class World:
         """Chooses the targets of some environments, as indices in `Plant.fruits`. Shape (b,)."""
         self.state.target = self.state.target.clone()
         self.state.target[env_idx] = torch.as_tensor(target, dtype=torch.int64, device=self.device)
-        self.target_position_w = self.planting.fruit_position_w(self.state.target)
+        self._look_up_targets()
 
     def set_arm(self, env_idx: Tensor, qpos: Tensor, viewpoint: Tensor) -> None:
         """Puts arms at the start of an episode.
@@ -359,6 +359,8 @@ class World:
             plan = self.look(plan.target_qpos if move is None else move(plan), plan)
 
     def _viewpoint_reached(self, qpos: Tensor, plan: Plan) -> Tensor:
+        if qpos is plan.target_qpos and not plan.transits:
+            return plan.viewpoint
         exact = (qpos == plan.target_qpos).all(-1)
         for i in plan.transits:
             exact[i] = False
@@ -395,14 +397,32 @@ class World:
     @property
     def target_id(self) -> Tensor:
         """Segmentation id of the target. Shape (N,), int32."""
-        organ = self.planting.fruit_organ(self.state.target)
-        return (self.first_organ_id + organ).int()
+        return self._target_id.clone()
+
+    def _look_up_targets(self) -> None:
+        """Works out where the targets are and what they are called in pictures."""
+        self.target_position_w = self.planting.fruit_position_w(self.state.target)
+        self._target_id = (self.first_organ_id + self.planting.fruit_organ(self.state.target)).int()
 
     @property
     def belief(self) -> Belief:
         """What is known after the last look, for policies; the general tasks alone have one."""
         belief: Belief = self.game.belief  # type: ignore[attr-defined]
         return belief
+
+    @property
+    def open_targets(self) -> Callable[[int], list[int]]:
+        """Tells the fruits of an environment's row that are yet to be looked for, as indices in `Plant.fruits`; tasks
+        with one target have no such attribute."""
+        sequence = getattr(self.game, "sequence", None)
+        if sequence is None:
+            raise AttributeError("open_targets")
+        told: Callable[[int], list[int]] = sequence.open_targets
+        return told
+
+    def fruit_position_w(self, env_index: int, fruit: int) -> Tensor:
+        """Centre of a fruit in the world frame, in [m]. Shape (3,)."""
+        return self.planting.fruit_positions_w(env_index, [fruit])[0]
 
     def observation(self) -> Tensor:
         """The observation of state vectors. Shape (N, D)."""
@@ -459,7 +479,7 @@ class World:
 
     def _recall(self, env_idx: Tensor) -> None:
         self.planting.place(env_idx, self.state.plant_pose[env_idx])
-        self.target_position_w = self.planting.fruit_position_w(self.state.target)
+        self._look_up_targets()
         self.place_arms()
         self.game.recall(env_idx)
 

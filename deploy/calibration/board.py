@@ -1,4 +1,4 @@
-"""The ChArUco board: its print, its corners, and where they are in a picture."""
+"""The ChArUco board: its layout, its corners, and their detection in a picture."""
 
 from dataclasses import dataclass
 from functools import cached_property

@@ -1,4 +1,4 @@
-"""Where the camera sits on the flange, from views of one board that does not move.
+"""Hand-eye calibration: the camera's pose on the flange from views of one fixed board.
 
 With A the flange in the base, X the camera on the flange, B the board before the camera and Z the board in the base,
 every view has A X B = Z. A first X follows in closed form from pairs of views (Park and Martin, "Robot sensor

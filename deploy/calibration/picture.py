@@ -1,4 +1,4 @@
-"""A calibration in one picture: where corners are off, by view, and where each view alone puts the board."""
+"""A picture of a calibration: the corners' residuals by view, and the board's pose from each view alone."""
 
 import io
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""Takes the views of a calibration: the arm goes round the board, each move through the guard and the operator."""
+"""Takes the views of a calibration: the arm moves around the board; the guard and the operator confirm each move."""
 
 import logging
 import math

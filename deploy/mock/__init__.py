@@ -1,1 +1,1 @@
-"""The digital twin: an arm and a camera that exist only in numbers."""
+"""The digital twin: a simulated arm and camera."""

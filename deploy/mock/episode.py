@@ -1,4 +1,4 @@
-"""Which plant the twin stands before: an episode of the simulated task's lists, the same in every number."""
+"""The twin's plant and start: an episode of the simulated task's lists, number for number."""
 
 from dataclasses import dataclass
 from functools import lru_cache

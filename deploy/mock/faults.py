@@ -1,4 +1,4 @@
-"""Faults that the twin's devices can have, to see what the real code does about them."""
+"""Faults that the twin's devices can simulate, to test how the real code reacts."""
 
 from dataclasses import dataclass
 from typing import Literal

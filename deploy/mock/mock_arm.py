@@ -1,4 +1,4 @@
-"""The twin's arm behind the `Arm` interface, with faults to order."""
+"""The twin's arm behind the `Arm` interface, with optional faults."""
 
 import contextlib
 from collections.abc import Mapping

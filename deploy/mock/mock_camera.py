@@ -1,4 +1,4 @@
-"""The twin's camera behind the `Camera` interface, with faults to order."""
+"""The twin's camera behind the `Camera` interface, with optional faults."""
 
 from collections.abc import Mapping
 from typing import Any

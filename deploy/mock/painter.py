@@ -1,4 +1,4 @@
-"""Where the twin's colours come from: flat ones, or SAPIEN's, which need Vulkan and ManiSkill."""
+"""Colours of the twin's pictures: flat ones, or SAPIEN's, which need Vulkan and ManiSkill."""
 
 import logging
 from typing import Any, Literal, Protocol

@@ -1,4 +1,4 @@
-"""What a profile may say about the twin; its arm and its camera share one world."""
+"""The twin's options in a profile. Its arm and its camera share one world."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -6,10 +6,10 @@ from typing import Any, Literal
 
 from maniskill_tomato.deploy.clock import Clock
 from maniskill_tomato.deploy.drivers import DriverContext
-from maniskill_tomato.deploy.fields import parse_table
 from maniskill_tomato.deploy.mock.episode import EpisodeListName, load_episode
 from maniskill_tomato.deploy.mock.faults import Faults
 from maniskill_tomato.deploy.mock.world import TwinWorld
+from maniskill_tomato.deploy.toml_tables import parse_table
 from maniskill_tomato.errors import InvalidInputError
 from maniskill_tomato.robot.d435 import color_intrinsics
 

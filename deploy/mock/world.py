@@ -1,4 +1,4 @@
-"""The twin's world: one arm before one plant, and what its camera would see."""
+"""The twin's world: one arm in front of one plant, and what its camera sees."""
 
 from typing import Final
 

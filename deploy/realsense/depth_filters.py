@@ -1,4 +1,4 @@
-"""The SDK's depth filters in the order that it documents, and anew at every viewpoint."""
+"""The SDK's depth filters in the order that it documents, restarted at every viewpoint."""
 
 from typing import Any
 

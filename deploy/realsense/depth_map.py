@@ -1,4 +1,4 @@
-"""Aligned counts of depth to metres along the colour camera's axis."""
+"""Converts aligned depth counts to metres along the colour camera's axis."""
 
 import numpy as np
 from numpy.typing import NDArray

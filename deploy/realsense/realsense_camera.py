@@ -15,13 +15,13 @@ from maniskill_tomato.deploy.deploy_errors import (
     StaleError,
 )
 from maniskill_tomato.deploy.drivers import DriverContext
-from maniskill_tomato.deploy.fields import parse_table
 from maniskill_tomato.deploy.interface import Camera, Float64, Frame
 from maniskill_tomato.deploy.realsense.depth_filters import DepthFilters
 from maniskill_tomato.deploy.realsense.depth_map import DepthMap
 from maniskill_tomato.deploy.realsense.realsense_config import RealSenseConfig
 from maniskill_tomato.deploy.realsense.sdk import load_sdk
 from maniskill_tomato.deploy.realsense.source import FrameSource
+from maniskill_tomato.deploy.toml_tables import parse_table
 from maniskill_tomato.robot.d435 import CameraIntrinsics, min_depth
 
 T = TypeVar("T")

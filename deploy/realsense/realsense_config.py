@@ -1,4 +1,4 @@
-"""Which RealSense camera, which streams and which filters: the `camera` table of a profile."""
+"""The `camera` table of a profile: which RealSense camera, streams and filters to use."""
 
 from dataclasses import dataclass
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""librealsense's Python module, loaded when a camera is asked for and not before."""
+"""Loads librealsense's Python module on first use."""
 
 import ctypes
 import importlib

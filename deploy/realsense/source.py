@@ -1,4 +1,4 @@
-"""Where framesets come from: a camera found by its serial number, or a recording; one pipeline for both."""
+"""The source of framesets: a camera found by its serial number, or a recording, through one pipeline."""
 
 import time
 from pathlib import Path

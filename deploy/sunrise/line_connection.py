@@ -1,4 +1,4 @@
-"""Text lines over TCP with deadlines and a largest length; what comes in is hostile until it is a line of ASCII."""
+"""Text lines over TCP with deadlines and a largest length. Input is not trusted until it is a line of ASCII."""
 
 import socket
 import time

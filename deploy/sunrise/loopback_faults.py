@@ -1,4 +1,4 @@
-"""What can go wrong with the loopback controller, and when."""
+"""Faults of the loopback controller, and when they occur."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass

@@ -1,4 +1,4 @@
-"""Whether the controller and our kinematics put the flange at the same place."""
+"""Checks that the controller and our kinematics agree about the flange's pose."""
 
 import math
 

@@ -1,4 +1,4 @@
-"""Whether joint angles that the controller reports can be true."""
+"""Plausibility checks of the joint angles that the controller reports."""
 
 import math
 from typing import Final, NamedTuple

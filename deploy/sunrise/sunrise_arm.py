@@ -1,4 +1,4 @@
-"""The driver `sunrise`: an iiwa as an `Arm`, every reading checked, every move short, guarded by torque and verified.
+"""The driver `sunrise`: an iiwa as an `Arm`. Readings are checked; moves are short, guarded by torque and verified.
 
 A point-to-point move of the controller cannot be stopped over the network: only the smartPAD or the emergency stop
 halts it. Moves are therefore sent in pieces, and `stop` keeps the next piece back.
@@ -23,13 +23,13 @@ from maniskill_tomato.deploy.deploy_errors import (
     RefusedError,
 )
 from maniskill_tomato.deploy.drivers import DriverContext
-from maniskill_tomato.deploy.fields import parse_table
 from maniskill_tomato.deploy.interface import Arm, ArmState, Float64, JointMove
 from maniskill_tomato.deploy.sunrise.client import SunriseClient
 from maniskill_tomato.deploy.sunrise.line_connection import LineConnection
 from maniskill_tomato.deploy.sunrise.pose_agreement import pose_difference
 from maniskill_tomato.deploy.sunrise.readings import Reading, why_impossible
 from maniskill_tomato.deploy.sunrise.sunrise_config import SunriseConfig
+from maniskill_tomato.deploy.toml_tables import parse_table
 from maniskill_tomato.robot import iiwa14
 
 logger = logging.getLogger(__name__)

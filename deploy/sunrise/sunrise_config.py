@@ -1,4 +1,4 @@
-"""How to reach an iiwa through the Sunrise Toolbox and what is mounted on it: the `arm` table of a profile."""
+"""The `arm` table of a profile: how to reach an iiwa through the Sunrise Toolbox, and what is mounted on it."""
 
 import math
 from dataclasses import dataclass

@@ -29,9 +29,9 @@ class Demonstrations:
 
         from maniskill_tomato.experiments.policy_runs import PolicySpec, open_for
         from maniskill_tomato.learning.imitation.demonstrations import record_demonstrations
-        from maniskill_tomato.learning.rl.envs import make_env
+        from maniskill_tomato.learning.rl.envs import make_simulated_env
 
-        env = make_env("TomatoViewpoint-v1")
+        env = make_simulated_env("TomatoViewpoint-v1")
         planner = open_for(PolicySpec.parse(self.planner), env, self.contact_free)
         seeds = range(self.first_seed, self.first_seed + self.episodes)
         result = record_demonstrations(env, planner, seeds, self.out)

@@ -6,7 +6,7 @@ from typing import Annotated
 
 import tyro
 
-from maniskill_tomato.cli.early_checks import check_file, check_segmenter
+from maniskill_tomato.cli.early_checks import check_segmenter
 from maniskill_tomato.errors import InvalidInputError
 
 
@@ -31,8 +31,8 @@ class Detect:
     def run(self) -> None:
         """Detects and says how many."""
         if not self.images.exists():
-            check_file("IMAGE_OR_FOLDER", self.images)
-        check_segmenter("--segmenter", self.segmenter, without=("ground_truth",))
+            raise InvalidInputError(f"IMAGE_OR_FOLDER: there is no image or folder {self.images}")
+        check_segmenter("--segmenter", self.segmenter)
         if not 0 <= self.score_threshold <= 1:
             raise InvalidInputError(f"--score-threshold must be between 0 and 1, got {self.score_threshold}")
 

@@ -74,15 +74,17 @@ def check_place(flag: str, place: str) -> None:
         check_folder(flag, Path(place.rpartition(":")[0] or place))
 
 
-def check_segmenter(flag: str, text: str, without: Sequence[str] = ()) -> None:
-    """Accepts a segmenter's name or an existing file of weights."""
+def check_segmenter(flag: str, text: str) -> None:
+    """Accepts the name of a segmenter of image files, or an existing file of weights."""
     from maniskill_tomato.segmentation.segmenter import SEGMENTERS
 
-    names = tuple(name for name in SEGMENTERS if name not in without)
-    if text not in names and not Path(text).is_file():
-        raise InvalidInputError(
-            f"{flag} must be a file of weights or one of {', '.join(names)}; got {text!r}{did_you_mean(text, names)}"
-        )
+    if text == "ground_truth":
+        raise InvalidInputError(f"{flag}: ground_truth knows rendered views only, no image files")
+    if Path(text).is_file():
+        return
+    if Path(text).suffix:
+        raise InvalidInputError(f"{flag}: no weights at {text}{_neighbour(Path(text))}")
+    check_choice(flag, text, (*(name for name in SEGMENTERS if name != "ground_truth"), "FILE.pt"))
 
 
 def check_profile(flag: str, text: str) -> None:

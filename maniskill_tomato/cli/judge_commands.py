@@ -98,7 +98,7 @@ class JudgeSegmenter:
     def run(self) -> None:
         """Evaluates and prints the figures."""
         check_place("--data", self.data)
-        check_segmenter("--segmenter", self.segmenter, without=("ground_truth",))
+        check_segmenter("--segmenter", self.segmenter)
         check_count("--limit", self.limit)
 
         from maniskill_tomato.files import write_atomically

@@ -160,7 +160,7 @@ def open_for(spec: PolicySpec, env: gym.Env[Any, Any], contact_free: bool = Fals
     world: Any = env.unwrapped
     return open_policy(
         spec.source,
-        env_id=None if world.spec is None else world.spec.id,
+        env_id=None if env.spec is None else env.spec.id,
         ground_truth=getattr(world, "ground_truth", None),
         contact_free=contact_free,
         device=getattr(world, "device", "cpu"),

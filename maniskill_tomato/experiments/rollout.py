@@ -122,7 +122,9 @@ def run_batch(
     world: Any = env.unwrapped
     observations, info = env.reset(seed=seeds[0] if len(seeds) == 1 else list(seeds))  # type: ignore[arg-type]
     acting = as_state_policy(policy, env)
-    targets = [world.open_targets(i) for i in range(len(seeds))] if hasattr(world, "open_targets") else None
+    # Of all tasks that search for fruits, a row alone tells of every step whether its target is done.
+    searches = "target_done" in info
+    targets = [world.open_targets(i) if searches else () for i in range(len(seeds))]
     views, steps = [_view(world, observations, info)], []
     running = np.ones(len(seeds), dtype=np.bool_)
     success = np.zeros_like(running)
@@ -163,7 +165,7 @@ def run_batch(
                 true_visible_fraction=view.get("true_visible_fraction"),
                 true_target=view.get("true_target"),
                 oracle_moves=None if oracle_moves is None else oracle_moves[i],
-                row=None if targets is None else _row_search(targets[i], view, step),
+                row=_row_search(targets[i], view, step) if searches else None,
             )
         )
     return records
@@ -178,8 +180,8 @@ def _view(world: Any, observations: Any, info: dict[str, Any]) -> dict[str, Floa
     else:
         view["viewpoint"], view["target"] = _array(belief.viewpoint), _array(belief.target_position)
         view["camera"] = _array(belief.camera_position)
-    if (agent := getattr(world, "agent", None)) is not None:
-        view["qpos"] = _array(agent.robot.get_qpos())
+    if (qpos := getattr(world, "qpos", None)) is not None:
+        view["qpos"] = _array(qpos)
     if (true := info.get("true_visible_fraction")) is not None:
         view["true_visible_fraction"] = _array(true)
         view["true_target"] = _array(world.target_position_w)

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any
 import torch
 from torch import Tensor
 
-from maniskill_tomato.errors import PolicyError
+from maniskill_tomato.errors import InvalidInputError, PolicyError
 from maniskill_tomato.policies.protocol import Planner, Policy, StatePolicy
 from maniskill_tomato.sensing.belief import Belief
 
@@ -91,11 +91,18 @@ def as_state_policy(policy: Policy | StatePolicy, env: Any) -> StatePolicy:
     """
     if not isinstance(policy, Policy):
         return policy
-    if getattr(env.unwrapped, "belief", None) is not None:
+    if _tells_belief(env.unwrapped):
         return BeliefFollower(policy, env)
     if isinstance(policy, ObservationPolicy):
         return policy.policy
     raise PolicyError(f"{policy.name} decides from beliefs, which this environment does not have")
+
+
+def _tells_belief(world: Any) -> bool:
+    try:
+        return getattr(world, "belief", None) is not None
+    except InvalidInputError:
+        return True  # There will be one after the first reset.
 
 
 def describe(policy: Policy) -> dict[str, Any]:

@@ -1,1 +1,1 @@
-"""The arm and its camera: numbers, kinematics, the ManiSkill agent."""
+"""The arm and its camera: dimensions, limits and kinematics."""

@@ -1,4 +1,4 @@
-"""Taking up a view in another posture: the arm draws back, passes its ready posture and comes to the place anew.
+"""Transits: the arm draws back, passes its ready posture and approaches a view in another posture.
 
 A `pd_look_at` move turns no joint by more than `LARGEST_JOINT_STEP`, so that an arm that is bent the wrong way cannot
 look at some places next to it. This is its way out: the camera backs away from the row, straight along -x, the joints

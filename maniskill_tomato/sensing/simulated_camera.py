@@ -15,7 +15,6 @@ from maniskill_tomato.segmentation.instances import Instances
 from maniskill_tomato.segmentation.segmenter import make_segmenter
 from maniskill_tomato.sensing.camera_perception import CameraPerception
 from maniskill_tomato.sensing.fruit_detector import FruitDetector
-from maniskill_tomato.sensing.measurement import Position
 from maniskill_tomato.sensing.posed_frame import PosedFrame
 from maniskill_tomato.sensing.visible_fraction.estimate import UInt8
 from maniskill_tomato.sensing.visible_fraction.occlusion_models import make_occlusion_model
@@ -68,10 +67,6 @@ class SimulatedCamera:
     def seed(self, env_index: int, seed: int) -> None:
         """Begins an environment's random numbers, from which all errors of an episode follow."""
         self._generators[env_index] = np.random.default_rng(seed)
-
-    def coarse_position(self, env_index: int, target_position: Position) -> Position:
-        """Where a target that was not seen yet is believed to be, world frame, in [m]. Shape (3,)."""
-        return target_position + self._generators[env_index].normal(0.0, COARSE_POSITION, 3)
 
     def take(
         self,

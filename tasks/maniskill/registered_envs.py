@@ -3,7 +3,7 @@
 from mani_skill.utils.registration import register
 
 from maniskill_tomato.tasks import MAX_EPISODE_STEPS, MAX_GENERAL_STEPS, MAX_ROW_STEPS
-from maniskill_tomato.tasks.maniskill.shell import SearchEnv, TomatoEnv
+from maniskill_tomato.tasks.maniskill.shell import RowEnv, SearchEnv, TomatoEnv
 
 
 class TomatoViewpointGuidedEnv(TomatoEnv):
@@ -95,7 +95,7 @@ class TomatoViewpointGeneralEnv(SearchEnv):
     env_id = "TomatoViewpoint-v1"
 
 
-class TomatoViewpointRowEnv(SearchEnv):
+class TomatoViewpointRowEnv(RowEnv):
     """**Task Description:**
     Three plants of a row carry ripe tomatoes. Look at one after the other until each was fully visible: when a target
     has been seen, or 20 moves were made for it, the nearest one left is the next, and the memory begins anew.

@@ -243,13 +243,15 @@ class TomatoEnv(BaseEnv):  # type: ignore[misc]
 
     def _put_joints(self, qpos: Tensor) -> None:
         robot = self.agent.robot
+        if not self.gpu_sim_enabled:
+            robot.set_qpos(qpos)
+            return
+        gpu_system: Any = self.scene.px
         with scene_mask.only(self.scene, None):
             robot.set_qpos(qpos)
-            if self.gpu_sim_enabled:
-                gpu_system: Any = self.scene.px
-                self.scene._gpu_apply_all()
-                gpu_system.gpu_update_articulation_kinematics()
-                self.scene._gpu_fetch_all()
+            self.scene._gpu_apply_all()
+            gpu_system.gpu_update_articulation_kinematics()
+            self.scene._gpu_fetch_all()
 
     # ---------------------------------------------------------------- outcome
 
@@ -411,15 +413,17 @@ class SearchEnv(TomatoEnv):
         episode: Episode | None = self._game.episode(env_index, options)
         return episode
 
+
+class RowEnv(SearchEnv):
+    """What the shell of the row tells beside."""
+
     def open_targets(self, env_index: int = 0) -> list[int]:
         """The fruits of a row that are yet to be looked for, as indices in `Plant.fruits`."""
-        left: list[int] = self._game.open_targets(env_index)
-        return left
+        return self.world.open_targets(env_index)
 
     def fruit_position_w(self, env_index: int, fruit: int) -> Tensor:
         """Centre of a fruit in the world frame, in [m]. Shape (3,)."""
-        position: Tensor = self._game.fruit_position_w(env_index, fruit)
-        return position
+        return self.world.fruit_position_w(env_index, fruit)
 
 
 def _stages(plan: Plan) -> list[Tensor]:

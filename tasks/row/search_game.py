@@ -381,13 +381,3 @@ class SearchGame:
         if self.sequence is None:
             return reward
         return reward - self.task.step_cost * TRANSIT_MOVES * info["transits"]
-
-    # ------------------------------------------------------------------- rows
-
-    def open_targets(self, env_index: int = 0) -> list[int]:
-        """The fruits that are yet to be looked for, the target among them, as indices in `Plant.fruits`."""
-        return [int(j) for j in self._world.state.open_targets[env_index].nonzero()[:, 0]]
-
-    def fruit_position_w(self, env_index: int, fruit: int) -> Tensor:
-        """Centre of a fruit in the world frame, in [m]. Shape (3,)."""
-        return self._world.planting.fruit_positions_w(env_index, [fruit])[0]

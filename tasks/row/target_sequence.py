@@ -70,6 +70,10 @@ class TargetSequence:
         """Whether no target is left. Shape (N,), bool."""
         return ~self._world.state.open_targets.any(-1)
 
+    def open_targets(self, env_index: int = 0) -> list[int]:
+        """The fruits that are yet to be looked for, the target among them, as indices in `Plant.fruits`."""
+        return [int(j) for j in self._world.state.open_targets[env_index].nonzero()[:, 0]]
+
     def finish(self, full_visibility: float, max_moves: int) -> list[int]:
         """Counts what the last move saw; returns the environments that turn to another target."""
         state = self._world.state

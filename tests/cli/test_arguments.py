@@ -85,8 +85,8 @@ ERRORS: dict[str, tuple[tuple[str, ...], str]] = {
     ),
     "recording": (("deploy", "replay", "no.mcap"), "error: RECORDING: there is no file no.mcap"),
     "views": (("deploy", "calibrate", "--views", "no"), "error: --views: there is no folder no"),
-    "images": (("detect", "no.jpg"), "error: IMAGE_OR_FOLDER: there is no file no.jpg"),
-    "segmenter": (("detect", ".", "--segmenter", "lihgt"), "error: --segmenter must be a file of weights"),
+    "images": (("detect", "no.jpg"), "error: IMAGE_OR_FOLDER: there is no image or folder no.jpg"),
+    "segmenter": (("detect", ".", "--segmenter", "lihgt"), "error: --segmenter must be one of"),
     "annotated images": (
         ("train-segmenter", "light", "--data", "no:train"),
         "error: --data: there is no folder no",

@@ -26,7 +26,7 @@ from maniskill_tomato.deploy.policies import TASK, default_policy
 from maniskill_tomato.deploy.profile import Profile, load_profile, parse_profile
 from maniskill_tomato.deploy.profile_files import profile_names
 from maniskill_tomato.deploy.robot_perception import TRUE_MASKS, ImagePerception, Sighting
-from maniskill_tomato.deploy.steps import KeptSteps, RunResult
+from maniskill_tomato.deploy.run_records import KeptSteps, RunResult
 from maniskill_tomato.deploy.stops import Stops
 from maniskill_tomato.deploy.workcell import Workcell, make_workcell
 from maniskill_tomato.errors import PolicyError

@@ -14,8 +14,8 @@ from onnx import numpy_helper
 from maniskill_tomato.assets import asset_path
 from maniskill_tomato.cli import main
 from maniskill_tomato.deploy.profile import load_profile
+from maniskill_tomato.deploy.run_records import KeptSteps
 from maniskill_tomato.deploy.run_replay import load_recording
-from maniskill_tomato.deploy.steps import KeptSteps
 from maniskill_tomato.deploy.stops import Stops
 from maniskill_tomato.deploy.workcell import make_workcell
 from maniskill_tomato.errors import PolicyError

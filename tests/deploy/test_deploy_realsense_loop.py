@@ -24,8 +24,8 @@ from maniskill_tomato.deploy.profile import Profile, parse_profile
 from maniskill_tomato.deploy.realsense.realsense_config import RealSenseConfig
 from maniskill_tomato.deploy.realsense.sdk import load_sdk
 from maniskill_tomato.deploy.realsense.source import FrameSource
+from maniskill_tomato.deploy.run_records import KeptSteps, RunResult, Step
 from maniskill_tomato.deploy.run_replay import load_recording
-from maniskill_tomato.deploy.steps import KeptSteps, RunResult, Step
 from maniskill_tomato.deploy.stops import Stops
 from maniskill_tomato.deploy.workcell import make_workcell
 from maniskill_tomato.policies.protocol import Planner

@@ -15,8 +15,8 @@ from maniskill_tomato.deploy.interface import Frame
 from maniskill_tomato.deploy.policy_run import RunConfig, run
 from maniskill_tomato.deploy.profile import Profile, load_profile, parse_profile
 from maniskill_tomato.deploy.recording import McapRecorder, decode_depth, encode_depth, read_messages
+from maniskill_tomato.deploy.run_records import RunResult
 from maniskill_tomato.deploy.run_replay import load_recording, replay
-from maniskill_tomato.deploy.steps import RunResult
 from maniskill_tomato.robot.d435 import T_flange_camera_color_optical
 
 TEXT = """

@@ -17,9 +17,9 @@ from maniskill_tomato.deploy.mock.episode import load_episode
 from maniskill_tomato.deploy.mock.twin_options import twin_options, twin_world
 from maniskill_tomato.deploy.policies import TASK
 from maniskill_tomato.deploy.robot_perception import TruthPerception
+from maniskill_tomato.deploy.run_records import RunResult
 from maniskill_tomato.deploy.safety import Safety
 from maniskill_tomato.deploy.safety_config import SafetyConfig
-from maniskill_tomato.deploy.steps import RunResult
 from maniskill_tomato.deploy.stops import Stops
 from maniskill_tomato.deploy.sunrise.loopback import LoopbackController
 from maniskill_tomato.deploy.sunrise.loopback_faults import Fault

@@ -205,12 +205,15 @@ class LineWorld:
     def __init__(self, num_envs: int = 1) -> None:
         self.num_envs = num_envs
         self.x = torch.zeros(num_envs)
-        self.agent = SimpleNamespace(robot=SimpleNamespace(get_qpos=lambda: self.x[:, None].expand(-1, 7)))
         self.resets = 0
 
     @property
     def unwrapped(self) -> "LineWorld":
         return self
+
+    @property
+    def qpos(self) -> Tensor:
+        return self.x[:, None].expand(-1, 7)
 
     @property
     def belief(self) -> Any:

@@ -369,7 +369,7 @@ def test_without_a_policy_eval_says_how_to_get_one(
     with pytest.raises(SystemExit) as stopped:
         main(["eval", "TomatoViewpoint-v1"])
     told = capsys.readouterr().err
-    assert stopped.value.code == 2 and "nbv" in told and "train_view_quality.py" in told
+    assert stopped.value.code == 2 and "nbv" in told and "maniskill-tomato train-view-quality" in told
 
 
 def test_the_evaluation_of_a_row_counts_the_tomatoes_that_were_seen() -> None:

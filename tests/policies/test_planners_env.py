@@ -15,7 +15,7 @@ from maniskill_tomato.errors import InvalidInputError
 from maniskill_tomato.experiments.policy_runs import PolicySpec, open_for
 from maniskill_tomato.experiments.rollout import run_episode
 from maniskill_tomato.learning.imitation.demonstrations import record_demonstrations
-from maniskill_tomato.learning.rl.envs import make_env
+from maniskill_tomato.learning.rl.envs import make_env, make_simulated_env
 from maniskill_tomato.policies.oracle import Oracle, OracleSearch
 
 PLANTS = {"seed": "train", "pool": 2}
@@ -74,14 +74,14 @@ def test_planners_act_on_the_real_arm(env: gym.Env[Any, Any]) -> None:
 
 
 def test_demonstrations_can_be_replayed(tmp_path: Path) -> None:
-    made: Any = make_env("TomatoViewpoint-v1", plant=PLANTS)
+    made: Any = make_simulated_env("TomatoViewpoint-v1", plant=PLANTS)
     planner = open_for(PolicySpec.parse("nbv"), made)
     result = record_demonstrations(made, planner, range(4), tmp_path)
     assert result.tried == 4 and result.recorded >= 2
     description = json.loads(result.path.with_suffix(".json").read_text())
     assert description["env_info"]["env_id"] == "TomatoViewpoint-v1"
     assert len(description["episodes"]) == result.recorded
-    again: Any = make_env("TomatoViewpoint-v1", plant=PLANTS)
+    again: Any = make_simulated_env("TomatoViewpoint-v1", plant=PLANTS)
     with h5py.File(result.path) as file:
         for entry in description["episodes"]:
             group: Any = file[f"traj_{entry['episode_id']}"]

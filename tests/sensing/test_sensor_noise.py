@@ -8,8 +8,8 @@ import torch
 
 from maniskill_tomato.errors import InvalidInputError
 from maniskill_tomato.learning.rl.envs import make_env
-from maniskill_tomato.raycast.view_rays import RayLabel
-from maniskill_tomato.sensing.sensor_noise import SensorNoise
+from maniskill_tomato.raycast.view_rays import RayLabel, ViewRays
+from maniskill_tomato.sensing.sensor_noise import SensorErrors, SensorNoise
 
 PLANT = {"seed": 3, "pool": None}
 
@@ -68,3 +68,20 @@ def test_noise_that_makes_no_sense_is_refused() -> None:
     for name, value in (("dropout", 1.5), ("depth_noise", -1.0), ("target_position", float("nan"))):
         with pytest.raises(InvalidInputError, match=name):
             SensorNoise.parse({name: value})
+
+
+def test_every_environment_has_its_own_errors() -> None:
+    """What one environment measures follows from its own seed, not from the others' or from how often they look."""
+    there = ViewRays(
+        torch.tensor([0.0, 0.0, 1.0]).expand(2, 64, 3),
+        torch.full((2, 64), 0.5),
+        torch.full((2, 64), int(RayLabel.OTHER), dtype=torch.int8),
+    )
+    noise = SensorNoise(depth_noise=1.0, dropout=0.2, false_target=0.1)
+    errors = SensorErrors(noise, torch.device("cpu"))
+    both, other = errors.rays(there, {0: 1, 1: 2}), errors.rays(there, {0: 1, 1: 3})
+    assert torch.equal(both.distance[0], other.distance[0]) and torch.equal(both.label[0], other.label[0])
+    assert not torch.equal(both.distance[1], other.distance[1])
+    alone = errors.rays(there, {1: 2})
+    assert torch.equal(alone.distance[0], there.distance[0])
+    assert torch.equal(alone.distance[1], both.distance[1])

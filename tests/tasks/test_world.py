@@ -82,10 +82,10 @@ def assert_same(world: World, singles: Sequence[World], exact_share: float = 1.0
 def test_every_environment_plays_as_it_would_alone(
     env_id: str, options: dict[str, Any], num_envs: int
 ) -> None:
-    exact_share = 1.0
+    # Rounding moves a ray at the edge of a pixel or of a voxel to the next one.
+    exact_share = 0.98 if options.keys() & {"perception", "sensor_noise"} else 1.0
     if "perception" in options:
-        # Each view of a camera takes 0.2 s; and rounding moves rays at the edge of a pixel to the next one.
-        num_envs, exact_share = min(num_envs, 3), 0.98
+        num_envs = min(num_envs, 3)  # Each view of a camera takes 0.2 s.
     world = make_world(env_id, num_envs, **options)
     singles = [make_world(env_id, **options) for _ in range(num_envs)]
     world.reset([5 + i for i in range(num_envs)])
@@ -180,15 +180,19 @@ def test_a_camera_measures_every_view_once() -> None:
         return take(T_w_camera, *rest)
 
     camera.take = counted
-    world.reset(1)
-    located, offset = 0, world.belief.target_position - world.target_position_w
-    for move in actions(world, 6):
-        world.step(move)
-        now = world.belief.target_position - world.target_position_w
-        located += not torch.equal(now, offset)
-        offset = now
-    # Also where the target's position changed, and with it all that the earlier views mean.
-    assert located > 0 and len(taken) == 7
+    located = 0
+    for seed in range(5):
+        taken.clear()
+        world.reset(seed)
+        offset = world.belief.target_position - world.target_position_w
+        for move in actions(world, 6, seed):
+            world.step(move)
+            now = world.belief.target_position - world.target_position_w
+            located += not torch.allclose(now, offset, atol=1e-6)
+            offset = now
+        # Also where the target's position changed, and with it all that the earlier views mean.
+        assert len(taken) == 7
+    assert located > 0
 
 
 @pytest.mark.parametrize("env_id", [GUIDED, GENERAL, ROW])

@@ -1,6 +1,7 @@
 """The environments a learner steps: many at once, reset when done, with the last observation of an episode
 kept."""
 
+from collections.abc import Mapping
 from typing import Any, Protocol, cast
 
 import gymnasium as gym
@@ -57,7 +58,22 @@ def check_env_id(env_id: str) -> None:
 
 
 def make_env(env_id: str, num_envs: int = 1, **options: Any) -> gym.Env[Any, Any]:
-    """One of this package's tasks with state observations, without rendering unless `options` say otherwise.
+    """N environments of a task with state observations, which do not reset themselves.
+
+    They are worlds in this process, on the first GPU if there is one and N is above 1. Options that only a simulator
+    has, such as `motion` or `render_mode`, or perception that renders colours, make it ManiSkill's shell.
+
+    Raises:
+        InvalidInputError: The id or an option is not allowed, or the simulator cannot run that many.
+    """
+    check_env_id(env_id)
+    if not needs_simulator(env_id, options):
+        return make_vector_env(env_id, num_envs, _device(num_envs), auto_reset=False, **options)
+    return make_simulated_env(env_id, num_envs, **options)
+
+
+def make_simulated_env(env_id: str, num_envs: int = 1, **options: Any) -> gym.Env[Any, Any]:
+    """The same in ManiSkill's shell, without rendering unless `options` say otherwise.
 
     Raises:
         InvalidInputError: The id is unknown, or more environments are asked for than this machine can
@@ -73,21 +89,21 @@ def make_env(env_id: str, num_envs: int = 1, **options: Any) -> gym.Env[Any, Any
 
 
 def make_learner_env(env_id: str, num_envs: int = 1, **options: Any) -> LearnerEnv:
-    """N environments of a task for a learner.
-
-    They are worlds in this process, on the first GPU if there is one and N is above 1. Options that only a simulator
-    has, such as `motion`, or perception that renders colours, make it ManiSkill's instead.
-
-    Raises:
-        InvalidInputError: The id or an option is not allowed, or the simulator cannot run that many.
-    """
+    """The same as `make_env`, but environments that are done are reset; see `LearnerEnv`."""
     check_env_id(env_id)
-    needs_simulator = set(options) - option_names(env_id) or options.get("perception") in RENDERED
-    if not needs_simulator:
-        device = "cuda" if num_envs > 1 and torch.cuda.is_available() else "cpu"
-        return make_vector_env(env_id, num_envs, device, **options)
-    env = make_env(env_id, num_envs, **options)
+    if not needs_simulator(env_id, options):
+        return make_vector_env(env_id, num_envs, _device(num_envs), **options)
+    env = make_simulated_env(env_id, num_envs, **options)
     # ManiSkill takes seconds to import; commands that do not simulate need not wait for it.
     from mani_skill.vector.wrappers.gymnasium import ManiSkillVectorEnv
 
     return cast(LearnerEnv, ManiSkillVectorEnv(env, auto_reset=True))
+
+
+def needs_simulator(env_id: str, options: Mapping[str, Any]) -> bool:
+    """Whether options ask for what a world does not have."""
+    return bool(set(options) - option_names(env_id)) or options.get("perception") in RENDERED
+
+
+def _device(num_envs: int) -> str:
+    return "cuda" if num_envs > 1 and torch.cuda.is_available() else "cpu"

@@ -9,7 +9,7 @@ import torch
 from numpy.typing import NDArray
 
 from maniskill_tomato.errors import InvalidInputError
-from maniskill_tomato.learning.rl.envs import make_env
+from maniskill_tomato.learning.rl.envs import make_simulated_env
 from maniskill_tomato.learning.rl.presets import OBSERVATION_CENTRE, OBSERVATION_HALF_RANGE, get_preset
 from maniskill_tomato.learning.rl.rewards import potential_reward
 
@@ -134,5 +134,5 @@ def make_gymnasium_env(
     # ManiSkill takes seconds to import; who only imports this module need not wait for it.
     from mani_skill.utils.wrappers.gymnasium import CPUGymWrapper
 
-    env = CPUGymWrapper(make_env(env_id, **options))
+    env = CPUGymWrapper(make_simulated_env(env_id, **options))
     return LearnableTask(env, action_scale=action_scale, reward=reward, gamma=gamma, step_cost=step_cost)

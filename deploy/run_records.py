@@ -1,4 +1,4 @@
-"""What a run writes down: one step a look, and what came of all of them."""
+"""Records of a run: one step for each picture, and the result."""
 
 from dataclasses import asdict, dataclass, field
 from typing import Any, Protocol

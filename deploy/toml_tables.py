@@ -1,4 +1,4 @@
-"""Tables of a TOML file as frozen dataclasses; errors name the key."""
+"""Reads tables of a TOML file into frozen dataclasses. Errors name the key."""
 
 import math
 import types
