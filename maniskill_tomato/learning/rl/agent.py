@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor, nn
 
+from maniskill_tomato.errors import CheckpointError
 from maniskill_tomato.learning.rl.auxiliary import AuxiliaryHeads
 from maniskill_tomato.learning.rl.categorical import CategoricalCritic, project
 from maniskill_tomato.learning.rl.critic import Critic
@@ -14,6 +15,7 @@ from maniskill_tomato.learning.rl.presets import OBSERVATION_CENTRE, OBSERVATION
 from maniskill_tomato.learning.rl.replay import Batch
 from maniskill_tomato.learning.rl.running_statistics import RunningStatistics
 from maniskill_tomato.policies.actor import Actor, ObservationNormalizer
+from maniskill_tomato.policies.trained_actor import TrainedActor
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -98,6 +100,33 @@ def make_agent(
         statistics=RunningStatistics(observation_dim).to(device),
         heads=heads,
     )
+
+
+def check_fits(policy: TrainedActor, config: TrainConfig, observation_dim: int) -> None:
+    """Refuses a policy that the configured actor cannot take over.
+
+    Raises:
+        CheckpointError: Its observations, its layers, its normaliser or its action scale are other ones.
+        InvalidInputError: It was trained with options that this version does not know.
+    """
+    given_config = TrainConfig.from_dict(policy.config)
+    for name, given, wanted in (
+        ("observation length", policy.observation_dim, observation_dim),
+        ("actor_hidden", tuple(given_config.actor_hidden), tuple(config.actor_hidden)),
+        ("normalize_observations", given_config.normalize_observations, config.normalize_observations),
+        ("action_scale", tuple(given_config.action_scale), tuple(config.action_scale)),
+    ):
+        if given != wanted:
+            raise CheckpointError(
+                f"initial_policy has {name} {given}, but the run is configured for {wanted}; give the same"
+            )
+
+
+def begin_with(agent: Agent, policy: TrainedActor) -> None:
+    """Gives the agent's actor, target actor and normaliser the weights of a policy that fits."""
+    agent.actor.load_state_dict(policy.actor.state_dict())
+    agent.target_actor.load_state_dict(policy.actor.state_dict())
+    agent.normalizer.load_state_dict(policy.normalizer.state_dict())
 
 
 @torch.no_grad()

@@ -15,13 +15,11 @@ from torch import Tensor
 
 from maniskill_tomato.errors import CheckpointError, InvalidInputError, TrainingDivergedError
 from maniskill_tomato.learning.interrupt import StopRequest, stop_on_signals
-from maniskill_tomato.learning.rl.agent import update
+from maniskill_tomato.learning.rl.agent import begin_with, check_fits, update
 from maniskill_tomato.learning.rl.checkpoint import make_checkpoint, save_checkpoint
 from maniskill_tomato.learning.rl.envs import LearnerEnv
-from maniskill_tomato.learning.rl.initial_policy import begin_with, check_fits
 from maniskill_tomato.learning.rl.presets import TrainConfig
 from maniskill_tomato.learning.rl.progress import Progress, TrainingLog
-from maniskill_tomato.learning.rl.random_state import seed_global_random_state
 from maniskill_tomato.learning.rl.replay import Batch
 from maniskill_tomato.learning.rl.rewards import learned_reward
 from maniskill_tomato.learning.rl.run_folder import (
@@ -33,7 +31,7 @@ from maniskill_tomato.learning.rl.run_folder import (
     remove_results,
     write_config,
 )
-from maniskill_tomato.learning.rl.training_state import TrainingState
+from maniskill_tomato.learning.rl.training_state import TrainingState, seed_global_random_state
 from maniskill_tomato.learning.rl.wandb_log import import_wandb
 from maniskill_tomato.policies.trained_actor import TrainedActor, load_actor
 
