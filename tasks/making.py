@@ -81,8 +81,6 @@ class SearchOptions(WorldOptions):
     """What camera and segmenter get wrong about exact labels."""
     perception: Perception = "ground_truth"
     """Where V_f, the target's position and the rays' labels come from."""
-    privileged: bool = False
-    """Whether the observation ends with the truth about the views around."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -276,7 +274,6 @@ def _search_setup(options: SearchOptions) -> TaskSetup:
             layout=shape,
             noise=noise,
             perception=options.perception,
-            privileged=options.privileged,
             transits=transits,
         ),
         needs_pictures=options.perception in RENDERED,

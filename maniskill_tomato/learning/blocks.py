@@ -1,6 +1,8 @@
-"""Data made in blocks by several processes, each kept in a file of its own, so that what is there is not made again."""
+"""A training's folder: its settings, and data made in blocks by several processes, each block in a file of its own,
+so that what is there is not made again."""
 
 import io
+import json
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -9,6 +11,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from maniskill_tomato.errors import InvalidInputError
 from maniskill_tomato.files import read_tensors, write_atomically
 from maniskill_tomato.worker_pool import run_jobs
 
@@ -54,3 +57,16 @@ def _make(block: Block) -> int:
     torch.save(data, buffer)
     write_atomically(block.path, buffer.getvalue())
     return max(len(rows) for rows in data.values())
+
+
+def begin_training(out: Path, settings: dict[str, Any]) -> None:
+    """Writes the settings of a training into its folder, or goes on with the one that is there.
+
+    Raises:
+        InvalidInputError: The folder holds a training with other settings.
+    """
+    settings = json.loads(json.dumps(settings))  # With lists for tuples, as the file tells it.
+    described = out / "config.json"
+    if described.is_file() and json.loads(described.read_text()) != settings:
+        raise InvalidInputError(f"{out} holds a training with other settings; choose another folder")
+    write_atomically(described, json.dumps(settings, indent=2).encode())

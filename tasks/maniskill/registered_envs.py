@@ -81,8 +81,6 @@ class TomatoViewpointGeneralEnv(SearchEnv):
     - `perception`: `"ground_truth"`, or a `Perception` with which V_f, success, reward, the target's position and the
       rays' labels come from a camera image with noisy depth; the info then also has `true_visible_fraction` and
       `true_success`. Those in `simulated_camera.RENDERED` need a renderer, and `segmenter` the extra `perception`.
-    - `privileged`: whether the observation ends with the truth about the views around (`sensing.true_views`), for
-      critics; `belief` never has it.
 
     `reset(options=...)` takes `episode` (index in the list), `target` (index of a ripe fruit in `Plant.fruits`) and
     `camera_position` (x, y, z [m], world frame).

@@ -413,16 +413,6 @@ class SearchEnv(TomatoEnv):
         episode: Episode | None = self._game.episode(env_index, options)
         return episode
 
-    @property
-    def leaf_density_range(self) -> tuple[float, float]:
-        """Of the plants that are drawn without a limit."""
-        bounds: tuple[float, float] = self._game.leaf_density_range
-        return bounds
-
-    def limit_leaf_density(self, highest: float) -> None:
-        """From the next reset on, draws only plants whose leaf density is at most this."""
-        self._game.limit_leaf_density(highest)
-
 
 class RowEnv(SearchEnv):
     """What the shell of the row tells beside."""

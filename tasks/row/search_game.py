@@ -3,7 +3,6 @@
 With a `TargetSequence` all ripe fruits of a row in reach are looked for, one after the other.
 """
 
-import math
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -11,9 +10,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from maniskill_tomato.errors import InvalidInputError
 from maniskill_tomato.plants.episode_list import Episode
-from maniskill_tomato.plants.row import Row, leaf_density_of
+from maniskill_tomato.plants.row import Row
 from maniskill_tomato.robot.kinematics import link_transforms
 from maniskill_tomato.robot.look_at import camera_to_viewpoint
 from maniskill_tomato.robot.transit import TRANSIT_MOVES
@@ -21,7 +19,6 @@ from maniskill_tomato.sensing.belief import Belief
 from maniskill_tomato.sensing.observation import ObservationLayout, ViewpointObserver
 from maniskill_tomato.sensing.sensor_noise import SensorNoise
 from maniskill_tomato.sensing.simulated_camera import Perception
-from maniskill_tomato.sensing.true_views import TRUE_VIEWS, TrueViews
 from maniskill_tomato.tasks import MAX_ROW_STEPS
 from maniskill_tomato.tasks.arm_moves import Plan
 from maniskill_tomato.tasks.row.camera_senses import make_senses
@@ -33,7 +30,6 @@ from maniskill_tomato.tasks.row.target_sequence import TargetSequence, Transits,
 from maniskill_tomato.tasks.world import World
 from maniskill_tomato.tasks.world_state import MAX_VIEWS
 
-MAX_PLANT_DRAWS = 1000
 """Plants drawn under a limit of leaf density before there is held to be none."""
 
 START_RPY = (0.0, torch.pi / 2, 0.0)
@@ -69,7 +65,6 @@ class SearchGame:
         layout: ObservationLayout,
         noise: SensorNoise,
         perception: Perception,
-        privileged: bool,
         transits: Transits | None,
     ) -> None:
         """Plays in a world.
@@ -81,20 +76,17 @@ class SearchGame:
             layout: What the observation holds.
             noise: What is wrong with exact labels.
             perception: Where labels and V_f come from.
-            privileged: Whether the observation ends with the truth about the views around.
             transits: When arms go by their ready posture in a row; None for the task with one target.
         """
         self.task = task
         self.layout = layout
         self.episodes = episodes
         self._world = world
-        self._leaf_density_limit = math.inf
         self._observer = ViewpointObserver(world.num_envs, world.device, layout, task.max_moves)
         self._senses = make_senses(perception, world, noise)
         self._is_camera = perception != "ground_truth"
         self._starts = HardStarts(task, world.scene, world.device)
         self.sequence = None if transits is None else TargetSequence(world, self._observer.lattice, transits)
-        self._true_views = TrueViews(world.num_envs, self._observer.lattice) if privileged else None
         self._sight: Sight | None = None
         self._seen_from = torch.zeros(0)
         """Poses of the cameras at the last views. Shape (N, 4, 4)."""
@@ -117,35 +109,7 @@ class SearchGame:
         episode = self.episode(env_index, options)
         if episode is not None:
             return episode.plant_seed
-        spec = self._world.planting.spec
-        # Without a limit, or with that of the task's highest density, the first draw is taken.
-        for _ in range(MAX_PLANT_DRAWS):
-            seed = spec.draw_seed(rng)
-            if (leaf_density_of(spec.leaf_density, seed) or 0.0) <= self._leaf_density_limit:
-                return seed
-        raise InvalidInputError(
-            f"none of {MAX_PLANT_DRAWS} drawn plants has a leaf density of {self._leaf_density_limit} or less; "
-            "raise the limit (leaf_density_start) or the plants' pool"
-        )
-
-    @property
-    def leaf_density_range(self) -> tuple[float, float]:
-        """Of the plants that are drawn without a limit; equal numbers where all plants have one density."""
-        density = self._world.planting.spec.leaf_density
-        if isinstance(density, tuple):
-            return density
-        return (1.0, 1.0) if density is None else (density, density)
-
-    def limit_leaf_density(self, highest: float) -> None:
-        """From the next reset on, draws only plants whose leaf density is at most this.
-
-        Raises:
-            InvalidInputError: No plant of the range is as sparse as that.
-        """
-        low, _ = self.leaf_density_range
-        if highest <= low:
-            raise InvalidInputError(f"the highest leaf density must be above {low}, got {highest}")
-        self._leaf_density_limit = highest
+        return self._world.planting.spec.draw_seed(rng)
 
     def begin(
         self, env_idx: Tensor, rngs: Sequence[np.random.RandomState], options: Mapping[str, Any]
@@ -217,16 +181,10 @@ class SearchGame:
     def _begin_targets(self, env_idx: Tensor) -> None:
         """Takes a first look at the targets of some environments, of which nothing is known. Shape (b,)."""
         state = self._world.state
-        self._ask_truth(env_idx)
         self._observer.begin(env_idx, self.known_target()[env_idx])
         state.view_count[env_idx] = 0
         state.views[env_idx] = 0.0
         self._look(self._mask(env_idx))
-
-    def _ask_truth(self, env_idx: Tensor) -> None:
-        if self._true_views is not None:
-            world = self._world
-            self._true_views.begin(env_idx, world.target_position_w, world.ground_truth.visible_fraction)
 
     def _mask(self, env_idx: Tensor) -> Tensor:
         mask = torch.zeros(self._world.num_envs, dtype=torch.bool, device=self._world.device)
@@ -352,7 +310,6 @@ class SearchGame:
     def recall(self, env_idx: Tensor) -> None:
         """Looks again from where some environments looked, so that all is known of their targets that was known."""
         state = self._world.state
-        self._ask_truth(env_idx)
         self._senses.recall_targets(env_idx)
         self._observer.begin(env_idx, self.known_target()[env_idx])
         chosen = self._mask(env_idx)
@@ -374,17 +331,13 @@ class SearchGame:
 
     @property
     def observation_size(self) -> int:
-        """Numbers of the observer's vector, and of the truth if it is told."""
-        return self.layout.size + (0 if self._true_views is None else TRUE_VIEWS)
+        """Numbers of the observer's vector."""
+        return self.layout.size
 
     def observation(self) -> dict[str, Tensor]:
-        """The parts of the observer's vector, and the truth for critics that ask for it."""
+        """The parts of the observer's vector."""
         vector = self.belief.observation
-        parts = {str(name): vector[:, part].clone() for name, part in self.layout.slices.items()}
-        if self._true_views is not None:
-            position = self._seen_from[:, :3, 3]
-            parts["truth"] = self._true_views.describe(position, self._world.target_position_w)
-        return parts
+        return {str(name): vector[:, part].clone() for name, part in self.layout.slices.items()}
 
     def info(self) -> dict[str, Tensor]:
         """What came of the last move: V_f, whether that is a success, what it touched, how much of a row is done."""

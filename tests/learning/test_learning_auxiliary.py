@@ -8,7 +8,7 @@ import torch
 from maniskill_tomato.errors import InvalidInputError
 from maniskill_tomato.learning.rl.agent import Agent, make_agent, update
 from maniskill_tomato.learning.rl.presets import TrainConfig, get_preset
-from maniskill_tomato.learning.rl.replay import Batch
+from maniskill_tomato.learning.rl.replay import Batch, ReplayBuffer
 
 TD3 = replace(get_preset("td3"), normalize_observations="none", actor_hidden=(64, 64), critic_hidden=(64, 64))
 
@@ -18,7 +18,7 @@ def batch(generator: torch.Generator, size: int = 128) -> Batch:
     s = torch.rand(size, 9, generator=generator) - 0.5
     a = torch.rand(size, 6, generator=generator) * 2 - 1
     visible = torch.sigmoid(3.0 * s[:, 0] - 2.0 * a[:, 1] + a[:, 2] * s[:, 7])
-    return Batch(s, a, torch.zeros(size), s, torch.ones(size), None, visible)
+    return Batch(s, a, torch.zeros(size), s, torch.ones(size), visible)
 
 
 def trained(config: TrainConfig, updates: int) -> tuple[Agent, dict[str, float]]:
@@ -87,3 +87,13 @@ def test_what_cannot_be_predicted_is_refused() -> None:
         replace(TD3, aux_distance_weight=-1.0)
     with pytest.raises(InvalidInputError, match="needs an observation that holds the target's position"):
         make_agent(replace(TD3, aux_distance_weight=1.0), 4, 6)
+
+
+def test_a_buffer_that_keeps_visible_fractions_refuses_transitions_without() -> None:
+    buffer = ReplayBuffer(10, 9, 6, visible_fractions=True)
+    step = Batch(torch.zeros(2, 9), torch.zeros(2, 6), torch.zeros(2), torch.zeros(2, 9), torch.zeros(2))
+    with pytest.raises(InvalidInputError, match="keeps visible_fractions"):
+        buffer.add(step)
+    buffer.add(step._replace(visible_fractions=torch.tensor([0.5, 0.25])))
+    drawn = buffer.sample(50).visible_fractions
+    assert drawn is not None and set(drawn.tolist()) == {0.5, 0.25}

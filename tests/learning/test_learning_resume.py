@@ -207,7 +207,6 @@ def unbroken(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 EVERYTHING: dict[str, Any] = {
-    "n_step": 3,
     "critic": "categorical",
     "normalize_observations": "running",
     "hindsight_targets": 2,
@@ -215,7 +214,7 @@ EVERYTHING: dict[str, Any] = {
     "aux_visibility_weight": 0.1,
     "exploration_noise_per_env": True,
 }
-"""Every option that keeps a state of its own, but the rising threshold, which does not go with n_step."""
+"""Every option that keeps a state of its own."""
 
 
 @pytest.mark.parametrize(
@@ -226,7 +225,6 @@ EVERYTHING: dict[str, Any] = {
         ("thesis-guided", 1, {}),
         ("thesis-sparse", 2, {}),
         ("td3", 2, EVERYTHING),
-        ("td3", 1, {"success_threshold_start": 0.3, "success_threshold_steps": 200}),
         ("fast-td3", 3, {"updates_per_step": 0.5}),
     ],
 )

@@ -63,6 +63,20 @@ def test_options_of_older_runs_still_mean_what_they_meant() -> None:
         TrainConfig.from_dict({**values, "normalize_observations": "always"})
 
 
+def test_removed_options_may_be_named_where_they_were_off() -> None:
+    config = get_preset("general-td3")
+    off = {
+        "n_step": 1,
+        "privileged_critic": False,
+        "leaf_density_start": None,
+        "success_threshold_steps": 5000,
+    }
+    assert TrainConfig.from_dict({**config.to_dict(), **off}) == config
+    for used in ({"n_step": 3}, {"privileged_critic": True}, {"leaf_density_start": 1.0}):
+        with pytest.raises(InvalidInputError, match=f"that were removed: {next(iter(used))}"):
+            TrainConfig.from_dict({**config.to_dict(), **off, **used})
+
+
 def test_policies_that_ship_still_scale_as_they_were_trained() -> None:
     root = Path(__file__).resolve().parents[2]
     for env_id in THESIS_IDS:

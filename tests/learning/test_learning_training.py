@@ -133,12 +133,11 @@ def test_training_solves_the_toy_task_that_an_untrained_policy_does_not(tmp_path
 
 
 def test_fast_td3_in_small_solves_the_toy_task(tmp_path: Path) -> None:
-    """Several steps, running normalisation, categorical critics and a noise level for each environment together."""
+    """Running normalisation, categorical critics and a noise level for each environment together."""
     config = replace(
         get_preset("fast-td3"),
         total_timesteps=8000,
         num_envs=8,
-        n_step=2,
         learning_starts=400,
         batch_size=128,
         buffer_size=20_000,

@@ -34,14 +34,22 @@ CASES: list[tuple[str, dict[str, Any]]] = [
     (SPARSE, {"other_targets": 2, "plant": {"seed": "train", "pool": 3}}),
     (GENERAL, POOL),
     (GENERAL, {**POOL, "sensor_noise": NOISE}),
-    (GENERAL, {**POOL, "privileged": True, "layout": ("viewpoint", "target", "map"), "contact_penalty": 0.5}),
+    (GENERAL, {**POOL, "layout": ("viewpoint", "target", "map"), "contact_penalty": 0.5}),
     (GENERAL, {"episodes": [replace(e) for e in load_episodes("validation")[:3]]}),
     (GENERAL, {**POOL, "perception": "occlusion_model"}),
     (ROW, {**POOL, "transits": "both"}),
     (ROW, {**POOL, "transits": "none", "sensor_noise": NOISE}),
 ]
 NAMES = [
-    *("pose noise", "other targets", "general", "sensor noise", "privileged", "episode list", "camera"),
+    *(
+        "pose noise",
+        "other targets",
+        "general",
+        "sensor noise",
+        "layout and contact",
+        "episode list",
+        "camera",
+    ),
     *("row with transits", "row with noise"),
 ]
 

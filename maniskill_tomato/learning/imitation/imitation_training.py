@@ -1,7 +1,6 @@
 """From nothing to an imitated policy: rounds of episodes and fits, kept in a folder and continued from there."""
 
 import dataclasses
-import json
 from collections.abc import Callable
 from dataclasses import asdict
 from pathlib import Path
@@ -11,9 +10,8 @@ import torch
 from torch import Tensor
 
 import maniskill_tomato
-from maniskill_tomato.errors import InvalidInputError
 from maniskill_tomato.files import write_atomically
-from maniskill_tomato.learning.blocks import Block, run_blocks
+from maniskill_tomato.learning.blocks import Block, begin_training, run_blocks
 from maniskill_tomato.learning.imitation.imitation_config import ImitationConfig
 from maniskill_tomato.learning.imitation.imitation_fit import fit_actor, fit_recurrent
 from maniskill_tomato.learning.imitation.teacher_episodes import ImitationData, collect_demonstrations
@@ -58,11 +56,7 @@ def train_imitation(
     """
     config = config or ImitationConfig()
     options = env_options or {}
-    settings = json.loads(json.dumps({"config": asdict(config), "env_options": options}))
-    described = out / "config.json"
-    if described.is_file() and json.loads(described.read_text()) != settings:
-        raise InvalidInputError(f"{out} holds a training with other settings; choose another folder")
-    write_atomically(described, json.dumps(settings, indent=2).encode())
+    begin_training(out, {"config": asdict(config), "env_options": options})
     blocks: list[Block] = []
     path = out / "round-0.pt"
     for number, episodes in enumerate(config.rounds):

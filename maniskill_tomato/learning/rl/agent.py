@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor, nn
 
+from maniskill_tomato.errors import CheckpointError
 from maniskill_tomato.learning.rl.auxiliary import AuxiliaryHeads
 from maniskill_tomato.learning.rl.categorical import CategoricalCritic, project
 from maniskill_tomato.learning.rl.critic import Critic
@@ -14,7 +15,7 @@ from maniskill_tomato.learning.rl.presets import OBSERVATION_CENTRE, OBSERVATION
 from maniskill_tomato.learning.rl.replay import Batch
 from maniskill_tomato.learning.rl.running_statistics import RunningStatistics
 from maniskill_tomato.policies.actor import Actor, ObservationNormalizer
-from maniskill_tomato.sensing.true_views import TRUE_VIEWS
+from maniskill_tomato.policies.trained_actor import TrainedActor
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -38,29 +39,12 @@ class Agent:
     def observe(self, observations: Tensor) -> None:
         """Lets a running normaliser follow what the environments show. Shape (B, observation_dim)."""
         if self.config.normalize_observations == "running":
-            self.statistics.update(observations[:, : self.actor_dim], self.normalizer)
-
-    @property
-    def actor_dim(self) -> int:
-        """How many of the observed values the actor sees: all but the last ones of a privileged critic."""
-        return len(self.normalizer.centre)
-
-    def actor_input(self, observations: Tensor) -> Tensor:
-        """What the actor sees of observations, normalised. Shape (B, actor_dim)."""
-        normalized: Tensor = self.normalizer(observations[:, : self.actor_dim])
-        return normalized
-
-    def critic_input(self, observations: Tensor) -> Tensor:
-        """What the critics see: the same, and after it the privileged values as they are. Shape (B, dim)."""
-        seen = self.actor_input(observations)
-        if observations.shape[-1] == self.actor_dim:
-            return seen
-        return torch.cat([seen, observations[:, self.actor_dim :]], dim=-1)
+            self.statistics.update(observations, self.normalizer)
 
     def policy(self, observations: Tensor) -> Tensor:
         """The policy's actions, in units of the action scale. Shape (B, action_dim)."""
         with torch.no_grad():
-            actions: Tensor = self.actor(self.actor_input(observations))
+            actions: Tensor = self.actor(self.normalizer(observations))
         return actions
 
 
@@ -91,16 +75,15 @@ def make_agent(
 
     Args:
         config: How it learns.
-        observation_dim: Number of observed values, a privileged critic's at the end.
+        observation_dim: Number of observed values.
         action_dim: Number of actions.
         device: Where the networks are.
     """
-    actor_dim = observation_dim - (TRUE_VIEWS if config.privileged_critic else 0)
-    actor = make_actor(config, actor_dim, action_dim).to(device)
+    actor = make_actor(config, observation_dim, action_dim).to(device)
     critics = nn.ModuleList(
         make_critic(config, observation_dim, action_dim) for _ in range(2 if config.twin_critics else 1)
     ).to(device)
-    heads = AuxiliaryHeads(config, actor_dim).to(device)
+    heads = AuxiliaryHeads(config, observation_dim).to(device)
     actor_parameters, critic_parameters = (
         _trained(actor, heads.distance),
         _trained(critics, heads.visible_fraction),
@@ -113,18 +96,44 @@ def make_agent(
         target_critics=copy.deepcopy(critics).requires_grad_(False),
         actor_optimizer=torch.optim.Adam(actor_parameters, lr=config.actor_learning_rate, fused=True),
         critic_optimizer=torch.optim.Adam(critic_parameters, lr=config.critic_learning_rate, fused=True),
-        normalizer=make_normalizer(config, actor_dim).to(device),
-        statistics=RunningStatistics(actor_dim).to(device),
+        normalizer=make_normalizer(config, observation_dim).to(device),
+        statistics=RunningStatistics(observation_dim).to(device),
         heads=heads,
     )
+
+
+def check_fits(policy: TrainedActor, config: TrainConfig, observation_dim: int) -> None:
+    """Refuses a policy that the configured actor cannot take over.
+
+    Raises:
+        CheckpointError: Its observations, its layers, its normaliser or its action scale are other ones.
+        InvalidInputError: It was trained with options that this version does not know.
+    """
+    given_config = TrainConfig.from_dict(policy.config)
+    for name, given, wanted in (
+        ("observation length", policy.observation_dim, observation_dim),
+        ("actor_hidden", tuple(given_config.actor_hidden), tuple(config.actor_hidden)),
+        ("normalize_observations", given_config.normalize_observations, config.normalize_observations),
+        ("action_scale", tuple(given_config.action_scale), tuple(config.action_scale)),
+    ):
+        if given != wanted:
+            raise CheckpointError(
+                f"initial_policy has {name} {given}, but the run is configured for {wanted}; give the same"
+            )
+
+
+def begin_with(agent: Agent, policy: TrainedActor) -> None:
+    """Gives the agent's actor, target actor and normaliser the weights of a policy that fits."""
+    agent.actor.load_state_dict(policy.actor.state_dict())
+    agent.target_actor.load_state_dict(policy.actor.state_dict())
+    agent.normalizer.load_state_dict(policy.normalizer.state_dict())
 
 
 @torch.no_grad()
 def td_targets(agent: Agent, batch: Batch, generator: torch.Generator | None = None) -> Tensor:
     """What the critics should say: y = r, plus gamma Q'(s', mu'(s')) unless the episode terminated.
 
-    With returns over n steps r is their discounted sum, s' comes after the last of them, and gamma^k stands for
-    gamma. A time limit is no termination: those transitions bootstrap. With two critics Q' is the smaller one; with
+    A time limit is no termination: those transitions bootstrap. With two critics Q' is the smaller one; with
     `target_noise` above zero the target action is smoothed by clipped Gaussian noise (TD3).
 
     Returns:
@@ -159,10 +168,10 @@ def distribution_targets(agent: Agent, batch: Batch, generator: torch.Generator 
 
 
 def _target_actions(agent: Agent, batch: Batch, generator: torch.Generator | None) -> tuple[Tensor, Tensor]:
-    """s' as the critics see it, and what the target actor does there, smoothed where configured."""
+    """s', normalised, and what the target actor does there, smoothed where configured."""
     config = agent.config
-    next_observations = agent.critic_input(batch.next_observations)
-    next_actions = agent.target_actor(next_observations[:, : agent.actor_dim])
+    next_observations = agent.normalizer(batch.next_observations)
+    next_actions = agent.target_actor(next_observations)
     if config.target_noise > 0.0:
         noise = torch.randn(next_actions.shape, generator=generator, device=next_actions.device)
         noise = (noise * config.target_noise).clamp_(-config.target_noise_clip, config.target_noise_clip)
@@ -171,9 +180,8 @@ def _target_actions(agent: Agent, batch: Batch, generator: torch.Generator | Non
 
 
 def _discounts(agent: Agent, batch: Batch) -> Tensor:
-    """What the value after a transition counts: gamma, or gamma^k, and 0 after a termination. Shape (B,)."""
-    discounts = agent.config.gamma if batch.discounts is None else batch.discounts
-    return discounts * (1.0 - batch.terminations)
+    """What the value after a transition counts: gamma, and 0 after a termination. Shape (B,)."""
+    return agent.config.gamma * (1.0 - batch.terminations)
 
 
 def update_critic(agent: Agent, batch: Batch, generator: torch.Generator | None = None) -> dict[str, Tensor]:
@@ -188,7 +196,7 @@ def update_critic(agent: Agent, batch: Batch, generator: torch.Generator | None 
     """
     categorical = agent.config.critic == "categorical"
     targets = (distribution_targets if categorical else td_targets)(agent, batch, generator)
-    observations = agent.critic_input(batch.observations)
+    observations = agent.normalizer(batch.observations)
     total = torch.zeros((), device=targets.device)
     auxiliary = torch.zeros((), device=targets.device)
     logs: dict[str, Tensor] = {}
@@ -227,8 +235,8 @@ def update_actor(agent: Agent, observations: Tensor) -> dict[str, Tensor]:
         `actor_loss`: minus the mean value, plus the penalty on saturated outputs where one is configured;
         `aux_distance_loss` where it has a weight. Scalars.
     """
-    seen = agent.critic_input(observations)
-    features = agent.actor.features(seen[:, : agent.actor_dim])
+    seen = agent.normalizer(observations)
+    features = agent.actor.features(seen)
     pre_activation = agent.actor.output(features)
     loss = -agent.critics[0](seen, torch.tanh(pre_activation)).mean()
     if agent.config.pre_tanh_penalty > 0.0:

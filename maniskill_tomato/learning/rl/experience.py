@@ -1,4 +1,4 @@
-"""From what the environments do to transitions in the replay buffer: over n steps, and of other targets too."""
+"""From what the environments do to transitions in the replay buffer, of other targets too."""
 
 from collections.abc import Mapping
 from typing import Any
@@ -7,7 +7,6 @@ import torch
 from torch import Tensor
 
 from maniskill_tomato.errors import InvalidInputError
-from maniskill_tomato.learning.rl.n_step import NStepReturns
 from maniskill_tomato.learning.rl.replay import Batch, ReplayBuffer
 from maniskill_tomato.learning.rl.rewards import learned_reward
 from maniskill_tomato.learning.rl.train_config import TrainConfig
@@ -25,8 +24,7 @@ def make_replay(
         observation_dim,
         action_dim,
         device,
-        discounts=config.n_step > 1,
-        visible_fractions=config.needs_visible_fractions,
+        visible_fractions=config.aux_visibility_weight > 0.0,
     )
 
 
@@ -44,33 +42,25 @@ class Experience:
         self,
         config: TrainConfig,
         replay: ReplayBuffer,
-        num_envs: int,
-        dims: tuple[int, int],
-        device: torch.device | str = "cpu",
+        observation_dim: int,
     ) -> None:
-        """Prepares the windows.
+        """Stores nothing yet.
 
         Args:
             config: How to learn.
             replay: Where transitions go.
-            num_envs: Parallel environments.
-            dims: Number of observed values and of actions.
-            device: Where the transitions are.
+            observation_dim: Number of observed values.
 
         Raises:
             InvalidInputError: Hindsight targets are wanted, and no target is part of the observation.
         """
-        if config.hindsight_targets and dims[0] < TARGET_POSITION.stop:
+        if config.hindsight_targets and observation_dim < TARGET_POSITION.stop:
             raise InvalidInputError(
                 f"hindsight_targets needs the target's position at {TARGET_POSITION.start} ... "
-                f"{TARGET_POSITION.stop - 1} of the observation, which has {dims[0]} values; set it to 0"
+                f"{TARGET_POSITION.stop - 1} of the observation, which has {observation_dim} values; set it to 0"
             )
         self._config = config
         self._replay = replay
-        windows = (config.n_step, config.gamma)
-        self._own = NStepReturns(*windows, num_envs, *dims, device) if config.n_step > 1 else None
-        rows = num_envs * config.hindsight_targets
-        self._others = NStepReturns(*windows, rows, *dims, device) if rows else None
         self._before: dict[str, Tensor] = {}
 
     def begin(self, info: Mapping[str, Tensor]) -> None:
@@ -87,33 +77,21 @@ class Experience:
             )
         self._remember(info)
 
-    def add(
-        self,
-        batch: Batch,
-        dones: Tensor,
-        step_info: Mapping[str, Tensor],
-        next_info: Mapping[str, Tensor],
-    ) -> None:
+    def add(self, batch: Batch, step_info: Mapping[str, Tensor], next_info: Mapping[str, Tensor]) -> None:
         """Stores one step of every environment.
 
         Args:
             batch: The step as it was, with the learned rewards. Shapes (num_envs, ...).
-            dones: Whether the episode ended, for good or by its time limit. Shape (num_envs,), bool.
             step_info: What the step told.
             next_info: The same, but of the new episode's start where one ended.
         """
-        visible = step_info["visible_fraction"]
-        if self._own is not None:
-            self._replay.add(self._own.add(batch, visible, dones))
-        else:
-            self._replay.add(batch._replace(visible_fractions=visible))
-        if self._others is not None:
-            self._add_others(self._others, batch, dones, step_info)
+        self._replay.add(batch._replace(visible_fractions=step_info["visible_fraction"]))
+        if self._config.hindsight_targets:
+            self._replay.add(self._of_others(batch, step_info))
         self._remember(next_info)
 
-    def _add_others(
-        self, windows: NStepReturns, batch: Batch, dones: Tensor, info: Mapping[str, Tensor]
-    ) -> None:
+    def _of_others(self, batch: Batch, info: Mapping[str, Tensor]) -> Batch:
+        """The step had another tomato been the target, once for each that exists."""
         count = self._config.hindsight_targets
         before = self._before
         success = info["other_success"]
@@ -131,35 +109,28 @@ class Experience:
             },
         )
         position = before["other_position"].flatten(0, 1)
+        exists = before["other_exists"].flatten()
         relabelled = Batch(
             _with_target(batch.observations.repeat_interleave(count, dim=0), position),
             batch.actions.repeat_interleave(count, dim=0),
             rewards,
             _with_target(batch.next_observations.repeat_interleave(count, dim=0), position),
             terminations.float().flatten(),
+            visible,
         )
-        ends = (terminations | dones[:, None]).flatten()
-        complete = windows.add(relabelled, visible, ends, before["other_exists"].flatten())
-        self._replay.add(complete)
+        return Batch(*(column[exists] for column in relabelled if column is not None))
 
     def _remember(self, info: Mapping[str, Tensor]) -> None:
-        if self._others is not None:
+        if self._config.hindsight_targets:
             self._before = {key: info[key].clone() for key in _OTHER_KEYS}
 
     def state_dict(self) -> dict[str, Any]:
-        """What is held back, for `load_state_dict`."""
-        state: dict[str, Any] = {"before": {key: value.cpu() for key, value in self._before.items()}}
-        for name, windows in (("own", self._own), ("others", self._others)):
-            if windows is not None:
-                state[name] = windows.state_dict()
-        return state
+        """What the last step told of the other tomatoes, for `load_state_dict`."""
+        return {"before": {key: value.cpu() for key, value in self._before.items()}}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Takes back what `state_dict` gave."""
         self._before = {key: value.to(self._before[key].device) for key, value in state["before"].items()}
-        for name, windows in (("own", self._own), ("others", self._others)):
-            if windows is not None:
-                windows.load_state_dict(state[name])
 
 
 def _with_target(observations: Tensor, position: Tensor) -> Tensor:

@@ -117,7 +117,44 @@ def draw_noise_levels(
     return torch.where(episode_starts[:, None], drawn, levels)
 
 
-class DecayingGaussian:
+class _Noise:
+    """Gaussian noise on actions; its level falls linearly from `noise` to `noise_end`, or is each environment's own."""
+
+    def __init__(
+        self,
+        exploration_steps: int,
+        noise: float,
+        noise_end: float,
+        generator: torch.Generator | None,
+        noise_per_env: bool,
+    ) -> None:
+        self._exploration_steps = exploration_steps
+        self._noise = noise
+        self._noise_end = noise_end
+        self._noise_per_env = noise_per_env
+        self._generator = generator
+        self._levels: Tensor | None = None
+
+    def amount(self, step: int) -> float:
+        if self._noise_per_env:
+            return 0.5 * (self._noise + self._noise_end)
+        remaining = decaying_schedule(step, self._exploration_steps)
+        return self._noise_end + remaining * (self._noise - self._noise_end)
+
+    def _level(self, step: int, episode_starts: Tensor) -> float | Tensor:
+        """Standard deviation of the noise at a step, or those of the environments, of shape (N, 1)."""
+        if not self._noise_per_env:
+            return self.amount(step)
+        self._levels = draw_noise_levels(
+            self._levels, episode_starts, self._noise_end, self._noise, self._generator
+        )
+        return self._levels
+
+    def _draw(self, actions: Tensor) -> Tensor:
+        return torch.randn(actions.shape, generator=self._generator, device=actions.device)
+
+
+class DecayingGaussian(_Noise):
     """The policy's action plus max(epsilon, 0) N(0, 0.1), where 0.1 is read as the standard deviation (sparse
     task); or with noise of each environment's own level."""
 
@@ -129,36 +166,28 @@ class DecayingGaussian:
         noise_end: float = 0.0,
         noise_per_env: bool = False,
     ) -> None:
-        self._exploration_steps = exploration_steps
-        self._noise = noise
-        self._noise_end = noise_end
-        self._noise_per_env = noise_per_env
-        self._generator = generator
-        self._levels: Tensor | None = None
+        super().__init__(exploration_steps, noise, noise_end, generator, noise_per_env)
 
     def amount(self, step: int) -> float:
-        if self._noise_per_env:
-            return 0.5 * (self._noise + self._noise_end)
-        return decaying_schedule(step, self._exploration_steps)
+        """Epsilon, which the thesis plots, instead of the standard deviation."""
+        return (
+            super().amount(step) if self._noise_per_env else decaying_schedule(step, self._exploration_steps)
+        )
 
     def explore(
         self, policy_actions: Tensor, observations: Tensor, step: int, episode_starts: Tensor
     ) -> Tensor:
-        noise = torch.randn(policy_actions.shape, generator=self._generator, device=policy_actions.device)
-        if self._noise_per_env:
-            self._levels = draw_noise_levels(
-                self._levels, episode_starts, self._noise_end, self._noise, self._generator
-            )
-            return (policy_actions + self._levels * noise).clamp_(-1.0, 1.0)
-        return (policy_actions + self.amount(step) * self._noise * noise).clamp_(-1.0, 1.0)
+        noise = self._draw(policy_actions)
+        level = self._level(step, episode_starts) * (1.0 if self._noise_per_env else self._noise)
+        return (policy_actions + level * noise).clamp_(-1.0, 1.0)
 
 
-class CorrelatedNoise:
+class CorrelatedNoise(_Noise):
     """The policy's action plus noise that remembers the step before, so that a wrong way is kept for some steps.
 
     The noise is a stationary autoregressive process, n' = c n + sqrt(1 - c^2) sigma e with e ~ N(0, 1), begun anew with
-    every episode; sigma falls linearly from `noise` to `noise_end`, or is each environment's own level. It does what
-    the Ornstein-Uhlenbeck noise of DDPG does (Lillicrap et al., 2016), with a spread that does not depend on c.
+    every episode. It does what the Ornstein-Uhlenbeck noise of DDPG does (Lillicrap et al., 2016), with a spread that
+    does not depend on c.
     """
 
     def __init__(
@@ -170,40 +199,24 @@ class CorrelatedNoise:
         generator: torch.Generator | None = None,
         noise_per_env: bool = False,
     ) -> None:
-        self._exploration_steps = exploration_steps
-        self._noise = noise
-        self._noise_end = noise_end
+        super().__init__(exploration_steps, noise, noise_end, generator, noise_per_env)
         self._correlation = correlation
-        self._noise_per_env = noise_per_env
-        self._generator = generator
-        self._levels: Tensor | None = None
         self._state: Tensor | None = None
-
-    def amount(self, step: int) -> float:
-        if self._noise_per_env:
-            return 0.5 * (self._noise + self._noise_end)
-        remaining = decaying_schedule(step, self._exploration_steps)
-        return self._noise_end + remaining * (self._noise - self._noise_end)
 
     def explore(
         self, policy_actions: Tensor, observations: Tensor, step: int, episode_starts: Tensor
     ) -> Tensor:
-        fresh = torch.randn(policy_actions.shape, generator=self._generator, device=policy_actions.device)
+        fresh = self._draw(policy_actions)
         if self._state is None or self._state.shape != fresh.shape:
             self._state = fresh
         else:
             c = self._correlation
             kept = c * self._state + (1.0 - c * c) ** 0.5 * fresh
             self._state = torch.where(episode_starts[:, None], fresh, kept)
-        amount: float | Tensor = self.amount(step)
-        if self._noise_per_env:
-            self._levels = amount = draw_noise_levels(
-                self._levels, episode_starts, self._noise_end, self._noise, self._generator
-            )
-        return (policy_actions + amount * self._state).clamp_(-1.0, 1.0)
+        return (policy_actions + self._level(step, episode_starts) * self._state).clamp_(-1.0, 1.0)
 
 
-class LookAtGoals:
+class LookAtGoals(_Noise):
     """Some episodes walk between random viewpoints that look at the target; the others follow the policy with
     noise.
 
@@ -226,23 +239,12 @@ class LookAtGoals:
         device: torch.device | str = "cpu",
         noise_per_env: bool = False,
     ) -> None:
-        self._exploration_steps = exploration_steps
-        self._noise = noise
-        self._noise_end = noise_end
-        self._noise_per_env = noise_per_env
-        self._levels: Tensor | None = None
+        super().__init__(exploration_steps, noise, noise_end, generator, noise_per_env)
         self._goal_share = goal_share
         self._warmup_steps = warmup_steps
         self._scale = torch.tensor(action_scale, device=device)
-        self._generator = generator
         self._led: Tensor | None = None
         self._goals = torch.zeros(0, 6, device=device)
-
-    def amount(self, step: int) -> float:
-        if self._noise_per_env:
-            return 0.5 * (self._noise + self._noise_end)
-        remaining = decaying_schedule(step, self._exploration_steps)
-        return self._noise_end + remaining * (self._noise - self._noise_end)
 
     def goal_share(self, step: int) -> float:
         """Probability that an episode which starts at `step` is led: 1 in the warm-up, then falling
@@ -266,13 +268,8 @@ class LookAtGoals:
             self._goals = torch.where((episode_starts | arrived)[:, None], goals, self._goals)
         towards = ((self._goals - observations[:, :6]) / self._scale).clamp_(-1.0, 1.0)
         base = torch.where(self._led[:, None], towards, policy_actions)
-        noise = torch.randn(base.shape, generator=self._generator, device=device)
-        amount: float | Tensor = self.amount(step)
-        if self._noise_per_env:
-            self._levels = amount = draw_noise_levels(
-                self._levels, episode_starts, self._noise_end, self._noise, self._generator
-            )
-        return (base + amount * noise).clamp_(-1.0, 1.0)
+        noise = self._draw(base)
+        return (base + self._level(step, episode_starts) * noise).clamp_(-1.0, 1.0)
 
 
 def draw_look_at_goals(targets: Tensor, generator: torch.Generator | None = None) -> Tensor:
@@ -314,33 +311,22 @@ def make_exploration(
     config: TrainConfig, generator: torch.Generator | None = None, device: torch.device | str = "cpu"
 ) -> Exploration:
     """The exploration that the configuration names."""
+    steps, per_env = config.exploration_steps, config.exploration_noise_per_env
+    start, end = config.exploration_noise, config.exploration_noise_end
     if config.exploration == "epsilon-greedy":
-        return EpsilonGreedy(config.exploration_steps, config.action_scale, generator, device)
+        return EpsilonGreedy(steps, config.action_scale, generator, device)
     if config.exploration == "decaying-gaussian":
-        return DecayingGaussian(
-            config.exploration_steps,
-            config.exploration_noise,
-            generator,
-            config.exploration_noise_end,
-            config.exploration_noise_per_env,
-        )
+        return DecayingGaussian(steps, start, generator, end, per_env)
     if config.exploration == "correlated":
-        return CorrelatedNoise(
-            config.exploration_steps,
-            config.exploration_noise,
-            config.exploration_noise_end,
-            config.exploration_correlation,
-            generator,
-            config.exploration_noise_per_env,
-        )
+        return CorrelatedNoise(steps, start, end, config.exploration_correlation, generator, per_env)
     return LookAtGoals(
-        config.exploration_steps,
-        config.exploration_noise,
-        config.exploration_noise_end,
+        steps,
+        start,
+        end,
         config.exploration_goal_share,
         config.action_scale,
         config.learning_starts,
         generator,
         device,
-        config.exploration_noise_per_env,
+        per_env,
     )

@@ -18,13 +18,11 @@ class Batch(NamedTuple):
     rewards: Tensor
     """Shape (B,)."""
     next_observations: Tensor
-    """What was seen after the action, or after the last of n, before any reset. Shape (B, observation_dim)."""
+    """What was seen after the action, before any reset. Shape (B, observation_dim)."""
     terminations: Tensor
     """1.0 where the episode ended for good, 0.0 where it went on or only ran out of time. Shape (B,)."""
-    discounts: Tensor | None = None
-    """gamma^k of a return over k steps; None where every return is over one. Shape (B,)."""
     visible_fractions: Tensor | None = None
-    """V_f after the action (the first of n); None where nobody needs it. Shape (B,)."""
+    """V_f after the action; None where nobody needs it. Shape (B,)."""
 
 
 class ReplayBuffer:
@@ -37,7 +35,6 @@ class ReplayBuffer:
         action_dim: int,
         device: torch.device | str = "cpu",
         *,
-        discounts: bool = False,
         visible_fractions: bool = False,
     ) -> None:
         """Allocates an empty buffer.
@@ -47,7 +44,6 @@ class ReplayBuffer:
             observation_dim: Number of observed values.
             action_dim: Number of actions.
             device: Where they are kept.
-            discounts: Whether `Batch.discounts` is kept.
             visible_fractions: Whether `Batch.visible_fractions` is kept.
 
         Raises:
@@ -62,7 +58,6 @@ class ReplayBuffer:
             torch.zeros(capacity, device=device),
             torch.zeros(capacity, observation_dim, device=device),
             torch.zeros(capacity, device=device),
-            torch.zeros(capacity, device=device) if discounts else None,
             torch.zeros(capacity, device=device) if visible_fractions else None,
         )
         self._next = 0

@@ -4,13 +4,11 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from maniskill_tomato.errors import InvalidInputError
 from maniskill_tomato.learning.rl.envs import LearnerEnv, check_env_id, make_learner_env
 from maniskill_tomato.learning.rl.presets import TrainConfig
 from maniskill_tomato.learning.rl.progress import Progress
 from maniskill_tomato.learning.rl.run_folder import check_run_dir, clear_run
 from maniskill_tomato.learning.rl.trainer import Trainer, TrainResult
-from maniskill_tomato.tasks import GENERAL_IDS
 
 
 def train(
@@ -67,16 +65,10 @@ def train(
 
 
 def make_training_env(env_id: str, config: TrainConfig, env_options: dict[str, Any]) -> LearnerEnv:
-    """The environments that a configuration trains in, telling what its hindsight and its critics need.
+    """The environments that a configuration trains in, telling what its hindsight needs.
 
     Raises:
         InvalidInputError: The id or an option cannot be used.
     """
-    needed: dict[str, Any] = {"other_targets": config.hindsight_targets} if config.hindsight_targets else {}
-    if config.privileged_critic:
-        if env_id not in GENERAL_IDS:
-            raise InvalidInputError(
-                f"privileged_critic needs a general task, one of {', '.join(GENERAL_IDS)}; got {env_id}"
-            )
-        needed["privileged"] = True
+    needed = {"other_targets": config.hindsight_targets} if config.hindsight_targets else {}
     return make_learner_env(env_id, config.num_envs, **{**needed, **env_options})

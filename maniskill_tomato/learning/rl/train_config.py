@@ -20,9 +20,6 @@ MAY_CHANGE = (
 """Options that may differ when a run is continued: its length, how often it is saved, where it also logs."""
 
 _AT_LEAST_ONE = (
-    "n_step",
-    "success_threshold_steps",
-    "leaf_density_steps",
     "batch_size",
     "buffer_size",
     "policy_frequency",
@@ -46,6 +43,16 @@ _NOT_NEGATIVE = (
     "exploration_noise",
     "exploration_noise_end",
 )
+
+_REMOVED = {
+    "n_step": 1,
+    "privileged_critic": False,
+    "leaf_density_start": None,
+    "leaf_density_steps": 5000,
+    "success_threshold_start": None,
+    "success_threshold_steps": 5000,
+}
+"""Options of earlier versions, each with the default with which a run equals one without the option."""
 
 _CHOICES = {
     "critic": ("scalar", "categorical"),
@@ -73,8 +80,6 @@ class TrainConfig:
     """What each step costs with the potential reward."""
     gamma: float = 0.99
     """Discount factor."""
-    n_step: int = 1
-    """Steps that a return adds up before it bootstraps; fewer where the episode ends."""
     tau: float = 0.001
     """Share by which the target networks follow at each of their updates."""
     batch_size: int = 32
@@ -113,24 +118,10 @@ class TrainConfig:
     """Weight of predicting the distance to the target, in [m], from the actor's last hidden layer."""
     aux_visibility_weight: float = 0.0
     """Weight of predicting V_f after the action from the critics' last hidden layers."""
-    privileged_critic: bool = False
-    """Show the critics, which only training needs, the true V_f around the present view; general tasks only."""
-
-    # Curriculum.
-    leaf_density_start: float | None = None
-    """Highest leaf density of the plants at the start of the run; it rises linearly to the task's. `none`: no limit."""
-    leaf_density_steps: int = 5000
-    """Steps in which it rises."""
 
     # Hindsight.
     hindsight_targets: int = 0
     """Other ripe tomatoes for which every step is stored once more, as if they had been the target."""
-    success_threshold_start: float | None = None
-    """V_f above which a view counts as a success at the start of the run, potential reward only; it rises linearly
-    to 1, and the task's own threshold holds as soon as it is lower. `none`: always the
-    task's."""
-    success_threshold_steps: int = 5000
-    """Steps in which it rises."""
 
     # Networks.
     actor_hidden: tuple[int, ...] = (100, 100)
@@ -196,16 +187,6 @@ class TrainConfig:
         for name in ("gamma", "exploration_goal_share", "exploration_correlation"):
             if not 0.0 <= getattr(self, name) < 1.0:
                 raise InvalidInputError(f"{name} must be in [0, 1), got {getattr(self, name)}")
-        if self.success_threshold_start is not None:
-            if not 0.0 < self.success_threshold_start < 1.0:
-                raise InvalidInputError(
-                    f"success_threshold_start must be in (0, 1), got {self.success_threshold_start}"
-                )
-            if self.reward != "potential" or self.n_step != 1:
-                raise InvalidInputError(
-                    "success_threshold_start needs reward 'potential' and n_step 1, because every batch is labelled "
-                    f"anew; got {self.reward!r} and {self.n_step}"
-                )
         for name in ("tau", "actor_learning_rate", "critic_learning_rate"):
             if not 0.0 < getattr(self, name) <= 1.0:
                 raise InvalidInputError(f"{name} must be in (0, 1], got {getattr(self, name)}")
@@ -215,11 +196,11 @@ class TrainConfig:
         for name in _NOT_NEGATIVE:
             if not getattr(self, name) >= 0:
                 raise InvalidInputError(f"{name} must be 0 or more, got {getattr(self, name)}")
-        at_once = self.num_envs * self.n_step * max(self.hindsight_targets, 1)
+        at_once = self.num_envs * max(self.hindsight_targets, 1)
         if self.buffer_size < max(self.batch_size, at_once):
             raise InvalidInputError(
-                f"buffer_size must be at least batch_size ({self.batch_size}) and num_envs x n_step x "
-                f"hindsight_targets ({at_once}), got {self.buffer_size}"
+                f"buffer_size must be at least batch_size ({self.batch_size}) and num_envs x hindsight_targets "
+                f"({at_once}), got {self.buffer_size}"
             )
         for name in ("actor_hidden", "critic_hidden"):
             widths = getattr(self, name)
@@ -250,11 +231,6 @@ class TrainConfig:
                 "correlated; epsilon-greedy has none"
             )
 
-    @property
-    def needs_visible_fractions(self) -> bool:
-        """Whether the replay must keep V_f."""
-        return self.aux_visibility_weight > 0.0 or self.success_threshold_start is not None
-
     def to_dict(self) -> dict[str, Any]:
         """The fields as numbers, strings and lists, ready for JSON."""
         return {k: list(v) if isinstance(v, tuple) else v for k, v in dataclasses.asdict(self).items()}
@@ -268,19 +244,31 @@ class TrainConfig:
         Raises:
             InvalidInputError: A field is unknown (the message lists them) or its value not allowed.
         """
+        values = modernise(values)
         known = {field.name for field in dataclasses.fields(cls)}
         unknown = sorted(set(values) - known)
         if unknown:
             raise InvalidInputError(
                 f"unknown training options: {', '.join(unknown)}; known are {', '.join(sorted(known))}"
             )
-        values = modernise(values)
         arguments: dict[str, Any] = {k: tuple(v) if isinstance(v, list) else v for k, v in values.items()}
         return cls(**arguments)
 
 
 def modernise(values: dict[str, Any]) -> dict[str, Any]:
-    """Options as this version writes them: `normalize_observations` was once a switch, on for `fixed`."""
+    """Options as this version writes them.
+
+    `normalize_observations` was once a switch, on for `fixed`. Options that were removed are left out.
+
+    Raises:
+        InvalidInputError: A removed option has another value than the one that switched it off.
+    """
+    used = [name for name, off in _REMOVED.items() if values.get(name, off) != off]
+    if used:
+        raise InvalidInputError(
+            f"training options that were removed: {', '.join(used)}; leave them out, or use the version that wrote them"
+        )
+    values = {name: value for name, value in values.items() if name not in _REMOVED}
     normalize = values.get("normalize_observations")
     if isinstance(normalize, bool):
         return {**values, "normalize_observations": "fixed" if normalize else "none"}

@@ -15,14 +15,11 @@ from torch import Tensor
 
 from maniskill_tomato.errors import CheckpointError, InvalidInputError, TrainingDivergedError
 from maniskill_tomato.learning.interrupt import StopRequest, stop_on_signals
-from maniskill_tomato.learning.rl.agent import update
+from maniskill_tomato.learning.rl.agent import begin_with, check_fits, update
 from maniskill_tomato.learning.rl.checkpoint import make_checkpoint, save_checkpoint
-from maniskill_tomato.learning.rl.curriculum import LeafDensityCurriculum
 from maniskill_tomato.learning.rl.envs import LearnerEnv
-from maniskill_tomato.learning.rl.initial_policy import begin_with, check_fits
 from maniskill_tomato.learning.rl.presets import TrainConfig
 from maniskill_tomato.learning.rl.progress import Progress, TrainingLog
-from maniskill_tomato.learning.rl.random_state import seed_global_random_state
 from maniskill_tomato.learning.rl.replay import Batch
 from maniskill_tomato.learning.rl.rewards import learned_reward
 from maniskill_tomato.learning.rl.run_folder import (
@@ -34,11 +31,9 @@ from maniskill_tomato.learning.rl.run_folder import (
     remove_results,
     write_config,
 )
-from maniskill_tomato.learning.rl.threshold import label_successes, success_threshold
-from maniskill_tomato.learning.rl.training_state import TrainingState
+from maniskill_tomato.learning.rl.training_state import TrainingState, seed_global_random_state
 from maniskill_tomato.learning.rl.wandb_log import import_wandb
 from maniskill_tomato.policies.trained_actor import TrainedActor, load_actor
-from maniskill_tomato.sensing.true_views import TRUE_VIEWS
 
 logger = logging.getLogger(__name__)
 
@@ -111,8 +106,7 @@ class Trainer:
         self._given: TrainedActor | None = None
         if config.initial_policy is not None and not resume:
             self._given = load_actor(config.initial_policy, env_id=env_id)
-            privileged = TRUE_VIEWS if config.privileged_critic else 0
-            check_fits(self._given, config, observation_space.shape[0] - privileged)
+            check_fits(self._given, config, observation_space.shape[0])
         if not resume:
             check_run_dir(run_dir)
         elif not (run_dir / "config.json").is_file():
@@ -125,7 +119,6 @@ class Trainer:
                 config.batch_size,
             )
         self._env = env
-        self._curriculum = LeafDensityCurriculum(config, env)
         self._env_id = env_id
         self._config = config
         self._run_dir = run_dir
@@ -166,7 +159,6 @@ class Trainer:
         torch.set_num_threads(self._config.torch_threads)
         seed_global_random_state(self._seed)
         saved = self._saved_run()
-        self._curriculum.apply(0)
         observations, info = self._env.reset(seed=self._seed)
         self._state = state = TrainingState(
             self._env, self._config, self._dims, self._seed, observations, info
@@ -216,7 +208,6 @@ class Trainer:
                 state.agent.policy(observations), observations, state.step, state.episode_starts
             )
             self._check_finite(action=actions)
-            self._curriculum.apply(state.step)
             next_observations, rewards, terminations, truncations, info = self._env.step(
                 actions * self._scale
             )
@@ -228,7 +219,7 @@ class Trainer:
             learned = learned_reward(self._config, rewards, terminations, state.visible_fraction, step_info)
             self._check_finite(reward=learned, observation=reached)
             batch = Batch(observations, actions, learned, reached, terminations.float())
-            state.experience.add(batch, dones, step_info, info)
+            state.experience.add(batch, step_info, info)
             losses = self._learn()
             if losses:
                 state.history.add_loss(losses["qf1_loss"])
@@ -275,11 +266,6 @@ class Trainer:
         while state.updates_owed >= 1.0:
             state.updates_owed -= 1.0
             batch = state.replay.sample(config.batch_size, state.generator)
-            if config.success_threshold_start is not None:
-                threshold = success_threshold(
-                    config.success_threshold_start, state.step, config.success_threshold_steps
-                )
-                batch = label_successes(batch, threshold, config.gamma)
             logs = update(state.agent, batch, state.updates, state.generator)
             state.updates += 1
             for name, value in logs.items():

@@ -1,7 +1,9 @@
 """Everything that changes while a run goes on, and how a checkpoint keeps it."""
 
+import random
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -19,8 +21,8 @@ from maniskill_tomato.learning.rl.experience import Experience, make_replay
 from maniskill_tomato.learning.rl.exploration import make_exploration
 from maniskill_tomato.learning.rl.history import TrainingHistory
 from maniskill_tomato.learning.rl.presets import TrainConfig
-from maniskill_tomato.learning.rl.random_state import global_random_state, set_global_random_state
 from maniskill_tomato.learning.rl.run_folder import RUN_STATE_FORMAT
+from maniskill_tomato.tasks.numpy_streams import numpy_state, random_state
 
 
 class TrainingState:
@@ -49,7 +51,7 @@ class TrainingState:
         self.env = env
         self.agent = make_agent(config, *dims, device)
         self.replay = make_replay(config, *dims, device)
-        self.experience = Experience(config, self.replay, env.num_envs, dims, device)
+        self.experience = Experience(config, self.replay, dims[0])
         self.experience.begin(info)
         self.generator = torch.Generator(device=device).manual_seed(seed)
         self.exploration = make_exploration(config, self.generator, device)
@@ -112,3 +114,32 @@ class TrainingState:
                 f"the checkpoint of step {counters['steps']} does not fit this run: {error!r}; "
                 "train again with --overwrite"
             ) from error
+
+
+def seed_global_random_state(seed: int) -> None:
+    """Seeds Python's, NumPy's and torch's global generators."""
+    random.seed(seed)
+    np.random.seed(seed % 2**32)
+    torch.manual_seed(seed)
+
+
+def global_random_state() -> dict[str, Any]:
+    """The states of Python's, NumPy's and torch's global generators, CUDA's included."""
+    version, numbers, gauss = random.getstate()
+    legacy: Any = np.random.mtrand._rand
+    return {
+        "python": {"version": version, "numbers": torch.tensor(numbers), "gauss": gauss},
+        "numpy": random_state(legacy),
+        "torch": torch.get_rng_state(),
+        "cuda": torch.cuda.get_rng_state_all() if torch.cuda.is_available() else [],
+    }
+
+
+def set_global_random_state(state: dict[str, Any]) -> None:
+    """Puts them back as `global_random_state` found them."""
+    python = state["python"]
+    random.setstate((python["version"], tuple(python["numbers"].tolist()), python["gauss"]))
+    np.random.set_state(numpy_state(state["numpy"]))
+    torch.set_rng_state(state["torch"].cpu())
+    if state["cuda"] and torch.cuda.device_count() == len(state["cuda"]):
+        torch.cuda.set_rng_state_all([s.cpu() for s in state["cuda"]])

@@ -2,7 +2,6 @@
 
 import hashlib
 import json
-import logging
 import time
 from collections.abc import Callable
 from dataclasses import asdict, fields
@@ -12,17 +11,15 @@ from typing import Any
 from torch import Tensor
 
 import maniskill_tomato
-from maniskill_tomato.errors import CheckpointError, InvalidInputError
+from maniskill_tomato.errors import CheckpointError
 from maniskill_tomato.files import write_atomically
-from maniskill_tomato.learning.blocks import Block, run_blocks
+from maniskill_tomato.learning.blocks import Block, begin_training, run_blocks
 from maniskill_tomato.learning.rl.envs import make_env
 from maniskill_tomato.learning.view_quality.quality_config import VALIDATION_SEED, QualityTrainConfig
 from maniskill_tomato.learning.view_quality.quality_episodes import QualityData, collect_episodes
 from maniskill_tomato.learning.view_quality.quality_fit import fit
 from maniskill_tomato.policies.quality_network import ViewQualityNetwork
 from maniskill_tomato.policies.view_quality import ViewQuality, load_view_quality, save_view_quality
-
-logger = logging.getLogger(__name__)
 
 ENV_ID = "TomatoViewpoint-v1"
 
@@ -58,13 +55,7 @@ def train_view_quality(
     if start_from is not None:
         network = load_view_quality(start_from).network
         settings["start_from"] = hashlib.sha256(start_from.read_bytes()).hexdigest()
-    # As JSON tells it, with lists for tuples.
-    settings = json.loads(json.dumps(settings))
-    described = out / "config.json"
-    if described.is_file() and json.loads(described.read_text()) != settings:
-        raise InvalidInputError(f"{out} holds a training with other settings; choose another folder")
-    out.mkdir(parents=True, exist_ok=True)
-    write_atomically(described, json.dumps(settings, indent=2).encode())
+    begin_training(out, settings)
     start = time.perf_counter()
     options = env_options or {}
     count = -(-config.validation_episodes // config.block)
