@@ -22,11 +22,11 @@ from maniskill_tomato.tasks import (
     option_checks,
 )
 from maniskill_tomato.tasks.arm_moves import ArmMoves, Control
-from maniskill_tomato.tasks.row.config import GeneralTaskConfig
 from maniskill_tomato.tasks.row.episode_selection import EpisodeChoice
+from maniskill_tomato.tasks.row.row_config import GeneralTaskConfig
 from maniskill_tomato.tasks.row.search_game import SearchGame
 from maniskill_tomato.tasks.row.target_sequence import Transits
-from maniskill_tomato.tasks.thesis.config import ViewpointTaskConfig, guided_task, sparse_task
+from maniskill_tomato.tasks.thesis.thesis_config import ViewpointTaskConfig, guided_task, sparse_task
 from maniskill_tomato.tasks.thesis.thesis_game import ThesisGame
 from maniskill_tomato.tasks.world import Game, Picture, TaskConfig, World
 

@@ -12,7 +12,7 @@ from maniskill_tomato.deploy.interface import Camera, Frame
 from maniskill_tomato.deploy.mock.faults import CameraFault
 from maniskill_tomato.deploy.mock.painter import Painter, make_painter
 from maniskill_tomato.deploy.mock.twin_options import TwinOptions, twin_options, twin_world
-from maniskill_tomato.deploy.mock.world import TwinWorld
+from maniskill_tomato.deploy.mock.twin_world import TwinWorld
 from maniskill_tomato.raycast.view_rays import DEPTH_MODE
 from maniskill_tomato.robot.d435 import CameraIntrinsics, min_depth
 from maniskill_tomato.robot.depth_noise import DepthNoise, measure_depth

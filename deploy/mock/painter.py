@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from maniskill_tomato.deploy.deploy_errors import ProfileError
-from maniskill_tomato.deploy.mock.world import TwinWorld
+from maniskill_tomato.deploy.mock.twin_world import TwinWorld
 from maniskill_tomato.raycast.images import ROBOT_LABEL, Picture
 
 _logger = logging.getLogger(__name__)

@@ -8,7 +8,7 @@ from maniskill_tomato.deploy.clock import Clock
 from maniskill_tomato.deploy.drivers import DriverContext
 from maniskill_tomato.deploy.mock.episode import EpisodeListName, load_episode
 from maniskill_tomato.deploy.mock.faults import Faults
-from maniskill_tomato.deploy.mock.world import TwinWorld
+from maniskill_tomato.deploy.mock.twin_world import TwinWorld
 from maniskill_tomato.deploy.toml_tables import parse_table
 from maniskill_tomato.errors import InvalidInputError
 from maniskill_tomato.robot.d435 import color_intrinsics

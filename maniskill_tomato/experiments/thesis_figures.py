@@ -30,7 +30,7 @@ from maniskill_tomato.report_design import INK, MUTED, PLOT_STYLE, TOMATO
 from maniskill_tomato.robot.d435 import T_flange_camera_color_optical, color_intrinsics
 from maniskill_tomato.robot.kinematics import viewpoint_transform
 from maniskill_tomato.tasks.planting import grow
-from maniskill_tomato.tasks.thesis.config import ViewpointTaskConfig, guided_task, sparse_task
+from maniskill_tomato.tasks.thesis.thesis_config import ViewpointTaskConfig, guided_task, sparse_task
 
 THESIS_EPISODES = 6
 """Length of the thesis's evaluations, in episodes."""

@@ -15,7 +15,7 @@ from maniskill_tomato.experiments.view_grid import draw_view_grid
 from maniskill_tomato.plants.episode_list import EPISODE_LISTS, load_episodes
 from maniskill_tomato.policies.registry import PRIVILEGED
 from maniskill_tomato.rendering import vulkan_probe
-from maniskill_tomato.tasks.row.config import GeneralTaskConfig
+from maniskill_tomato.tasks.row.row_config import GeneralTaskConfig
 
 MAIN = "held_out"
 """The condition on which policies are compared; also the name of its list of episodes."""

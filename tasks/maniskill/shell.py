@@ -24,9 +24,9 @@ from maniskill_tomato.tasks.arm_moves import Plan
 from maniskill_tomato.tasks.ground_truth import GroundTruth
 from maniskill_tomato.tasks.making import default_control, make_setup, option_names
 from maniskill_tomato.tasks.maniskill import scene_mask, scenery, shell_options
-from maniskill_tomato.tasks.maniskill.agent import Iiwa14D435
 from maniskill_tomato.tasks.maniskill.controllers import CONTROL_MODES
 from maniskill_tomato.tasks.maniskill.flat_state import checked_rows, unflatten
+from maniskill_tomato.tasks.maniskill.iiwa14_agent import Iiwa14D435
 from maniskill_tomato.tasks.maniskill.motion import drive_to
 from maniskill_tomato.tasks.maniskill.plant_scene import PlantScene
 from maniskill_tomato.tasks.option_checks import check_choice

@@ -14,7 +14,7 @@ from maniskill_tomato.robot.iiwa14 import READY_QPOS
 from maniskill_tomato.robot.inverse_kinematics import Reach
 from maniskill_tomato.robot.kinematics import link_transforms
 from maniskill_tomato.robot.look_at_move import LookAtMove, LookAtMover
-from maniskill_tomato.tasks.row.config import GeneralTaskConfig
+from maniskill_tomato.tasks.row.row_config import GeneralTaskConfig
 
 CANDIDATES = 64
 """Camera positions drawn at a time for each target."""

@@ -22,9 +22,9 @@ from maniskill_tomato.sensing.simulated_camera import Perception
 from maniskill_tomato.tasks import MAX_ROW_STEPS
 from maniskill_tomato.tasks.arm_moves import Plan
 from maniskill_tomato.tasks.row.camera_senses import make_senses
-from maniskill_tomato.tasks.row.config import GeneralTaskConfig
 from maniskill_tomato.tasks.row.episode_selection import EpisodeChoice
 from maniskill_tomato.tasks.row.hidden_starts import HardStarts, Start
+from maniskill_tomato.tasks.row.row_config import GeneralTaskConfig
 from maniskill_tomato.tasks.row.senses import Sight, Vantage
 from maniskill_tomato.tasks.row.target_sequence import TargetSequence, Transits, with_transits
 from maniskill_tomato.tasks.world import World

@@ -11,7 +11,7 @@ from maniskill_tomato.errors import InvalidInputError
 from maniskill_tomato.robot.iiwa14 import READY_QPOS
 from maniskill_tomato.robot.inverse_kinematics import IkSolution, InverseKinematics, Reach
 from maniskill_tomato.robot.kinematics import viewpoint_transform
-from maniskill_tomato.tasks.thesis.config import ViewpointTaskConfig
+from maniskill_tomato.tasks.thesis.thesis_config import ViewpointTaskConfig
 
 CANDIDATES = 16
 """Poses drawn at a time; the first one in reach is taken, so the number does not change the distribution."""

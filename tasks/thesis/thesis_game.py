@@ -9,10 +9,10 @@ from torch import Tensor
 
 from maniskill_tomato.robot.inverse_kinematics import Reach
 from maniskill_tomato.tasks.arm_moves import Plan
-from maniskill_tomato.tasks.thesis.config import ViewpointTaskConfig
 from maniskill_tomato.tasks.thesis.other_targets import other_ripe_fruits
-from maniskill_tomato.tasks.thesis.rewards import in_forbidden_zone
 from maniskill_tomato.tasks.thesis.starts import Starts
+from maniskill_tomato.tasks.thesis.thesis_config import ViewpointTaskConfig
+from maniskill_tomato.tasks.thesis.thesis_rewards import in_forbidden_zone
 from maniskill_tomato.tasks.world import World
 
 

@@ -19,7 +19,7 @@ from maniskill_tomato.deploy.deploy_errors import NotConnectedError
 from maniskill_tomato.deploy.drivers import DriverContext
 from maniskill_tomato.deploy.interface import Float64
 from maniskill_tomato.deploy.mock.twin_options import twin_options, twin_world
-from maniskill_tomato.deploy.mock.world import TwinWorld
+from maniskill_tomato.deploy.mock.twin_world import TwinWorld
 from maniskill_tomato.deploy.profile import Profile, parse_profile
 from maniskill_tomato.deploy.realsense.realsense_config import RealSenseConfig
 from maniskill_tomato.deploy.realsense.sdk import load_sdk

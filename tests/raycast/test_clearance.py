@@ -16,7 +16,7 @@ from maniskill_tomato.robot.iiwa14 import LINK_NAMES
 from maniskill_tomato.robot.kinematics import link_transforms
 from maniskill_tomato.robot.robot_description import link_meshes
 from maniskill_tomato.robot.spheres import LINK_SPHERES, sphere_table
-from maniskill_tomato.tasks.maniskill.agent import READY_QPOS
+from maniskill_tomato.tasks.maniskill.iiwa14_agent import READY_QPOS
 
 PLANT_POSES = ((0.3, 0.1, 0.3), (0.4, -0.1, 0.0))
 

@@ -22,7 +22,7 @@ from maniskill_tomato.robot.look_at_move import (
     keeps_clear,
     moved_position,
 )
-from maniskill_tomato.tasks.maniskill.agent import READY_QPOS
+from maniskill_tomato.tasks.maniskill.iiwa14_agent import READY_QPOS
 
 TARGET = torch.tensor([[0.8, 0.0, 0.7]], dtype=torch.float64)
 

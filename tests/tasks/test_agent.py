@@ -17,8 +17,8 @@ from maniskill_tomato.errors import InvalidInputError
 from maniskill_tomato.robot import d435, iiwa14
 from maniskill_tomato.robot import robot_description as description
 from maniskill_tomato.robot.kinematics import link_transforms
-from maniskill_tomato.tasks.maniskill import agent as agent_module
-from maniskill_tomato.tasks.maniskill.agent import READY_QPOS, REST_QPOS, D435CameraConfig, Iiwa14D435
+from maniskill_tomato.tasks.maniskill import iiwa14_agent as agent_module
+from maniskill_tomato.tasks.maniskill.iiwa14_agent import READY_QPOS, REST_QPOS, D435CameraConfig, Iiwa14D435
 
 ENV_ID = "TestEmptyIiwa-v0"
 CUBE_AT = np.array([0.75, 0.10, 0.85])

@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from maniskill_tomato.robot.inverse_kinematics import Reach
-from maniskill_tomato.tasks.thesis import rewards
+from maniskill_tomato.tasks.thesis import thesis_rewards as rewards
 
 OK, NEAR, OUT = int(Reach.REACHABLE), int(Reach.NEIGHBOUR), int(Reach.UNREACHABLE)
 

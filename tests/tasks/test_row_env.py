@@ -26,7 +26,7 @@ from maniskill_tomato.robot.kinematics import forward_kinematics
 from maniskill_tomato.robot.look_at import flange_to_camera
 from maniskill_tomato.sensing.observation import ObservationLayout
 from maniskill_tomato.tasks.row.episode_sampling import draw_episodes, extend_episodes
-from maniskill_tomato.tasks.row.rewards import view_gain_reward
+from maniskill_tomato.tasks.row.row_rewards import view_gain_reward
 
 GENERAL, ROW = "TomatoViewpoint-v1", "TomatoViewpointRow-v1"
 

@@ -37,7 +37,7 @@ from maniskill_tomato.policies.layout import layout_of
 from maniskill_tomato.policies.onnx_policy import OnnxPolicy, description_path
 from maniskill_tomato.policies.trained_actor import load_actor, load_checkpoint
 from maniskill_tomato.tasks import THESIS_IDS
-from maniskill_tomato.tasks.thesis.config import ViewpointTaskConfig, guided_task, sparse_task
+from maniskill_tomato.tasks.thesis.thesis_config import ViewpointTaskConfig, guided_task, sparse_task
 
 OPSET = 17
 """Version of the operators; an old one on purpose, so that old runtimes read the file too."""

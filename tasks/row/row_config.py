@@ -7,7 +7,7 @@ from torch import Tensor
 from maniskill_tomato.errors import InvalidInputError
 from maniskill_tomato.plants.spec import ROW_PLANT, PlantPose, PlantSpec
 from maniskill_tomato.tasks import MAX_GENERAL_STEPS
-from maniskill_tomato.tasks.row.rewards import view_gain_reward
+from maniskill_tomato.tasks.row.row_rewards import view_gain_reward
 
 Range = tuple[float, float]
 

@@ -9,7 +9,7 @@ from typing import Literal
 from torch import Tensor
 
 from maniskill_tomato.plants.spec import PlantPose, PlantSpec
-from maniskill_tomato.tasks.thesis import rewards
+from maniskill_tomato.tasks.thesis import thesis_rewards as rewards
 
 Range = tuple[float, float]
 VisualReward = Callable[[Tensor, Tensor, Tensor, Tensor], Tensor]
