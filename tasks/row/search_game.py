@@ -30,8 +30,6 @@ from maniskill_tomato.tasks.row.target_sequence import TargetSequence, Transits,
 from maniskill_tomato.tasks.world import World
 from maniskill_tomato.tasks.world_state import MAX_VIEWS
 
-"""Plants drawn under a limit of leaf density before there is held to be none."""
-
 START_RPY = (0.0, torch.pi / 2, 0.0)
 """The angles that those of a first view are near to, in [rad]: along +x, upright."""
 
@@ -39,21 +37,10 @@ START_RPY = (0.0, torch.pi / 2, 0.0)
 class SearchGame:
     """The general task, and the row where `transits` says how arms get from target to target."""
 
-    saved_columns: tuple[str, ...] = (
-        *(
-            "viewpoint",
-            "reach",
-            "target",
-            "plant_pose",
-            "plant_seed",
-            "views",
-            "view_count",
-            "looks",
-            "moves",
-        ),
-        *("clearance", "path_length", "joint_path_length", "fraction_before", "fraction_after"),
-        *("noise_seed", "position_error", "hidden_below", "open_targets", "targets_begun", "seen_count"),
-        *("target_count", "target_moves", "target_done", "transits"),
+    saved_columns: tuple[str, ...] = tuple(
+        "viewpoint reach target plant_pose plant_seed views view_count looks moves clearance path_length "
+        "joint_path_length fraction_before fraction_after noise_seed position_error hidden_below open_targets "
+        "targets_begun seen_count target_count target_moves target_done transits".split()
     )
 
     def __init__(
