@@ -10,9 +10,11 @@ from numpy.typing import NDArray
 from maniskill_tomato.errors import InvalidInputError
 from maniskill_tomato.experiments.statistics import (
     RESAMPLES,
+    Interval,
     interquartile_band,
     interquartile_interval,
     interquartile_mean,
+    interval_text,
     mcnemar_p,
     mean_interval,
     paired_test,
@@ -198,3 +200,10 @@ def test_bad_input_is_refused() -> None:
         mcnemar_p(-1, 2)
     with pytest.raises(InvalidInputError, match="same episodes"):
         paired_test([True], [1.0], [True, False], [1.0, 2.0])
+
+
+def test_an_interval_is_written_with_its_ends_where_it_has_them() -> None:
+    whole = Interval(estimate=0.975, low=0.95, high=0.99)
+    assert interval_text(whole, 100.0, "{:.1f}", " %") == "97.5 [95.0, 99.0] %"
+    assert interval_text(Interval(estimate=3.0, low=None, high=None), 2.0, "{:.2f}", " moves") == "6.00 moves"
+    assert interval_text(None, 100.0, "{:.1f}", " %") == "not evaluated"

@@ -1,9 +1,10 @@
-"""The reward equations of the thesis against values worked out by hand, bounds included."""
+"""The rewards of the thesis and of the general task against values worked out by hand, bounds included."""
 
 import pytest
 import torch
 
 from maniskill_tomato.robot.inverse_kinematics import Reach
+from maniskill_tomato.tasks.row.row_rewards import view_gain_reward
 from maniskill_tomato.tasks.thesis import thesis_rewards as rewards
 
 OK, NEAR, OUT = int(Reach.REACHABLE), int(Reach.NEIGHBOUR), int(Reach.UNREACHABLE)
@@ -120,3 +121,35 @@ def test_rewards_are_batched_and_keep_their_rows_apart() -> None:
     torch.testing.assert_close(
         rewards.sparse_visual_reward(v, seen, any_seen, reach), torch.tensor([1.0, 0.0, 0.1, 0.0])
     )
+
+
+def test_view_gain_reward_agrees_with_values_worked_out_by_hand() -> None:
+    now = torch.tensor([0.5, 0.9, 0.2, 0.7])
+    before = torch.tensor([0.2, 0.7, 0.4, 0.7])
+    success, contact = now > 0.8, torch.tensor([False, False, True, False])
+    found = view_gain_reward(
+        now, before, success, contact, step_cost=0.02, success_reward=1.0, contact_penalty=0.5
+    )
+    torch.testing.assert_close(found, torch.tensor([0.28, 1.18, -0.72, -0.02]))
+
+
+def test_lingering_never_pays_and_a_success_always_does() -> None:
+    def episode(fractions: list[float]) -> float:
+        v = torch.tensor(fractions)
+        reward = view_gain_reward(
+            v[1:],
+            v[:-1],
+            v[1:] > 0.8,
+            torch.zeros(len(v) - 1, dtype=torch.bool),
+            step_cost=0.02,
+            success_reward=1.0,
+            contact_penalty=0.0,
+        )
+        return float(reward.sum())
+
+    finished = episode([0.1, 0.4, 0.9])
+    lingering = episode([0.1, 0.4] + [0.75] * 18)
+    assert finished == pytest.approx(0.8 - 0.04 + 1.0, abs=1e-6)
+    assert lingering == pytest.approx(0.65 - 0.02 * 19, abs=1e-6)
+    # Going back and forth brings nothing.
+    assert episode([0.1, 0.7, 0.1, 0.7, 0.1]) == pytest.approx(-0.08, abs=1e-6)

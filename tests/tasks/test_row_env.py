@@ -26,7 +26,6 @@ from maniskill_tomato.robot.kinematics import forward_kinematics
 from maniskill_tomato.robot.look_at import flange_to_camera
 from maniskill_tomato.sensing.observation import ObservationLayout
 from maniskill_tomato.tasks.row.episode_sampling import draw_episodes, extend_episodes
-from maniskill_tomato.tasks.row.row_rewards import view_gain_reward
 
 GENERAL, ROW = "TomatoViewpoint-v1", "TomatoViewpointRow-v1"
 
@@ -58,38 +57,6 @@ def row() -> Iterator[Any]:
 
 def action(rng: np.random.Generator) -> np.ndarray[Any, Any]:
     return rng.normal(size=3).astype(np.float32)
-
-
-def test_reward_by_hand() -> None:
-    now = torch.tensor([0.5, 0.9, 0.2, 0.7])
-    before = torch.tensor([0.2, 0.7, 0.4, 0.7])
-    success, contact = now > 0.8, torch.tensor([False, False, True, False])
-    found = view_gain_reward(
-        now, before, success, contact, step_cost=0.02, success_reward=1.0, contact_penalty=0.5
-    )
-    torch.testing.assert_close(found, torch.tensor([0.28, 1.18, -0.72, -0.02]))
-
-
-def test_lingering_never_pays_and_a_success_always_does() -> None:
-    def episode(fractions: list[float]) -> float:
-        v = torch.tensor(fractions)
-        reward = view_gain_reward(
-            v[1:],
-            v[:-1],
-            v[1:] > 0.8,
-            torch.zeros(len(v) - 1, dtype=torch.bool),
-            step_cost=0.02,
-            success_reward=1.0,
-            contact_penalty=0.0,
-        )
-        return float(reward.sum())
-
-    finished = episode([0.1, 0.4, 0.9])
-    lingering = episode([0.1, 0.4] + [0.75] * 18)
-    assert finished == pytest.approx(0.8 - 0.04 + 1.0, abs=1e-6)
-    assert lingering == pytest.approx(0.65 - 0.02 * 19, abs=1e-6)
-    # Going back and forth brings nothing.
-    assert episode([0.1, 0.7, 0.1, 0.7, 0.1]) == pytest.approx(-0.08, abs=1e-6)
 
 
 def test_starts_are_hidden_free_of_contact_and_look_at_a_ripe_fruit_of_the_middle_plant(env: Any) -> None:
