@@ -88,6 +88,8 @@ def test_every_file_beside_the_code_is_covered_by_package_data() -> None:
             candidates = [
                 pattern.removeprefix("**/") for pattern in patterns[package] if pattern.startswith("**/")
             ]
+            own = ".".join((package, *path.relative_to(ROOT / top).parent.parts))
+            candidates += patterns.get(own, []) if own != package else []
             matched = any(fnmatch.fnmatch(path.name, pattern) for pattern in candidates)
             if not matched and relative not in patterns[package]:
                 forgotten.append(f"{top}/{relative}")

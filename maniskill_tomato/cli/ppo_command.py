@@ -59,9 +59,10 @@ class TrainPpo:
             if not train_ppo(self.env_id, self.config, run_dir, seed, self.progress):
                 print(f"stopped; {run_dir} holds what was learned so far")
                 return
-            metrics = evaluate_run(load_run(run_dir), self.episodes, self.eval_seed).metrics
+            run = load_run(run_dir)
+            metrics = evaluate_run(run, self.episodes, self.eval_seed).metrics
             print(
                 f"{run_dir}: success {metrics['success_rate']:.0%} of {self.episodes}, "
-                f"{metrics['mean_steps']:.1f} steps, trained {metrics['policy']['training_steps']} steps in "
-                f"{metrics['policy']['training_seconds']:.0f} s"
+                f"{metrics['mean_steps']:.1f} steps, trained {run.training_steps} steps in "
+                f"{run.training_seconds or 0.0:.0f} s"
             )

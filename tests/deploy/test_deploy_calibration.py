@@ -378,8 +378,9 @@ def test_the_command_calculates_from_a_folder_and_writes_file_and_picture(
     ("arguments", "match"),
     [
         ([], "either --profile"),
-        (["--views", "/nowhere"], "no views.json"),
-        (["--views", "/nowhere", "--square", "30"], "square_length must be"),
+        (["--views", "/nowhere"], "there is no folder /nowhere"),
+        (["--views", "."], "no views.json"),
+        (["--views", ".", "--square", "30"], "square_length must be"),
         (["--profile", "mock", "--confirm", "--unattended"], "not both"),
     ],
 )

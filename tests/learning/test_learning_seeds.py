@@ -52,10 +52,10 @@ def parsed(*arguments: str) -> Train:
     return command
 
 
-def fails(capsys: pytest.CaptureFixture[str], *arguments: str) -> str:
+def fails(capsys: pytest.CaptureFixture[str], *arguments: str, status: int = 2) -> str:
     with pytest.raises(SystemExit) as ended:
         main(["train", *arguments])
-    assert ended.value.code == 2
+    assert ended.value.code == status
     return capsys.readouterr().err
 
 
@@ -194,7 +194,8 @@ def test_seeds_train_side_by_side_and_one_that_fails_does_not_stop_the_others(
     out = tmp_path / "runs"
     (out / "seed-5").mkdir(parents=True)
     write(out / "seed-5/checkpoints", "in the way")
-    assert "1 of 2 seeds failed: 5" in fails(capsys, "--config", file, "--seeds", "5..6", "--out", str(out))
+    arguments = ("--config", file, "--seeds", "5..6", "--out", str(out))
+    assert "1 of 2 seeds failed: 5" in fails(capsys, *arguments, status=1)
     assert_same_policy(tmp_path / "alone", out / "seed-6")
     assert "cannot write" in (out / "seed-5/train.log").read_text()
     assert json.loads((out / "seeds.json").read_text())["seeds"] == [5, 6]
