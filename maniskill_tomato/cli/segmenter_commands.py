@@ -150,9 +150,13 @@ class TrainYolo(ImageOptions):
 
 def _train(training: "DetectorTraining[Any]", out: Path) -> Path | None:
     from maniskill_tomato.learning.interrupt import stop_on_signals
+    from maniskill_tomato.segmentation.metrics.detection_plots import plot_losses
 
     with stop_on_signals() as request:
-        return training.run(out, lambda line: print(line, flush=True), lambda: request.reason is not None)
+        path = training.run(out, lambda line: print(line, flush=True), lambda: request.reason is not None)
+    if training.history:
+        plot_losses({out.name: training.history}, out / "losses.png")
+    return path
 
 
 def _tell_weights(train: Callable[[], Path | None]) -> None:

@@ -371,12 +371,12 @@ def test_training_lowers_the_loss_on_two_pictures(tmp_path: Path) -> None:
     torch.manual_seed(0)
     images = annotated(tmp_path, 2)
     config = LightTrainConfig(
-        steps=60,
+        steps=40,
         batch_size=2,
         learning_rate=5e-3,
         warmup_steps=5,
-        log_every=20,
-        save_every=60,
+        log_every=10,
+        save_every=40,
         network=SMALL,
         bfloat16=False,
         augmentation=AugmentationConfig(size=96, mosaic_probability=0, scale=(1.0, 1.0)),

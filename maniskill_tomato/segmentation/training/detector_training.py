@@ -14,7 +14,6 @@ from torch import Tensor, nn
 
 from maniskill_tomato.errors import CheckpointError, TrainingDivergedError
 from maniskill_tomato.files import read_tensors, write_atomically
-from maniskill_tomato.segmentation.metrics.detection_plots import plot_losses
 from maniskill_tomato.segmentation.training.training_pictures import TrainingImages, TrainingPicture
 from maniskill_tomato.segmentation.weights import save_weights
 
@@ -141,10 +140,10 @@ class DetectorTraining(ABC, Generic[Network]):
     def run(
         self, out: Path, report: Callable[[str], None], stopped: Callable[[], bool] = lambda: False
     ) -> Path | None:
-        """Trains to the end, from the checkpoint in `out` if there is one, and draws the losses.
+        """Trains to the end, from the checkpoint in `out` if there is one.
 
         Args:
-            out: Folder of checkpoints, history, curves and weights; those of each checkpoint can be used already.
+            out: Folder of checkpoints, history and weights; those of each checkpoint can be used already.
             report: Called with a line of progress every `log_every` steps.
             stopped: Asked after every step; if true, the state is saved and the training ends early.
 
@@ -157,13 +156,6 @@ class DetectorTraining(ABC, Generic[Network]):
         """
         if (out / CHECKPOINT).is_file():
             self.resume(out)
-        finished = self._run_steps(out, report, stopped)
-        if self.history:
-            plot_losses({out.name: self.history}, out / "losses.png")
-        return out / WEIGHTS if finished else None
-
-    def _run_steps(self, out: Path, report: Callable[[str], None], stopped: Callable[[], bool]) -> bool:
-        """Whether all steps are done."""
         while self.step < self.steps:
             terms = self.train_step()
             if not np.isfinite(terms["loss"]):
@@ -186,8 +178,8 @@ class DetectorTraining(ABC, Generic[Network]):
                 self.save(out)
                 self.write_weights(out / WEIGHTS)
             if end:
-                return False
-        return True
+                return None
+        return out / WEIGHTS
 
     def write_weights(self, path: Path) -> None:
         """Writes the trained network for use.
