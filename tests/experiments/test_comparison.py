@@ -306,5 +306,6 @@ def test_ppo_trains_evaluates_and_can_be_compared(tmp_path: Path, capsys: pytest
     largest = metrics["per_episode"]["max_visible_fraction"]
     np.testing.assert_allclose(largest, run.metrics["per_episode"]["max_visible_fraction"], atol=0.02)
     assert "Training" in (evaluated / "report.html").read_text()
-    again = run_python(*arguments)
-    assert again.returncode == 2 and "already holds a run" in again.stderr
+    with pytest.raises(SystemExit) as ended:
+        main(list(arguments[2:]))
+    assert ended.value.code == 2 and "already holds a run" in capsys.readouterr().err

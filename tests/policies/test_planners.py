@@ -470,9 +470,9 @@ def test_the_oracle_says_where_nothing_can_be_seen() -> None:
 
 
 def test_no_planner_needs_fewer_moves_than_the_oracle(world: FreeWorld) -> None:
-    episodes = range(8)
+    episodes = range(4)
     oracle = run(world, Oracle(OracleSearch(world, reachable=anywhere)), episodes)
-    assert sum(e.success for e in oracle) >= 6
+    assert sum(e.success for e in oracle) >= 3
     planners = [
         RandomViewpoint(),
         FixedSweep(),
