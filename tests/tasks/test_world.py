@@ -39,6 +39,7 @@ CASES: list[tuple[str, dict[str, Any]]] = [
     (GENERAL, {**POOL, "perception": "occlusion_model"}),
     (ROW, {**POOL, "transits": "both"}),
     (ROW, {**POOL, "transits": "none", "sensor_noise": NOISE}),
+    (ROW, {**POOL, "perception": "occlusion_model"}),
 ]
 NAMES = [
     *(
@@ -50,7 +51,7 @@ NAMES = [
         "episode list",
         "camera",
     ),
-    *("row with transits", "row with noise"),
+    *("row with transits", "row with noise", "row with a camera"),
 ]
 
 ROUNDING = 2e-5
