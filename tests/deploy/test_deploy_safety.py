@@ -108,15 +108,15 @@ def test_an_arm_outside_the_workspace_may_come_in() -> None:
 def test_the_first_place_outside_and_in_a_zone_is_named() -> None:
     goal = turned(j2=0.1)
     way = np.array([plain_flange(joints) for joints in joint_path(READY_QPOS, goal, 0.02)])
-    third = "(" + ", ".join(f"{v:.3f}" for v in way[3]) + ") m"
-    between = float(way[2, 0] + way[3, 0]) / 2
+    fourth = "(" + ", ".join(f"{v:.3f}" for v in way[4]) + ") m"
+    between = float(way[3, 0] + way[4, 0]) / 2
     workspace = Box(low=(-0.9, -0.9, 0.0), high=(between, 0.9, 1.35))
     refusal = Safety(SafetyConfig(workspace=workspace, path_step=0.02)).check(move(goal), state(), 10.0)
-    assert refusal is not None and refusal.reason == "workspace" and third in refusal.detail
-    zone = Box(low=(between, -0.9, 0.0), high=(float(way[3, 0]) + 1e-4, 0.9, 1.35))
+    assert refusal is not None and refusal.reason == "workspace" and fourth in refusal.detail
+    zone = Box(low=(between, -0.9, 0.0), high=(float(way[4, 0]) + 1e-4, 0.9, 1.35))
     refusal = Safety(SafetyConfig(forbidden=(zone,), path_step=0.02)).check(move(goal), state(), 10.0)
     assert refusal is not None and refusal.reason == "forbidden_zone" and "flange" in refusal.detail
-    assert third in refusal.detail
+    assert fourth in refusal.detail
 
 
 def test_a_contact_is_named_with_its_distance_and_the_share_of_the_move_before_it() -> None:
@@ -134,6 +134,10 @@ def test_a_contact_is_named_with_its_distance_and_the_share_of_the_move_before_i
     assert 0.1 < share < 0.95
     assert safety.check(move(turned(j2=0.3 * (share - 0.02))), state(), 10.0) is None
     assert safety.check(move(turned(j2=0.3 * (share + 0.02))), state(), 10.0) is not None
+    # In ten samples the share is a whole number of tenths.
+    coarse = Safety(SafetyConfig(obstacles=(wall,), obstacle_clearance=0.02, path_step=0.0301))
+    refusal = coarse.check(move(goal), state(), 10.0)
+    assert refusal is not None and "0% of the move" in refusal.detail
 
 
 def test_a_posture_stands_in_collision_with_itself_or_with_enough_points_of_the_plant(safety: Safety) -> None:
