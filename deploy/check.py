@@ -11,9 +11,9 @@ import numpy as np
 from maniskill_tomato.deploy.capture import Capture
 from maniskill_tomato.deploy.deploy_errors import DeployError, RecordingError
 from maniskill_tomato.deploy.interface import JointMove
-from maniskill_tomato.deploy.policies import TASK, decide, default_policy
+from maniskill_tomato.deploy.loop import TASK, decide, default_policy
 from maniskill_tomato.deploy.profile import Profile
-from maniskill_tomato.deploy.robot_belief import RobotBelief
+from maniskill_tomato.deploy.robot_perception import RobotBelief
 from maniskill_tomato.deploy.workcell import make_workcell
 from maniskill_tomato.errors import TomatoError
 from maniskill_tomato.files import write_atomically

@@ -14,10 +14,10 @@ import numpy as np
 from maniskill_tomato.deploy.capture import CaptureConfig
 from maniskill_tomato.deploy.deploy_errors import ProfileError
 from maniskill_tomato.deploy.interface import Float64
-from maniskill_tomato.deploy.loop_config import LoopConfig
 from maniskill_tomato.deploy.profile_files import profile_names, profile_path
 from maniskill_tomato.deploy.robot_perception import TRUE_MASKS, Sight
-from maniskill_tomato.deploy.safety_config import SafetyConfig
+from maniskill_tomato.deploy.run_records import LoopConfig
+from maniskill_tomato.deploy.safety import SafetyConfig
 from maniskill_tomato.deploy.toml_tables import parse_table
 from maniskill_tomato.errors import InvalidInputError
 from maniskill_tomato.robot.d435 import T_flange_camera_color_optical

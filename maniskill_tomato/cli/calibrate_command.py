@@ -61,10 +61,8 @@ class DeployCalibrate:
         """Takes or reads the views, calculates, and says where the file is."""
         self._check()
 
-        from maniskill_tomato.deploy.calibration.board_print import print_board
-        from maniskill_tomato.deploy.calibration.calibration_file import write_calibration
-        from maniskill_tomato.deploy.calibration.hand_eye import calibrate_hand_eye
-        from maniskill_tomato.deploy.calibration.picture import draw_calibration
+        from maniskill_tomato.deploy.calibration.hand_eye import calibrate_hand_eye, write_calibration
+        from maniskill_tomato.deploy.calibration.picture import draw_calibration, print_board
         from maniskill_tomato.deploy.calibration.view_folder import board_view, read_views
 
         board = self._board()
@@ -122,8 +120,7 @@ class DeployCalibrate:
         from maniskill_tomato.deploy.calibration.view_capture import CapturePlan, capture_views
         from maniskill_tomato.deploy.deploy_errors import StoppedError
         from maniskill_tomato.deploy.profile import load_profile
-        from maniskill_tomato.deploy.stops import Stops
-        from maniskill_tomato.deploy.workcell import make_workcell, prepare_folder
+        from maniskill_tomato.deploy.workcell import make_workcell
 
         moves = self.confirm or self.unattended
         if moves and (folder / "views.json").exists():
@@ -133,20 +130,13 @@ class DeployCalibrate:
         profile = load_profile(name)
         workcell = make_workcell(profile)
         plan = CapturePlan(views=self.count)
-        stop_file = prepare_folder(profile, self.out)
+        stops = workcell.listen(self.out, keyboard=not self.confirm)
         with ExitStack() as stack:
             if not moves:
                 folder = Path(stack.enter_context(TemporaryDirectory()))
             stack.enter_context(workcell.arm)
             camera = stack.enter_context(workcell.camera)
-            stops = stack.enter_context(
-                Stops(
-                    stop_file=stop_file,
-                    keyboard=not self.confirm,
-                    heartbeat_s=profile.stop.heartbeat,
-                    on_lost_heartbeat=workcell.guarded_arm.stop,
-                )
-            )
+            stack.enter_context(stops)
             try:
                 taken = capture_views(
                     workcell.guarded_arm,

@@ -13,7 +13,7 @@ from maniskill_tomato.errors import InvalidInputError
 from maniskill_tomato.policies.layout import GENERAL_IDS
 
 if TYPE_CHECKING:
-    from maniskill_tomato.deploy.loop_config import Proposal
+    from maniskill_tomato.deploy.run_records import Proposal
 
 FAULT_STATUS = 3
 """Exit status of a run that a fault ended."""
@@ -54,9 +54,9 @@ class DeployRun:
         if self.confirm and not sys.stdin.isatty():
             raise InvalidInputError("--confirm asks before every move and needs a terminal")
 
-        from maniskill_tomato.deploy.loop_config import Mode
         from maniskill_tomato.deploy.policy_run import RunConfig, run
         from maniskill_tomato.deploy.profile import load_profile
+        from maniskill_tomato.deploy.run_records import Mode
 
         modes: list[Mode] = []
         if self.confirm:

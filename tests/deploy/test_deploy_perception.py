@@ -8,8 +8,7 @@ import torch
 
 from maniskill_tomato.deploy.interface import Frame, FrameTruth
 from maniskill_tomato.deploy.mock.episode import load_episode
-from maniskill_tomato.deploy.robot_belief import FIRST_RPY, RobotBelief
-from maniskill_tomato.deploy.robot_perception import TRUE_MASKS, ImagePerception
+from maniskill_tomato.deploy.robot_perception import FIRST_RPY, TRUE_MASKS, ImagePerception, RobotBelief
 from maniskill_tomato.raycast.images import FIRST_ORGAN_LABEL, ROBOT_LABEL
 from maniskill_tomato.raycast.scene import RayScene
 from maniskill_tomato.raycast.view_rays import ViewRays

@@ -13,6 +13,7 @@ from onnx import numpy_helper
 
 from maniskill_tomato.assets import asset_path
 from maniskill_tomato.cli import main
+from maniskill_tomato.deploy.loop import Loop
 from maniskill_tomato.deploy.profile import load_profile
 from maniskill_tomato.deploy.run_records import KeptSteps
 from maniskill_tomato.deploy.run_replay import load_recording
@@ -92,7 +93,7 @@ def test_an_exported_policy_makes_the_moves_that_it_makes_in_torch(tmp_path: Pat
     workcell, kept = make_workcell(load_profile(str(profile)), SEED), KeptSteps()
     with workcell.arm, workcell.camera, Stops() as stops:
         policy = open_policy(source, env_id=TASK)
-        workcell.loop(policy, stops, "unattended", kept).run()
+        Loop(workcell, policy, stops, "unattended", [kept]).run()
     assert len(kept.steps) == len(exported) == 6
     assert any(step.outcome == "moved" for step in kept.steps)
     for step, facts in zip(kept.steps, exported, strict=True):

@@ -31,8 +31,7 @@ from maniskill_tomato.deploy.interface import Arm, JointMove
 from maniskill_tomato.deploy.profile import load_profile
 from maniskill_tomato.deploy.sunrise.client import SunriseClient
 from maniskill_tomato.deploy.sunrise.line_connection import MAX_LINE_BYTES, LineConnection
-from maniskill_tomato.deploy.sunrise.loopback import LoopbackController
-from maniskill_tomato.deploy.sunrise.loopback_faults import Fault
+from maniskill_tomato.deploy.sunrise.loopback import Fault, LoopbackController
 from maniskill_tomato.errors import InvalidInputError
 
 START = np.array([0.0, 0.35, 0.0, -1.2, 0.0, 1.5, 0.0])

@@ -8,12 +8,12 @@ import pytest
 import torch
 
 from maniskill_tomato.deploy.clock import SimulatedClock
+from maniskill_tomato.deploy.collision import Box
 from maniskill_tomato.deploy.detour import MAX_MOVES, DetourPlanner
 from maniskill_tomato.deploy.guarded_arm import GuardedArm
 from maniskill_tomato.deploy.interface import ArmState, Float64, JointMove
 from maniskill_tomato.deploy.move_choice import MoveChooser, MoveRequest
-from maniskill_tomato.deploy.safety import Safety
-from maniskill_tomato.deploy.safety_config import Box, SafetyConfig
+from maniskill_tomato.deploy.safety import Safety, SafetyConfig
 from maniskill_tomato.robot.d435 import T_flange_camera_color_optical
 from maniskill_tomato.robot.iiwa14 import LINK_NAMES, READY_QPOS
 from maniskill_tomato.robot.kinematics import forward_kinematics, link_transforms
