@@ -13,7 +13,7 @@ from maniskill_tomato.errors import TomatoError
 from maniskill_tomato.raycast.images import ROBOT_LABEL
 from maniskill_tomato.raycast.view_rays import ViewRays
 from maniskill_tomato.robot.kinematics import forward_kinematics, link_transforms
-from maniskill_tomato.robot.rotations import matrix_to_rpy
+from maniskill_tomato.robot.rotations import FORWARD_RPY, matrix_to_rpy
 from maniskill_tomato.segmentation.instances import Instances
 from maniskill_tomato.segmentation.masks import BinaryMask
 from maniskill_tomato.segmentation.segmenter import Segmenter
@@ -201,10 +201,6 @@ def open_perception(sight: Sight, segmenter: str) -> Perception:
         raise ProfileError(f"perception.segmenter: {error}") from error
 
 
-FIRST_RPY = (0.0, np.pi / 2, 0.0)
-"""The angles that those of the first view are near to, in [rad], as in the task: along +x, upright."""
-
-
 class RobotBelief:
     """What is known of one target, view after view, as `TomatoViewpoint-v1` takes them."""
 
@@ -224,7 +220,7 @@ class RobotBelief:
         self._exact_mount = torch.as_tensor(np.array(T_flange_camera), dtype=torch.float64)
         self._mount = self._exact_mount.float()
         self._observer = ViewpointObserver(1, layout=layout, max_moves=max_moves)
-        self._rpy = torch.tensor([FIRST_RPY])
+        self._rpy = torch.tensor([FORWARD_RPY])
         self._has_views = False
 
     def camera_pose(self, joint_positions: Float64) -> Float64:

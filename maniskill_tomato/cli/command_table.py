@@ -44,7 +44,7 @@ COMMANDS: Final[dict[str, CommandEntry]] = {
         "move_to_see_command:TrainDeepMoveToSee", "Train the network of the planner deep_3dmts"
     ),
     "demonstrations": CommandEntry(
-        "demonstrations_command:Demonstrations", "Record a planner's episodes for other learners"
+        "demonstrations_command:RecordDemonstrations", "Record a planner's episodes for other learners"
     ),
     "export": CommandEntry("export_command:Export", "Write a policy as ONNX, which runs without PyTorch"),
     "eval": CommandEntry("eval_command:Eval", "Evaluate a policy and write a report"),

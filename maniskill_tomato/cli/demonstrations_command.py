@@ -7,7 +7,7 @@ from maniskill_tomato.cli.early_checks import check_count, check_policy
 
 
 @dataclass(frozen=True, kw_only=True)
-class Demonstrations:
+class RecordDemonstrations:
     """Record a planner's successful episodes on training plants in ManiSkill's trajectory format."""
 
     planner: str = "oracle"

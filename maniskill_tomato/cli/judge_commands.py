@@ -15,7 +15,7 @@ from maniskill_tomato.cli.early_checks import (
     check_profile,
     check_segmenter,
 )
-from maniskill_tomato.experiments.configs import PerceptionConfig, TwinConfig
+from maniskill_tomato.experiments.configs import PerceptionComparisonConfig, TwinConfig
 
 OcclusionModelName = Literal["thesis", "improved", "sphere", "amodal"]
 
@@ -120,7 +120,7 @@ class JudgeSegmenter:
 
 
 @dataclass(frozen=True, kw_only=True)
-class JudgePerception(PerceptionConfig):
+class JudgePerception(PerceptionComparisonConfig):
     """Measure what a policy loses when it sees through the camera instead of the simulator, on the same episodes.
 
     An episode ends when the robot believes that the target is fully visible, or after the last move. It is a success

@@ -112,7 +112,7 @@ class RowBenchmarkConfig:
 
 
 @dataclass(frozen=True, kw_only=True)
-class PerceptionConfig:
+class PerceptionComparisonConfig:
     """Measure what a policy loses when it sees through the camera instead of the simulator, on the same episodes.
 
     An episode ends when the robot believes that the target is fully visible, or after the last move. It is a success

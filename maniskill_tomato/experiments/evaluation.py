@@ -15,7 +15,7 @@ from maniskill_tomato.errors import InvalidInputError
 from maniskill_tomato.experiments import plots
 from maniskill_tomato.experiments.configs import EvaluationConfig
 from maniskill_tomato.experiments.episode_record import EpisodeRecord
-from maniskill_tomato.experiments.evaluation_report import Picture, ReportInput, write_report
+from maniskill_tomato.experiments.evaluation_report import ReportInput, ReportPicture, write_report
 from maniskill_tomato.experiments.metrics import make_metrics, write_json
 from maniskill_tomato.experiments.rollout import run_episodes
 from maniskill_tomato.experiments.training_runs import Run
@@ -72,7 +72,7 @@ def evaluate(config: EvaluationConfig) -> EvaluationResult:
     )
     write_json(config.out / "metrics.json", metrics)
     write_trajectories(config.out / "trajectories.npz", episodes)
-    views: list[Picture] = []
+    views: list[ReportPicture] = []
     video = left_out = None
     if config.video:
         if vulkan_probe.rendering_available():
@@ -186,18 +186,18 @@ def _run(
 
 def _plot_episodes(
     config: EvaluationConfig, episodes: Sequence[EpisodeRecord], threshold: float
-) -> list[Picture]:
+) -> list[ReportPicture]:
     out = config.out
     plots.plot_steps(episodes, out / "steps.png")
     plots.plot_visible_fraction(episodes, threshold, out / "visible_fraction.png")
     plots.plot_trajectories(episodes, out / "trajectories.png")
     return [
-        Picture(path=out / "steps.png", caption="Steps that each episode took (thesis Fig. 5-6)."),
-        Picture(
+        ReportPicture(path=out / "steps.png", caption="Steps that each episode took (thesis Fig. 5-6)."),
+        ReportPicture(
             path=out / "visible_fraction.png",
             caption="Visible fraction of the target at the start and at its best in each episode (thesis Fig. 5-7).",
         ),
-        Picture(
+        ReportPicture(
             path=out / "trajectories.png",
             caption="Way of the end-effector in the first episodes, with the viewing direction at the first, "
             "middle and last pose (thesis Fig. 5-8).",
@@ -205,7 +205,7 @@ def _plot_episodes(
     ]
 
 
-def _plot_training(config: EvaluationConfig, policy: Path | None) -> list[Picture]:
+def _plot_training(config: EvaluationConfig, policy: Path | None) -> list[ReportPicture]:
     """Curves of the training that the configuration names, or of the one beside the policy."""
     run = config.training_run
     if run is None and policy is not None and (policy.parent / "history.npz").is_file():
@@ -215,7 +215,7 @@ def _plot_training(config: EvaluationConfig, policy: Path | None) -> list[Pictur
     path = config.out / "training_curves.png"
     plots.plot_training_curves(load_history(run), path)
     return [
-        Picture(
+        ReportPicture(
             path=path,
             caption="Loss and reward of each episode, reward and visible fraction of each step (thesis Fig. 5-1 to "
             "5-4).",
@@ -223,7 +223,7 @@ def _plot_training(config: EvaluationConfig, policy: Path | None) -> list[Pictur
     ]
 
 
-def _film(config: EvaluationConfig, found: str | Path) -> tuple[Path, list[Picture]]:
+def _film(config: EvaluationConfig, found: str | Path) -> tuple[Path, list[ReportPicture]]:
     """Films the first episodes; returns the film and the first and last view of the first one."""
     from maniskill_tomato.experiments.film import film_episodes, make_film_options
 
@@ -238,7 +238,7 @@ def _film(config: EvaluationConfig, found: str | Path) -> tuple[Path, list[Pictu
         env.close()
     first = films[0]
     steps = "1 step" if first.steps == 1 else f"{first.steps} steps"
-    pictures: list[Picture] = []
+    pictures: list[ReportPicture] = []
     for name, image, caption in (
         (
             "first_view",
@@ -255,5 +255,5 @@ def _film(config: EvaluationConfig, found: str | Path) -> tuple[Path, list[Pictu
     ):
         picture = config.out / f"{name}.png"
         imageio.imwrite(picture, image)
-        pictures.append(Picture(path=picture, caption=caption))
+        pictures.append(ReportPicture(path=picture, caption=caption))
     return path, pictures

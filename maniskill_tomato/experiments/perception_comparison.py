@@ -8,7 +8,7 @@ import numpy as np
 
 import maniskill_tomato
 from maniskill_tomato.errors import InvalidInputError
-from maniskill_tomato.experiments.configs import PerceptionConfig
+from maniskill_tomato.experiments.configs import PerceptionComparisonConfig
 from maniskill_tomato.experiments.episode_record import EpisodeRecord
 from maniskill_tomato.experiments.metrics import write_json
 from maniskill_tomato.experiments.policy_runs import Condition, parse_policies, run_policies
@@ -70,7 +70,7 @@ class PerceivedEpisode:
         )
 
 
-def compare_perceptions(config: PerceptionConfig) -> str:
+def compare_perceptions(config: PerceptionComparisonConfig) -> str:
     """Runs the episodes that are not in the folder yet; writes perception.json and perception.md.
 
     Returns:

@@ -96,7 +96,7 @@ class Condition:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Block:
+class EpisodeBlock:
     """Some episodes under one condition, for a process to run by itself."""
 
     condition: Condition
@@ -138,7 +138,7 @@ def run_policies(
             logger.info("%d of %d episodes, about %.0f minutes left", done, total, left / 60.0)
 
 
-def run_block(block: Block) -> dict[str, list[EpisodeRecord]]:
+def run_block(block: EpisodeBlock) -> dict[str, list[EpisodeRecord]]:
     """Runs some episodes with some policies, in whatever process this is; the episodes by policy."""
     env = _environment(block.condition)
     oracle = known_moves(block.condition.episode_list)
@@ -179,14 +179,16 @@ def known_moves(episode_list: str | None) -> Callable[[int], int | None]:
 
 def _missing_blocks(
     store: ResultStore, condition: Condition, specs: Sequence[PolicySpec], numbers: range
-) -> list[Block]:
+) -> list[EpisodeBlock]:
     missing = {spec: set(store.missing(condition.name, spec.label, numbers)) for spec in specs}
     blocks = []
     for first in range(numbers.start, numbers.stop, BLOCK):
         some = range(first, min(first + BLOCK, numbers.stop))
         wanted = tuple((spec, tuple(n for n in some if n in missing[spec])) for spec in specs)
         if any(left for _, left in wanted):
-            blocks.append(Block(condition=condition, missing=tuple(part for part in wanted if part[1])))
+            blocks.append(
+                EpisodeBlock(condition=condition, missing=tuple(part for part in wanted if part[1]))
+            )
     return blocks
 
 

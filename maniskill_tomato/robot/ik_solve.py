@@ -29,7 +29,7 @@ LARGEST_SKEW = wp.constant(wp.float64(1.0e-3))
 
 
 @wp.struct
-class Solution:
+class ExactSolution:
     found: wp.int32
     stretched: wp.int32
     """1 if the arm was taken as stretched; exact elbow angles near zero are then worth another attempt."""
@@ -44,9 +44,9 @@ def exact_solution(
     weights: Weights,
     tolerance: wp.float64,
     stretch: wp.float64,
-) -> Solution:
+) -> ExactSolution:
     """The cheapest joint angles that reach a pose to within a few tolerances."""
-    solution = Solution()
+    solution = ExactSolution()
     x = wp.vec3d(rotation[0, 0], rotation[1, 0], rotation[2, 0])
     y = wp.vec3d(rotation[0, 1], rotation[1, 1], rotation[2, 1])
     z = wp.vec3d(rotation[0, 2], rotation[1, 2], rotation[2, 2])

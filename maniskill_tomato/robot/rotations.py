@@ -6,11 +6,15 @@ Every function takes any number of leading dimensions and keeps dtype and device
 """
 
 import math
+from typing import Final
 
 import numpy as np
 import torch
 
 from maniskill_tomato.errors import InvalidInputError
+
+FORWARD_RPY: Final = (0.0, math.pi / 2, 0.0)
+"""Of the flange when the camera looks along +x with its picture upright, in [rad]; a first view's are near to these."""
 
 SINGULAR_COS_PITCH_FLOAT64 = 1e-6
 """Below this |cos(pitch)| a double-precision matrix counts as singular in `matrix_to_rpy`."""

@@ -57,7 +57,7 @@ def _unshuffled(image: Tensor) -> Tensor:
     return x.contiguous(memory_format=torch.channels_last)
 
 
-class _Block(nn.Module):
+class _ResidualBlock(nn.Module):
     """Two convolutions beside a shortcut."""
 
     def __init__(self, width: int) -> None:
@@ -80,7 +80,9 @@ class PlainBackbone(nn.Module):
         previous = 12
         for width, count in zip(widths, blocks, strict=True):
             stages.append(
-                nn.Sequential(_conv(previous, width, stride=2), *(_Block(width) for _ in range(count)))
+                nn.Sequential(
+                    _conv(previous, width, stride=2), *(_ResidualBlock(width) for _ in range(count))
+                )
             )
             previous = width
         self.stages = nn.ModuleList(stages)

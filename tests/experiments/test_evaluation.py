@@ -19,7 +19,7 @@ from maniskill_tomato.experiments import evaluation
 from maniskill_tomato.experiments.configs import EvaluationConfig
 from maniskill_tomato.experiments.episode_record import EpisodeRecord
 from maniskill_tomato.experiments.evaluation import write_trajectories
-from maniskill_tomato.experiments.evaluation_report import Picture, ReportInput, write_report
+from maniskill_tomato.experiments.evaluation_report import ReportInput, ReportPicture, write_report
 from maniskill_tomato.experiments.metrics import make_metrics, summarise, write_json
 from maniskill_tomato.experiments.plots import (
     default_windows,
@@ -260,7 +260,7 @@ def report(tmp_path: Path, **changes: Any) -> str:
     options: dict[str, Any] = {
         "title": "A <report>",
         "metrics": metrics,
-        "evaluation": [Picture(path=tmp_path / "steps.png", caption="Steps & more")],
+        "evaluation": [ReportPicture(path=tmp_path / "steps.png", caption="Steps & more")],
     }
     write_report(tmp_path / "report.html", ReportInput(**(options | changes)))
     return (tmp_path / "report.html").read_text()

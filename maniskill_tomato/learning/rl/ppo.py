@@ -41,7 +41,7 @@ SPS_EVERY = 100
 """Environment steps between two points of charts/SPS."""
 
 
-class Recorder(gym.Wrapper[Array, Array, Array, Array]):
+class HistoryWrapper(gym.Wrapper[Array, Array, Array, Array]):
     """Keeps the history of the training, and TensorBoard's charts."""
 
     def __init__(self, env: gym.Env[Array, Array], run_dir: Path) -> None:
@@ -131,7 +131,7 @@ def train_ppo(env_id: str, config: PpoConfig, run_dir: Path, seed: int, progress
         gamma=config.gamma,
         step_cost=config.step_cost,
     )
-    env = Recorder(task, run_dir)
+    env = HistoryWrapper(task, run_dir)
     model = PPO(
         "MlpPolicy",
         env,
