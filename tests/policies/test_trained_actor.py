@@ -113,5 +113,5 @@ def test_options_that_only_a_training_needs_do_not_keep_a_policy_from_acting(tmp
     saved(tmp_path / "p.pt", config={**agent.config.to_dict(), "colour": "red"})
     policy = load_actor(tmp_path / "p.pt")
     assert policy.act(torch.zeros(1, 9)).shape == (1, 6)
-    with pytest.raises(InvalidInputError, match="unknown training options: colour"):
+    with pytest.raises(InvalidInputError, match="config.colour is unknown"):
         TrainConfig.from_dict(policy.config)

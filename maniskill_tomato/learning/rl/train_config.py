@@ -5,6 +5,7 @@ from dataclasses import dataclass
 from typing import Any, Literal
 
 from maniskill_tomato.errors import InvalidInputError
+from maniskill_tomato.tables import read_table
 
 ExplorationName = Literal["epsilon-greedy", "decaying-gaussian", "look-at-goals", "correlated"]
 
@@ -53,11 +54,6 @@ _REMOVED = {
     "success_threshold_steps": 5000,
 }
 """Options of earlier versions, each with the default with which a run equals one without the option."""
-
-_CHOICES = {
-    "critic": ("scalar", "categorical"),
-    "normalize_observations": ("none", "fixed", "running"),
-}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -222,9 +218,6 @@ class TrainConfig:
                 "categorical critics need 2 or more value_atoms over a rising value_range, got "
                 f"{self.value_atoms} over {self.value_range}"
             )
-        for name, allowed in _CHOICES.items():
-            if getattr(self, name) not in allowed:
-                raise InvalidInputError.choice(name, getattr(self, name), allowed)
         if self.exploration_noise_per_env and self.exploration == "epsilon-greedy":
             raise InvalidInputError(
                 "exploration_noise_per_env needs an exploration with noise: decaying-gaussian, look-at-goals or "
@@ -242,17 +235,10 @@ class TrainConfig:
         Options are read as `modernise` leaves them.
 
         Raises:
-            InvalidInputError: A field is unknown (the message lists them) or its value not allowed.
+            InvalidInputError: A field is unknown (the message lists them), or its value is of another kind or not
+                allowed.
         """
-        values = modernise(values)
-        known = {field.name for field in dataclasses.fields(cls)}
-        unknown = sorted(set(values) - known)
-        if unknown:
-            raise InvalidInputError(
-                f"unknown training options: {', '.join(unknown)}; known are {', '.join(sorted(known))}"
-            )
-        arguments: dict[str, Any] = {k: tuple(v) if isinstance(v, list) else v for k, v in values.items()}
-        return cls(**arguments)
+        return read_table(cls, modernise(values), "config")
 
 
 def modernise(values: dict[str, Any]) -> dict[str, Any]:
