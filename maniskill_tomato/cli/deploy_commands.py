@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated, cast
 import tyro
 
 from maniskill_tomato.cli.early_checks import (
-    check_count,
+    check_counts,
     check_file,
     check_folder,
     check_policy,
@@ -228,8 +228,7 @@ class DeployCalibrate:
 
     def _check(self) -> None:
         """Accepts options that fit together, and files that are there."""
-        for flag, value in (("--count", self.count), ("--columns", self.columns), ("--rows", self.rows)):
-            check_count(flag, value)
+        check_counts(count=self.count, columns=self.columns, rows=self.rows)
         if self.print_board is not None:
             return
         if (self.profile is None) == (self.views is None):

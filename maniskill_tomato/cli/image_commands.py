@@ -7,7 +7,7 @@ from typing import Annotated, Literal
 
 import tyro
 
-from maniskill_tomato.cli.early_checks import check_count, check_folder, check_segmenter
+from maniskill_tomato.cli.early_checks import check_counts, check_folder, check_segmenter
 from maniskill_tomato.errors import InvalidInputError
 
 
@@ -39,9 +39,7 @@ class Dataset:
     def run(self) -> None:
         """Renders what is missing and says where it is."""
         check_folder("--real", self.real)
-        check_count("--jobs", self.jobs)
-        for flag, value in (("--count", self.count), ("--width", self.width), ("--height", self.height)):
-            check_count(flag, value)
+        check_counts(jobs=self.jobs, count=self.count, width=self.width, height=self.height)
 
         from tqdm import tqdm
 

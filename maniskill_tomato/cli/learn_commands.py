@@ -8,7 +8,7 @@ from typing import Annotated
 import tyro
 
 from maniskill_tomato.cli.arguments import Flat
-from maniskill_tomato.cli.early_checks import check_count, check_env_id, check_file, check_policy
+from maniskill_tomato.cli.early_checks import check_counts, check_env_id, check_file, check_policy
 from maniskill_tomato.cli.shared_options import EnvId, parse_env_options, tell_policy
 from maniskill_tomato.errors import InvalidInputError
 from maniskill_tomato.learning.imitation.imitation_config import ImitationConfig
@@ -39,7 +39,7 @@ class TrainImitation:
 
     def run(self) -> None:
         """Trains and says where the policy is."""
-        check_count("--jobs", self.jobs)
+        check_counts(jobs=self.jobs)
         options = parse_env_options(self.env_options)
 
         from maniskill_tomato.learning.imitation.imitation_training import train_imitation
@@ -67,7 +67,7 @@ class TrainViewQuality:
 
     def run(self) -> None:
         """Trains and says where the policy is."""
-        check_count("--jobs", self.jobs)
+        check_counts(jobs=self.jobs)
         check_file("--start-from", self.start_from)
         options = parse_env_options(self.env_options)
 
@@ -98,8 +98,7 @@ class TrainDeepMoveToSee:
 
     def run(self) -> None:
         """Trains and says where the network is."""
-        check_count("--episodes", self.episodes)
-        check_count("--moves", self.moves)
+        check_counts(episodes=self.episodes, moves=self.moves)
 
         from maniskill_tomato.learning.imitation.move_to_see_training import train_move_to_see
 
@@ -139,7 +138,7 @@ class TrainPpo:
     def run(self) -> None:
         """Trains and evaluates every seed; a signal ends the present run and starts no other."""
         check_env_id(self.env_id)
-        check_count("--episodes", self.episodes)
+        check_counts(episodes=self.episodes)
         if not self.seeds or len(set(self.seeds)) != len(self.seeds):
             raise InvalidInputError("--seeds must be one or more different numbers")
 
@@ -179,8 +178,8 @@ class RecordDemonstrations:
     def run(self) -> None:
         """Records and says what."""
         check_policy("--planner", self.planner)
-        check_count("--episodes", self.episodes)
-        check_count("--first-seed", self.first_seed, 0)
+        check_counts(episodes=self.episodes)
+        check_counts(0, first_seed=self.first_seed)
 
         from maniskill_tomato.experiments.policy_runs import PolicySpec, open_for
         from maniskill_tomato.learning.imitation.demonstrations import record_demonstrations

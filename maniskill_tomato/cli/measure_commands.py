@@ -8,6 +8,7 @@ from typing import Annotated
 import tyro
 
 from maniskill_tomato.cli.early_checks import check_choice, check_folder, check_policies
+from maniskill_tomato.cli.shared_options import say
 from maniskill_tomato.errors import InvalidInputError
 from maniskill_tomato.experiments.configs import (
     AblationConfig,
@@ -92,10 +93,6 @@ class Compare(RunComparisonConfig):
         print(f"report  {result.report}")
 
 
-def _say(line: str) -> None:
-    print(line, flush=True)
-
-
 @dataclass(frozen=True, kw_only=True)
 class Reproduce(ReproductionConfig):
     """Reproduce an experiment of the thesis over several seeds and draw the counterparts of its figures.
@@ -113,7 +110,7 @@ class Reproduce(ReproductionConfig):
 
         from maniskill_tomato.experiments.reproduction import run_reproduction
 
-        run_reproduction(self, _say)
+        run_reproduction(self, say)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -132,4 +129,4 @@ class Ablate(AblationConfig):
 
         from maniskill_tomato.experiments.ablation import run_ablation
 
-        _say(run_ablation(self, _say))
+        say(run_ablation(self, say))
