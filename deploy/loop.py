@@ -151,7 +151,7 @@ class Loop:
         try:
             device_seconds = self._clock.now() - device_began
         except DeployError:
-            device_seconds = float("nan")
+            device_seconds = 0.0
         result = RunResult(
             success=reason == "success",
             reason=reason,
@@ -164,7 +164,7 @@ class Loop:
             true_visible_fraction=self._true_fraction,
             visible_fractions=tuple(round(v, 4) for v in self._fractions),
             seconds=time.perf_counter() - began,
-            device_seconds=0.0 if np.isnan(device_seconds) else device_seconds,
+            device_seconds=device_seconds,
             stage_ms=self._times.mean_ms,
             end_state=end_state,
         )
