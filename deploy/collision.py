@@ -147,8 +147,7 @@ class CollisionChecker:
 
     def _are_neighbours(self, a: int, b: int) -> bool:
         """Whether two shapes belong to links with at most one joint between them."""
-        in_world = [self._model.geom_bodyid[g] == 0 for g in (a, b)]
-        if any(in_world):
+        if 0 in (self._model.geom_bodyid[a], self._model.geom_bodyid[b]):
             return False
         return bool(
             self._weld[a] == self._weld[b]

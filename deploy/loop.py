@@ -151,7 +151,7 @@ class Loop:
         try:
             device_seconds = self._clock.now() - device_began
         except DeployError:
-            device_seconds = float("nan")
+            device_seconds = 0.0
         result = RunResult(
             success=reason == "success",
             reason=reason,
@@ -164,7 +164,7 @@ class Loop:
             true_visible_fraction=self._true_fraction,
             visible_fractions=tuple(round(v, 4) for v in self._fractions),
             seconds=time.perf_counter() - began,
-            device_seconds=0.0 if np.isnan(device_seconds) else device_seconds,
+            device_seconds=device_seconds,
             stage_ms=self._times.mean_ms,
             end_state=end_state,
         )
@@ -312,22 +312,19 @@ class Loop:
 
     def _ask(self, step: Step, move: JointMove, refusal: Refusal | None) -> None:
         """Shows the move; goes on only if a person wants it."""
-        state = self._arm.read()
-        after = self._robot_belief.camera_pose(move.joint_positions)
-        proposal = Proposal(
-            number=self._moves - 1,
-            visible_fraction=step.view.visible_fraction,
-            joint_positions=move.joint_positions,
-            turn=move.joint_positions - state.joint_positions,
-            camera_step=float(np.linalg.norm(after[:3, 3] - step.T_world_camera[:3, 3])),
-            refusal=None if refusal is None else str(refusal),
-        )
         if self._mode == "dry_run":
             told = "safety would let it through" if refusal is None else f"safety would refuse it: {refusal}"
             turns = ", ".join(f"{v:.1f}" for v in np.rad2deg(move.joint_positions))
             self._end(step, "dry_run", f"nothing was sent; the first move would go to ({turns}) deg; {told}")
         if refusal is not None:
             return
+        after = self._robot_belief.camera_pose(move.joint_positions)
+        proposal = Proposal(
+            number=self._moves - 1,
+            visible_fraction=step.view.visible_fraction,
+            turn=move.joint_positions - self._arm.read().joint_positions,
+            camera_step=float(np.linalg.norm(after[:3, 3] - step.T_world_camera[:3, 3])),
+        )
         with self._stops.waiting_for_a_person():
             confirmed = self._confirm(proposal)
         self._check_stops()

@@ -77,9 +77,8 @@ class IiwaRealAgent(BaseRealAgent):  # type: ignore[misc]
         """
         joints = _joints(qpos)
         state = self.workcell.guarded_arm.read()
-        if (
-            not np.abs(joints - state.joint_positions).max() <= 1e-4
-        ):  # NaN goes on to safety, which refuses it.
+        # NaN goes on to safety, which refuses it.
+        if not np.abs(joints - state.joint_positions).max() <= 1e-4:
             frame_stamp = None if self._frame is None else self._frame.stamp
             self._go(joints, frame_stamp)
 
@@ -207,9 +206,8 @@ class IiwaRealAgent(BaseRealAgent):  # type: ignore[misc]
 
 
 def _joints(qpos: Any) -> Float64:
-    values = np.asarray(qpos.detach().cpu() if isinstance(qpos, Tensor) else qpos, dtype=np.float64).reshape(
-        -1
-    )
+    on_cpu = qpos.detach().cpu() if isinstance(qpos, Tensor) else qpos
+    values = np.asarray(on_cpu, dtype=np.float64).reshape(-1)
     if values.shape != (NUM_JOINTS,):
         raise InvalidInputError(f"qpos must be {NUM_JOINTS} joint angles, got {values.size}")
     return values

@@ -43,14 +43,10 @@ class Proposal:
     """How many moves there were before."""
     visible_fraction: float
     """V_f now."""
-    joint_positions: Float64
-    """Where the arm would go, in [rad]. Shape (7,)."""
     turn: Float64
     """How far each joint would turn, in [rad]. Shape (7,)."""
     camera_step: float
     """How far the camera would move, in [m]."""
-    refusal: str | None
-    """Why `safety` would refuse it, if it would."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

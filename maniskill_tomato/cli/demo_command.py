@@ -4,7 +4,7 @@ import dataclasses
 from dataclasses import dataclass
 from pathlib import Path
 
-from maniskill_tomato.cli.early_checks import check_count
+from maniskill_tomato.cli.early_checks import check_counts
 from maniskill_tomato.cli.eval_command import summary
 from maniskill_tomato.cli.train_command import train
 from maniskill_tomato.errors import InvalidInputError
@@ -28,7 +28,7 @@ class Demo:
 
     def run(self) -> None:
         """Runs both parts and names the results."""
-        check_count("--episodes", self.episodes)
+        check_counts(episodes=self.episodes)
         if not self.minutes > 0:
             raise InvalidInputError(f"--minutes must be above 0, got {self.minutes:g}")
 

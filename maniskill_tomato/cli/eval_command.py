@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 from maniskill_tomato.cli.arguments import Flat
-from maniskill_tomato.cli.early_checks import check_count, check_env_id, check_policy
+from maniskill_tomato.cli.early_checks import check_counts, check_env_id, check_policy
 from maniskill_tomato.cli.shared_options import EnvId, PlantOptions
 from maniskill_tomato.policies.opening import shipped_policy
 
@@ -45,7 +45,7 @@ class Eval:
     def run(self) -> None:
         """Evaluates and says where the report is."""
         check_env_id(self.env_id)
-        check_count("--episodes", self.episodes)
+        check_counts(episodes=self.episodes)
         env_id = None if self.allow_other_task else self.env_id
         check_policy("--policy", self.policy or shipped_policy(self.env_id), env_id)
 

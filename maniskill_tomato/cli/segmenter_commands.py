@@ -8,7 +8,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
 from maniskill_tomato.cli.arguments import Flat
-from maniskill_tomato.cli.early_checks import check_count, check_file, check_place
+from maniskill_tomato.cli.early_checks import check_counts, check_file, check_place
+from maniskill_tomato.cli.shared_options import say
 from maniskill_tomato.errors import InvalidInputError
 from maniskill_tomato.segmentation.training.detector_presets import MASK_RCNN_PRESETS, YOLO_PRESET
 from maniskill_tomato.segmentation.training.light_config import LightTrainConfig
@@ -48,7 +49,7 @@ class ImageOptions:
             check_place("--validation", self.validation)
         if self.shares and len(self.shares) != len(self.data):
             raise InvalidInputError(f"--shares must be one for each folder of --data, got {len(self.shares)}")
-        check_count("--limit", self.limit)
+        check_counts(limit=self.limit)
 
     def read(self) -> "TrainingImages":
         """The images; what is left out is named on standard error."""
@@ -101,8 +102,7 @@ class TrainMaskRcnn(ImageOptions):
     def run(self) -> None:
         """Trains and says where the weights are."""
         self.check()
-        check_count("--epochs", self.epochs)
-        check_count("--steps-per-epoch", self.steps_per_epoch)
+        check_counts(epochs=self.epochs, steps_per_epoch=self.steps_per_epoch)
         preset = MASK_RCNN_PRESETS[self.preset]
         config = replace(
             preset,
@@ -137,7 +137,7 @@ class TrainYolo(ImageOptions):
     def run(self) -> None:
         """Trains and says where the weights are."""
         self.check()
-        check_count("--epochs", self.epochs)
+        check_counts(epochs=self.epochs)
 
         from maniskill_tomato.segmentation.training.training_run import run_yolo_training
         from maniskill_tomato.segmentation.yolo import stock_settings, thesis_settings
@@ -156,9 +156,7 @@ def _train(training: "ResumableTraining", out: Path) -> Path | None:
     from maniskill_tomato.segmentation.training.training_run import run_training
 
     with stop_on_signals() as request:
-        return run_training(
-            training, out, lambda line: print(line, flush=True), lambda: request.reason is not None
-        )
+        return run_training(training, out, say, lambda: request.reason is not None)
 
 
 def _tell_weights(train: Callable[[], Path | None]) -> None:

@@ -9,7 +9,7 @@ from typing import Annotated, Any
 import tyro
 
 from maniskill_tomato.cli.arguments import Flat
-from maniskill_tomato.cli.early_checks import check_count, check_env_id, check_file
+from maniskill_tomato.cli.early_checks import check_counts, check_env_id, check_file
 from maniskill_tomato.cli.shared_options import PlantOptions, merge_options
 from maniskill_tomato.errors import InvalidInputError, SeedsFailedError
 from maniskill_tomato.learning.rl.config_file import RunFile, parse_seeds, read_run_config, read_run_file
@@ -73,7 +73,7 @@ class Train:
                 f"give the task to train on, one of {', '.join(TASK_IDS)}, or --config FILE or --resume DIR"
             )
         check_env_id(env_id)
-        check_count("--jobs", self.jobs)
+        check_counts(jobs=self.jobs)
         if self.config.initial_policy is not None:
             check_file("--initial-policy", Path(self.config.initial_policy))
         if self.resume is not None:

@@ -65,7 +65,7 @@ class WarpScene:
         start_warp()
         self._device = device
         self._warp_device = str(wp.device_from_torch(str(device)))
-        self._camera: Any = kernels.Pinhole()
+        self._camera: Any = kernels.FieldOfView()
         self._camera.left = -intrinsics.cx / intrinsics.fx
         self._camera.top = -intrinsics.cy / intrinsics.fy
         self._camera.right = (intrinsics.width - intrinsics.cx) / intrinsics.fx

@@ -363,7 +363,7 @@ def test_the_command_calculates_from_a_folder_and_writes_file_and_picture(
         (["--views", "/nowhere"], "there is no folder /nowhere"),
         (["--views", "."], "no views.json"),
         (["--views", ".", "--square", "30"], "square_length must be"),
-        (["--profile", "mock", "--confirm", "--unattended"], "not both"),
+        (["--profile", "mock", "--confirm", "--unattended"], "exclude each other"),
     ],
 )
 def test_the_command_says_in_one_line_what_is_wrong(

@@ -451,7 +451,7 @@ def test_options_are_checked_when_the_profile_is_read() -> None:
     context = DriverContext(clock=MonotonicClock())
     for options, match in (
         ({"prot": 30001}, "arm.prot is unknown"),
-        ({"port": 0}, "port must be between"),
+        ({"port": 0}, "port must be from"),
         ({"torque_margin": [1.0, 2.0]}, "torque_margin must be 7 torques"),
         ({"torque_margin": [0.0] * 7}, "above 0"),
         ({"largest_segment": 0.0}, "largest_segment"),
