@@ -8,14 +8,11 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from maniskill_tomato.deploy.deploy_errors import FaultError
-from maniskill_tomato.deploy.interface import Float64
+from maniskill_tomato.deploy.interface import LIMIT_SLACK, Float64
 from maniskill_tomato.deploy.rigid import difference, transform
 from maniskill_tomato.deploy.sunrise.sunrise_config import SunriseConfig
 from maniskill_tomato.robot import iiwa14
 from maniskill_tomato.robot.kinematics import forward_kinematics
-
-LIMIT_SLACK: Final = math.radians(1.0)
-"""How far beyond a joint limit a reading may be, in [rad]."""
 
 SPEED_SLACK: Final = 1.2
 """Joints may seem this much faster than they can be: time stamps are not exact."""
