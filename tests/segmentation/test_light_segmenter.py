@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import torch
 from numpy.typing import NDArray
+from torchvision.ops import box_iou
 
 from maniskill_tomato.errors import CheckpointError, InvalidInputError
 from maniskill_tomato.segmentation.datasets.annotations import AnnotatedImage, Instance
@@ -33,7 +34,6 @@ from maniskill_tomato.segmentation.light_segmenter import (
     split_by_votes,
 )
 from maniskill_tomato.segmentation.masks import EncodedMask
-from maniskill_tomato.segmentation.metrics.detection_metrics import box_overlaps
 from maniskill_tomato.segmentation.training.augmentation import augmented
 from maniskill_tomato.segmentation.training.fruit_targets import fruit_losses, make_targets
 from maniskill_tomato.segmentation.training.light_training import LightTraining
@@ -424,7 +424,8 @@ def test_two_looks_at_one_image_are_joined_in_order_and_sizes_are_shared_out() -
     both = LightSegmenter(network, score_threshold=0.0, overlap_threshold=0.5)(image)
     fine = LightSegmenter(network, score_threshold=0.0, overlap_threshold=0.5, scales=(1.0,))(image)
     assert len(both) > 0 and (np.diff(both.scores) <= 0).all()
-    overlaps, _ = box_overlaps(both.boxes.astype(np.float64), both.boxes.astype(np.float64))
+    boxes = torch.from_numpy(both.boxes).double()
+    overlaps = box_iou(boxes, boxes).numpy()
     assert (overlaps - np.eye(len(both))).max() <= 0.5 + 1e-6
     # Small boxes can only come from the fine look.
     small = (both.boxes[:, 2:] - both.boxes[:, :2]).min(axis=1) < 60
