@@ -451,7 +451,11 @@ def square(size: int, left: float, side: float) -> TrainingPicture:
     )
 
 
-@pytest.mark.parametrize(("side", "found_at"), [(40, [20]), (120, [20, 400]), (240, [400])])
+# The fine look keeps fruits of up to 192 px, the coarse one those of 32 px or more in its image of half the size.
+@pytest.mark.parametrize(
+    ("side", "found_at"),
+    [(40, [20]), (60, [20]), (68, [20, 400]), (120, [20, 400]), (188, [20, 400]), (196, [400]), (240, [400])],
+)
 def test_fruits_too_large_for_the_fine_look_are_left_to_the_coarse_one_and_the_other_way_round(
     monkeypatch: pytest.MonkeyPatch, side: float, found_at: list[float]
 ) -> None:
