@@ -25,8 +25,8 @@ from maniskill_tomato.segmentation.fruit_network import (
     FruitNetwork,
     place_centres,
 )
-from maniskill_tomato.segmentation.fruit_session import FruitSession
 from maniskill_tomato.segmentation.light_segmenter import (
+    FruitSession,
     LightSegmenter,
     find_fruits,
     mirror,
