@@ -249,4 +249,4 @@ def mask_overlaps(a: NDArray[np.bool_], b: NDArray[np.bool_]) -> NDArray[np.floa
     flat_a, flat_b = (c.reshape(len(c), int(np.prod(c.shape[1:]))).astype(np.float32) for c in (a, b))
     shared = (flat_a @ flat_b.T).astype(np.float64)
     area_a, area_b = (c.sum(axis=1, dtype=np.float64) for c in (flat_a, flat_b))
-    return shared / np.maximum(area_a[:, None] + area_b[None] - shared, 1e-9)
+    return np.asarray(shared / np.maximum(area_a[:, None] + area_b[None] - shared, 1e-9))
