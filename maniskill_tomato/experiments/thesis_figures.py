@@ -29,7 +29,7 @@ from maniskill_tomato.rendering import vulkan_probe
 from maniskill_tomato.report_design import INK, MUTED, PLOT_STYLE, TOMATO
 from maniskill_tomato.robot.d435 import T_flange_camera_color_optical, color_intrinsics
 from maniskill_tomato.robot.kinematics import viewpoint_transform
-from maniskill_tomato.tasks.planting import grow
+from maniskill_tomato.tasks.plant_batch import grow
 from maniskill_tomato.tasks.thesis.thesis_config import ViewpointTaskConfig, guided_task, sparse_task
 
 THESIS_EPISODES = 6
