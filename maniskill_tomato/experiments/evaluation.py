@@ -17,7 +17,7 @@ from maniskill_tomato.experiments.configs import EvaluationConfig
 from maniskill_tomato.experiments.episode_record import EpisodeRecord
 from maniskill_tomato.experiments.evaluation_report import Picture, ReportInput, write_report
 from maniskill_tomato.experiments.metrics import make_metrics, write_json
-from maniskill_tomato.experiments.rollout import run_episodes
+from maniskill_tomato.experiments.rollout import open_widest, run_episodes
 from maniskill_tomato.experiments.training_runs import Run
 from maniskill_tomato.learning.rl.envs import make_env
 from maniskill_tomato.learning.rl.history import load_history
@@ -169,19 +169,26 @@ def _run(
     config: EvaluationConfig, found: str | Path
 ) -> tuple[list[EpisodeRecord], list[EpisodeRecord] | None, float, Policy]:
     """The policy's episodes, the baseline's if wanted, the task's threshold of V_f, and the policy."""
-    env = make_env(config.env_id, **config.env_options)
+    episodes, threshold, policy = _run_policy(config, found)
+    baseline = None
+    if config.baseline:
+        logger.info("the same episodes with random actions, to compare")
+        baseline = _run_policy(config, RANDOM)[0]
+    return episodes, baseline, threshold, policy
+
+
+def _run_policy(config: EvaluationConfig, found: str | Path) -> tuple[list[EpisodeRecord], float, Policy]:
+    def make(num_envs: int) -> tuple[gym.Env[Any, Any], Policy]:
+        env = make_env(config.env_id, num_envs, **config.env_options)
+        return env, _open(config, found, env)
+
+    env, policy = open_widest(make, min(config.num_envs, config.episodes))
     try:
         threshold = float(cast(Any, env.unwrapped).task.full_visibility)
-        policy = _open(config, found, env)
         episodes = run_episodes(env, policy, config.episodes, config.seed, config.show_progress)
-        baseline = None
-        if config.baseline:
-            logger.info("the same episodes with random actions, to compare")
-            random = _open(config, RANDOM, env)
-            baseline = run_episodes(env, random, config.episodes, config.seed, config.show_progress)
     finally:
         env.close()
-    return episodes, baseline, threshold, policy
+    return episodes, threshold, policy
 
 
 def _plot_episodes(

@@ -290,7 +290,7 @@ def test_without_vulkan_an_evaluation_still_reports_and_names_the_remedy(
     class Task(SeededTask):
         task = SimpleNamespace(full_visibility=0.85)
 
-    monkeypatch.setattr(evaluation, "make_env", lambda env_id, **options: Task(1))
+    monkeypatch.setattr(evaluation, "make_env", lambda env_id, num_envs, **options: Task(1))
     monkeypatch.setattr(evaluation, "find_policy", lambda policy, env_id: "forward")
     monkeypatch.setattr(evaluation, "open_policy", lambda policy, **options: as_policy(Forward()))
     monkeypatch.setattr("maniskill_tomato.rendering.vulkan_probe.rendering_available", lambda: False)
