@@ -197,7 +197,7 @@ def _plot_episodes(
     out = config.out
     plots.plot_steps(episodes, out / "steps.png")
     plots.plot_visible_fraction(episodes, threshold, out / "visible_fraction.png")
-    plots.plot_trajectories(episodes, out / "trajectories.png")
+    plots.plot_trajectories(episodes, "the first episodes", out / "trajectories.png")
     return [
         Picture(path=out / "steps.png", caption="Steps that each episode took (thesis Fig. 5-6)."),
         Picture(
@@ -206,8 +206,8 @@ def _plot_episodes(
         ),
         Picture(
             path=out / "trajectories.png",
-            caption="Way of the end-effector in the first episodes, with the viewing direction at the first, "
-            "middle and last pose (thesis Fig. 5-8).",
+            caption="Way of the end-effector in the first episodes, with the camera at the first, middle and last pose "
+            "(thesis Fig. 5-8).",
         ),
     ]
 
