@@ -16,9 +16,10 @@ from maniskill_tomato.experiments import plots
 from maniskill_tomato.experiments.configs import EvaluationConfig
 from maniskill_tomato.experiments.episode_record import EpisodeRecord
 from maniskill_tomato.experiments.evaluation_report import Picture, ReportInput, write_report
-from maniskill_tomato.experiments.metrics import make_metrics, write_json
+from maniskill_tomato.experiments.metrics import make_metrics
 from maniskill_tomato.experiments.rollout import open_widest, run_episodes
 from maniskill_tomato.experiments.training_runs import Run
+from maniskill_tomato.files import write_json
 from maniskill_tomato.learning.rl.envs import make_env
 from maniskill_tomato.learning.rl.history import load_history
 from maniskill_tomato.policies.adapters import origin

@@ -13,11 +13,12 @@ from torch import Tensor
 
 from maniskill_tomato.errors import SeedsFailedError, TomatoError
 from maniskill_tomato.experiments.episode_record import EpisodeRecord
-from maniskill_tomato.experiments.metrics import make_metrics, summarise, totals, write_json
+from maniskill_tomato.experiments.metrics import make_metrics, summarise, totals
 from maniskill_tomato.experiments.plots import moving_average
 from maniskill_tomato.experiments.result_store import ResultStore
 from maniskill_tomato.experiments.rollout import run_episode
 from maniskill_tomato.experiments.variants import Evaluation, Variant
+from maniskill_tomato.files import write_json
 from maniskill_tomato.learning.rl.envs import LearnerEnv, make_env
 from maniskill_tomato.learning.rl.history import TrainingCurves, load_history
 from maniskill_tomato.learning.rl.presets import TrainConfig

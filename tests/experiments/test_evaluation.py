@@ -20,7 +20,7 @@ from maniskill_tomato.experiments.configs import EvaluationConfig
 from maniskill_tomato.experiments.episode_record import EpisodeRecord
 from maniskill_tomato.experiments.evaluation import write_trajectories
 from maniskill_tomato.experiments.evaluation_report import Picture, ReportInput, write_report
-from maniskill_tomato.experiments.metrics import make_metrics, summarise, write_json
+from maniskill_tomato.experiments.metrics import make_metrics, summarise
 from maniskill_tomato.experiments.plots import (
     default_windows,
     moving_average,
@@ -30,6 +30,7 @@ from maniskill_tomato.experiments.plots import (
     plot_visible_fraction,
 )
 from maniskill_tomato.experiments.rollout import run_episodes
+from maniskill_tomato.files import write_json
 from maniskill_tomato.learning.rl.history import TrainingHistory, load_history
 from maniskill_tomato.policies.adapters import as_policy
 

@@ -9,8 +9,7 @@ from torch import Tensor, nn
 
 from maniskill_tomato.errors import CheckpointError
 from maniskill_tomato.learning.rl.auxiliary import AuxiliaryHeads
-from maniskill_tomato.learning.rl.categorical import CategoricalCritic, project
-from maniskill_tomato.learning.rl.critic import Critic
+from maniskill_tomato.learning.rl.critic import CategoricalCritic, Critic, project
 from maniskill_tomato.learning.rl.presets import OBSERVATION_CENTRE, OBSERVATION_HALF_RANGE, TrainConfig
 from maniskill_tomato.learning.rl.replay import Batch
 from maniskill_tomato.learning.rl.running_statistics import RunningStatistics

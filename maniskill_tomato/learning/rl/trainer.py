@@ -14,9 +14,10 @@ import torch
 from torch import Tensor
 
 from maniskill_tomato.errors import CheckpointError, InvalidInputError, TrainingDivergedError
+from maniskill_tomato.files import write_tensors
 from maniskill_tomato.learning.interrupt import StopRequest, stop_on_signals
 from maniskill_tomato.learning.rl.agent import begin_with, check_fits, update
-from maniskill_tomato.learning.rl.checkpoint import make_checkpoint, save_checkpoint
+from maniskill_tomato.learning.rl.checkpoint import make_checkpoint
 from maniskill_tomato.learning.rl.envs import LearnerEnv
 from maniskill_tomato.learning.rl.presets import TrainConfig
 from maniskill_tomato.learning.rl.progress import Progress, TrainingLog
@@ -325,7 +326,7 @@ class Trainer:
             run=state.run_state(self._log.state_dict()),
             env_options=self._env_options,
         )
-        save_checkpoint(checkpoint_path(self._run_dir, state.step), data)
+        write_tensors(checkpoint_path(self._run_dir, state.step), data)
         for old in checkpoints(self._run_dir)[: -self._config.checkpoints_kept]:
             old.unlink()
         state.history.save(self._run_dir)
@@ -344,5 +345,5 @@ class Trainer:
             with_training_state=False,
             env_options=self._env_options,
         )
-        save_checkpoint(path, data)
+        write_tensors(path, data)
         return path
