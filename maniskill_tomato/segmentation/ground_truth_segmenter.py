@@ -33,10 +33,3 @@ class GroundTruthSegmenter:
         present = [number for number in np.unique(labels).tolist() if number in self.categories]
         masks = labels[None] == np.array(present, labels.dtype)[:, None, None]
         return Instances.from_masks(masks, categories=tuple(self.categories[n] for n in present))
-
-
-def open_ground_truth(
-    labels: Callable[[], NDArray[np.integer]], categories: Mapping[int, str]
-) -> GroundTruthSegmenter:
-    """Opens it; see `GroundTruthSegmenter`."""
-    return GroundTruthSegmenter(labels, categories)

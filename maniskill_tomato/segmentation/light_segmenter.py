@@ -1,5 +1,6 @@
 """The light segmenter that ships: one small network, boxes, masks, ripeness and whole boxes in one pass on a CPU."""
 
+from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +13,7 @@ from torchvision.ops import nms
 
 from maniskill_tomato.assets import asset_path
 from maniskill_tomato.errors import CheckpointError, InvalidInputError
+from maniskill_tomato.segmentation.detector_configs import FruitNetworkConfig
 from maniskill_tomato.segmentation.fruit_network import (
     SIZE_MULTIPLE,
     STRIDE,
@@ -19,7 +21,6 @@ from maniskill_tomato.segmentation.fruit_network import (
     FruitNetwork,
     place_centres,
 )
-from maniskill_tomato.segmentation.fruit_network_config import FruitNetworkConfig
 from maniskill_tomato.segmentation.fruit_session import FruitSession
 from maniskill_tomato.segmentation.instances import (
     FRUIT_CATEGORIES,
@@ -189,15 +190,8 @@ def full_maps(
     return (both[0, 0] > 0).numpy(), (both[0, 1:] * scale[:, None, None]).numpy()
 
 
-def open_light(
-    weights: Path | str | None = None,
-    score_threshold: float = 0.3,
-    overlap_threshold: float = 0.55,
-    longest_side: int = 640,
-    scales: tuple[float, ...] = (1.0, 0.5),
-    mirrored: bool = False,
-) -> LightSegmenter:
-    """Opens the shipped weights, or those in a file.
+def open_light(weights: Path | str | None = None, **options: Any) -> LightSegmenter:
+    """Opens the shipped weights, or those in a file, with the options of `LightSegmenter`.
 
     Raises:
         CheckpointError: The file is missing, damaged or of something else.
@@ -211,16 +205,14 @@ def open_light(
         ) from error
     data = load_weights(path, "light")
     try:
-        network = FruitNetwork(FruitNetworkConfig.from_dict(data["config"]))
+        sizes = {field.name: data["config"][field.name] for field in fields(FruitNetworkConfig)}
+        network = FruitNetwork(FruitNetworkConfig(**sizes))
         network.load_state_dict(data["state"])
-    except (TypeError, RuntimeError) as error:
+    except (KeyError, TypeError, RuntimeError) as error:
         raise CheckpointError(
             f"{path} does not fit this version's network ({str(error).splitlines()[0]})"
         ) from error
-    boxes_only = bool(data["training"].get("boxes_only", False))
-    return LightSegmenter(
-        network, boxes_only, score_threshold, overlap_threshold, longest_side, scales, mirrored
-    )
+    return LightSegmenter(network, bool(data["training"].get("boxes_only", False)), **options)
 
 
 def find_fruits(maps: FruitMaps, score_threshold: float, overlap_threshold: float) -> dict[str, Tensor]:

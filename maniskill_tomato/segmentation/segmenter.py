@@ -13,12 +13,12 @@ from maniskill_tomato.segmentation.instances import Image, Instances
 
 SEGMENTERS = {
     "light": "maniskill_tomato.segmentation.light_segmenter:open_light",
-    "colour": "maniskill_tomato.segmentation.colour_segmenter:open_colour",
-    "ground_truth": "maniskill_tomato.segmentation.ground_truth_segmenter:open_ground_truth",
+    "colour": "maniskill_tomato.segmentation.colour_segmenter:ColourSegmenter",
+    "ground_truth": "maniskill_tomato.segmentation.ground_truth_segmenter:GroundTruthSegmenter",
     "mask_rcnn": "maniskill_tomato.segmentation.mask_rcnn:open_mask_rcnn",
     "yolo": "maniskill_tomato.segmentation.yolo:open_yolo",
 }
-"""Name of each kind of segmenter, and the function that opens it."""
+"""Name of each kind of segmenter, and what opens it."""
 
 DEFAULT_SEGMENTER = "light"
 
@@ -63,8 +63,8 @@ def make_segmenter(name_or_path: str | Path = DEFAULT_SEGMENTER, **options: Any)
         name = read_kind(path)
         if name not in SEGMENTERS:
             raise CheckpointError(f"{path} is for a segmenter {name!r}, which this version does not know")
-    module, function = SEGMENTERS[name].split(":")
-    opener = cast(Callable[..., Segmenter], getattr(importlib.import_module(module), function))
+    module, opens = SEGMENTERS[name].split(":")
+    opener = cast(Callable[..., Segmenter], getattr(importlib.import_module(module), opens))
     try:
         return opener(**options)
     except TypeError as error:
