@@ -105,5 +105,5 @@ def _descend(
         if step % 500 == 0 or step == config.steps:
             report(step, sum(recent) / len(recent))
 
-    descend(actor, loss, config.steps, config.learning_rate, config.weight_decay, tell)
+    descend(actor, loss, config, tell)
     return sum(recent) / len(recent)

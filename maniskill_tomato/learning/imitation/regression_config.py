@@ -3,6 +3,7 @@
 from dataclasses import dataclass
 
 from maniskill_tomato.errors import InvalidInputError
+from maniskill_tomato.learning.round_config import check_counts
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -20,9 +21,7 @@ class RegressionConfig:
     seed: int = 0
 
     def __post_init__(self) -> None:
-        for name in ("epochs", "batch_size"):
-            if getattr(self, name) < 1:
-                raise InvalidInputError(f"{name} must be at least 1, got {getattr(self, name)}")
+        check_counts(self, "epochs", "batch_size")
         if not 0.0 < self.validation_share < 1.0:
             raise InvalidInputError(f"validation_share must lie in (0, 1), got {self.validation_share}")
         if not self.learning_rate > 0.0:

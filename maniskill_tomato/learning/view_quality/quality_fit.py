@@ -96,7 +96,7 @@ def fit(
                 values |= {f"validation_{name}": value for name, value in judged.items()}
             report(step, {**values, "seconds": time.perf_counter() - start})
 
-    descend(network, loss, config.steps, config.learning_rate, config.weight_decay, tell)
+    descend(network, loss, config, tell)
     return network
 
 
