@@ -33,7 +33,7 @@ class Demo:
 
         from maniskill_tomato.experiments.configs import EvaluationConfig
         from maniskill_tomato.experiments.evaluation import evaluate
-        from maniskill_tomato.learning.rl.run import train
+        from maniskill_tomato.learning.rl.trainer import train
 
         env_id = "TomatoViewpointGuided-v1"
         print(f"1/2 training on {env_id}, at most {self.minutes:g} minutes")

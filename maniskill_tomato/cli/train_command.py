@@ -88,7 +88,7 @@ class Train:
         if seeds:
             self._run_seeds(env_id, out, seeds, env_options)
             return
-        from maniskill_tomato.learning.rl.run import train
+        from maniskill_tomato.learning.rl.trainer import train
 
         result = train(
             env_id,

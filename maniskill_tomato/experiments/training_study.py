@@ -22,9 +22,8 @@ from maniskill_tomato.files import write_json
 from maniskill_tomato.learning.rl.envs import LearnerEnv, make_env
 from maniskill_tomato.learning.rl.history import TrainingCurves, load_history
 from maniskill_tomato.learning.rl.presets import TrainConfig
-from maniskill_tomato.learning.rl.run import make_training_env
 from maniskill_tomato.learning.rl.run_folder import clear_run
-from maniskill_tomato.learning.rl.trainer import Trainer
+from maniskill_tomato.learning.rl.trainer import Trainer, make_training_env
 from maniskill_tomato.policies.trained_actor import TrainedActor, load_actor
 from maniskill_tomato.robot.inverse_kinematics import Reach
 from maniskill_tomato.tasks import THESIS_IDS

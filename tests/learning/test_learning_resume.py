@@ -530,7 +530,7 @@ def start(*arguments: str) -> Any:
     """The command in a process of its own, forked from one that has loaded the simulator already."""
     context = multiprocessing.get_context("forkserver")
     context.set_forkserver_preload(
-        ["maniskill_tomato.cli", "maniskill_tomato.learning.rl.run", "maniskill_tomato.tasks.vector_env"]
+        ["maniskill_tomato.cli", "maniskill_tomato.learning.rl.trainer", "maniskill_tomato.tasks.vector_env"]
     )
     process = context.Process(target=cli.main, args=(list(arguments),))
     process.start()

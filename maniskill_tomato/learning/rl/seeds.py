@@ -24,9 +24,8 @@ from maniskill_tomato.files import write_json
 from maniskill_tomato.learning.interrupt import stop_on_signals
 from maniskill_tomato.learning.rl.presets import TrainConfig
 from maniskill_tomato.learning.rl.progress import Progress
-from maniskill_tomato.learning.rl.run import train
 from maniskill_tomato.learning.rl.run_folder import LOG_NAME, check_run_dir, clear_run
-from maniskill_tomato.learning.rl.trainer import TrainResult
+from maniskill_tomato.learning.rl.trainer import TrainResult, train
 from maniskill_tomato.worker_pool import start_process
 
 logger = logging.getLogger(__name__)
