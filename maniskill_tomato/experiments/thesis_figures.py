@@ -29,7 +29,7 @@ from maniskill_tomato.plants.organs import SemanticClass
 from maniskill_tomato.plants.spec import PlantPose, PlantSpec
 from maniskill_tomato.rendering import vulkan_probe
 from maniskill_tomato.report_design import INK, MUTED, PLOT_STYLE, TOMATO
-from maniskill_tomato.tasks.planting import grow
+from maniskill_tomato.tasks.plant_batch import grow
 from maniskill_tomato.tasks.thesis.thesis_config import ViewpointTaskConfig, guided_task, sparse_task
 
 THESIS_EPISODES = 6

@@ -224,13 +224,13 @@ def test_target_differs_by_episode_and_is_a_ripe_fruit(sparse: Any) -> None:
     for seed in range(60):
         sparse.reset(seed=seed)
         targets.append(int(base.target_fruit[0]))
-    assert set(targets) == set(base.planting.ripe_fruits[0]) and len(set(targets)) == 3
+    assert set(targets) == set(base.plant_batch.ripe_fruits[0]) and len(set(targets)) == 3
     assert min(targets.count(t) for t in set(targets)) >= 8
 
 
 def test_target_can_be_chosen_at_reset(sparse: Any) -> None:
     ids = set()
-    for target in sparse.unwrapped.planting.ripe_fruits[0]:
+    for target in sparse.unwrapped.plant_batch.ripe_fruits[0]:
         _, info = sparse.reset(seed=0, options={"target": target})
         assert int(sparse.unwrapped.target_fruit[0]) == target
         ids.add(int(info["target_id"]))
