@@ -7,7 +7,7 @@ from typing import Annotated
 from maniskill_tomato.cli.arguments import Flat
 from maniskill_tomato.cli.early_checks import check_count
 from maniskill_tomato.cli.shared_options import tell_policy
-from maniskill_tomato.learning.imitation.regression_config import RegressionConfig
+from maniskill_tomato.learning.imitation.imitation_config import RegressionConfig
 
 
 @dataclass(frozen=True, kw_only=True)
