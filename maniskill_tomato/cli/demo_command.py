@@ -6,7 +6,6 @@ from pathlib import Path
 
 from maniskill_tomato.cli.early_checks import check_counts
 from maniskill_tomato.cli.eval_command import summary
-from maniskill_tomato.cli.train_command import train
 from maniskill_tomato.errors import InvalidInputError
 from maniskill_tomato.learning.rl.presets import PRESETS
 
@@ -34,6 +33,7 @@ class Demo:
 
         from maniskill_tomato.experiments.configs import EvaluationConfig
         from maniskill_tomato.experiments.evaluation import evaluate
+        from maniskill_tomato.learning.rl.trainer import train
 
         env_id = "TomatoViewpointGuided-v1"
         print(f"1/2 training on {env_id}, at most {self.minutes:g} minutes")

@@ -11,8 +11,7 @@ from maniskill_tomato.cli.arguments import Flat
 from maniskill_tomato.cli.early_checks import check_counts, check_env_id, check_file, check_policy
 from maniskill_tomato.cli.shared_options import EnvId, parse_env_options, tell_policy
 from maniskill_tomato.errors import InvalidInputError
-from maniskill_tomato.learning.imitation.imitation_config import ImitationConfig
-from maniskill_tomato.learning.imitation.regression_config import RegressionConfig
+from maniskill_tomato.learning.imitation.imitation_config import ImitationConfig, RegressionConfig
 from maniskill_tomato.learning.rl.ppo_config import PpoConfig, default_ppo
 from maniskill_tomato.learning.view_quality.quality_config import QualityTrainConfig
 from maniskill_tomato.policies.opening import shipped_policy

@@ -16,9 +16,10 @@ from maniskill_tomato.experiments import plots
 from maniskill_tomato.experiments.configs import EvaluationConfig
 from maniskill_tomato.experiments.episode_record import EpisodeRecord
 from maniskill_tomato.experiments.evaluation_report import ReportInput, ReportPicture, write_report
-from maniskill_tomato.experiments.metrics import make_metrics, write_json
-from maniskill_tomato.experiments.rollout import run_episodes
+from maniskill_tomato.experiments.metrics import make_metrics
+from maniskill_tomato.experiments.rollout import open_widest, run_episodes
 from maniskill_tomato.experiments.training_runs import Run
+from maniskill_tomato.files import write_json
 from maniskill_tomato.learning.rl.envs import make_env
 from maniskill_tomato.learning.rl.history import load_history
 from maniskill_tomato.policies.adapters import origin
@@ -169,19 +170,26 @@ def _run(
     config: EvaluationConfig, found: str | Path
 ) -> tuple[list[EpisodeRecord], list[EpisodeRecord] | None, float, Policy]:
     """The policy's episodes, the baseline's if wanted, the task's threshold of V_f, and the policy."""
-    env = make_env(config.env_id, **config.env_options)
+    episodes, threshold, policy = _run_policy(config, found)
+    baseline = None
+    if config.baseline:
+        logger.info("the same episodes with random actions, to compare")
+        baseline = _run_policy(config, RANDOM)[0]
+    return episodes, baseline, threshold, policy
+
+
+def _run_policy(config: EvaluationConfig, found: str | Path) -> tuple[list[EpisodeRecord], float, Policy]:
+    def make(num_envs: int) -> tuple[gym.Env[Any, Any], Policy]:
+        env = make_env(config.env_id, num_envs, **config.env_options)
+        return env, _open(config, found, env)
+
+    env, policy = open_widest(make, min(config.num_envs, config.episodes))
     try:
         threshold = float(cast(Any, env.unwrapped).task.full_visibility)
-        policy = _open(config, found, env)
         episodes = run_episodes(env, policy, config.episodes, config.seed, config.show_progress)
-        baseline = None
-        if config.baseline:
-            logger.info("the same episodes with random actions, to compare")
-            random = _open(config, RANDOM, env)
-            baseline = run_episodes(env, random, config.episodes, config.seed, config.show_progress)
     finally:
         env.close()
-    return episodes, baseline, threshold, policy
+    return episodes, threshold, policy
 
 
 def _plot_episodes(
@@ -190,7 +198,7 @@ def _plot_episodes(
     out = config.out
     plots.plot_steps(episodes, out / "steps.png")
     plots.plot_visible_fraction(episodes, threshold, out / "visible_fraction.png")
-    plots.plot_trajectories(episodes, out / "trajectories.png")
+    plots.plot_trajectories(episodes, "the first episodes", out / "trajectories.png")
     return [
         ReportPicture(path=out / "steps.png", caption="Steps that each episode took (thesis Fig. 5-6)."),
         ReportPicture(
@@ -199,8 +207,8 @@ def _plot_episodes(
         ),
         ReportPicture(
             path=out / "trajectories.png",
-            caption="Way of the end-effector in the first episodes, with the viewing direction at the first, "
-            "middle and last pose (thesis Fig. 5-8).",
+            caption="Way of the end-effector in the first episodes, with the camera at the first, middle and last pose "
+            "(thesis Fig. 5-8).",
         ),
     ]
 

@@ -103,10 +103,10 @@ class EncodedMask:
 
     def decode(self) -> BinaryMask:
         """The mask. Shape (height, width)."""
-        from pycocotools import mask as coco_mask
-
-        coded: Any = self._coded()
-        return np.asarray(coco_mask.decode(coded), dtype=bool)
+        # pycocotools decodes in a way that NumPy 2 has deprecated.
+        runs = _run_lengths(self.counts)
+        inside = np.arange(len(runs)) % 2 == 1
+        return np.asarray(np.repeat(inside, runs).reshape(self.width, self.height).T)
 
     @property
     def area(self) -> int:

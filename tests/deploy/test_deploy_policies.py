@@ -20,8 +20,9 @@ from maniskill_tomato.deploy.run_replay import load_recording
 from maniskill_tomato.deploy.stops import Stops
 from maniskill_tomato.deploy.workcell import make_workcell
 from maniskill_tomato.errors import PolicyError
+from maniskill_tomato.files import write_tensors
 from maniskill_tomato.learning.rl.agent import make_agent
-from maniskill_tomato.learning.rl.checkpoint import make_checkpoint, save_checkpoint
+from maniskill_tomato.learning.rl.checkpoint import make_checkpoint
 from maniskill_tomato.learning.rl.export import export_policy
 from maniskill_tomato.learning.rl.presets import get_preset
 from maniskill_tomato.policies.opening import open_policy
@@ -55,7 +56,7 @@ def saved(path: Path, bound: float = 1.0) -> Path:
         agent.actor.output.weight *= 10.0
         agent.actor.output.bias[:] = torch.tensor([0.6, 0.8, 0.5])
     bounds = (-bound * torch.ones(3), bound * torch.ones(3))
-    save_checkpoint(path, make_checkpoint(agent, TASK, bounds, {"steps": 1, "episodes": 1, "seed": 3}))
+    write_tensors(path, make_checkpoint(agent, TASK, bounds, {"steps": 1, "episodes": 1, "seed": 3}))
     return path
 
 
