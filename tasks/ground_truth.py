@@ -12,7 +12,7 @@ from maniskill_tomato.tasks.plant_batch import PlantBatch
 from maniskill_tomato.tasks.world_state import WorldState
 
 
-class GroundTruth:
+class WorldTruth:
     """Asks the plants themselves: the `policies.protocol.GroundTruth` of a world."""
 
     def __init__(self, scene: RayScene, plant_batch: PlantBatch, state: WorldState, threshold: float) -> None:

@@ -22,7 +22,7 @@ from maniskill_tomato.robot.robot_description import link_meshes
 from maniskill_tomato.robot.viewpoint_move import viewpoint_of
 from maniskill_tomato.sensing.belief import Belief
 from maniskill_tomato.tasks.arm_moves import ACTION_SIZES, ArmMoves, Plan
-from maniskill_tomato.tasks.ground_truth import GroundTruth
+from maniskill_tomato.tasks.ground_truth import WorldTruth
 from maniskill_tomato.tasks.numpy_streams import (
     random_state,
     set_random_state,
@@ -188,7 +188,7 @@ class World:
         """Poses of the cameras' optical frames. Shape (N, 4, 4)."""
         self.place_arms()
         self.game = make_game(self)
-        self.ground_truth = GroundTruth(
+        self.ground_truth = WorldTruth(
             self.scene, self.plant_batch, self.state, float(self.task.full_visibility)
         )
         """What only a simulator knows; for policies that need the truth."""

@@ -22,7 +22,7 @@ from maniskill_tomato.sensing.belief import Belief
 from maniskill_tomato.sensing.observation import ObservationLayout
 from maniskill_tomato.sensing.simulated_camera import RENDERED_SIZE
 from maniskill_tomato.tasks.arm_moves import Plan
-from maniskill_tomato.tasks.ground_truth import GroundTruth
+from maniskill_tomato.tasks.ground_truth import WorldTruth
 from maniskill_tomato.tasks.making import check_choice, default_control, make_setup, option_names
 from maniskill_tomato.tasks.maniskill import scenery, shell_options
 from maniskill_tomato.tasks.maniskill.controllers import CONTROL_MODES
@@ -314,7 +314,7 @@ class TomatoEnv(BaseEnv):  # type: ignore[misc]
         return self.world.plant_batch
 
     @property
-    def ground_truth(self) -> GroundTruth:
+    def ground_truth(self) -> WorldTruth:
         """What only the simulator knows; for planners that need the truth."""
         return self.world.ground_truth
 

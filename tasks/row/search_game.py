@@ -14,6 +14,7 @@ from maniskill_tomato.plants.episode_list import Episode
 from maniskill_tomato.plants.row import Row
 from maniskill_tomato.robot.kinematics import link_transforms
 from maniskill_tomato.robot.look_at import camera_to_viewpoint
+from maniskill_tomato.robot.rotations import FORWARD_RPY
 from maniskill_tomato.robot.transit import TRANSIT_MOVES
 from maniskill_tomato.sensing.belief import Belief
 from maniskill_tomato.sensing.observation import ObservationLayout, ViewpointObserver
@@ -28,9 +29,6 @@ from maniskill_tomato.tasks.row.senses import ViewMeasurement, ViewPoses, make_s
 from maniskill_tomato.tasks.row.target_sequence import TargetSequence, Transits, with_transits
 from maniskill_tomato.tasks.world import World
 from maniskill_tomato.tasks.world_state import MAX_VIEWS
-
-START_RPY = (0.0, torch.pi / 2, 0.0)
-"""The angles that those of a first view are near to, in [rad]: along +x, upright."""
 
 
 class SearchGame:
@@ -114,7 +112,7 @@ class SearchGame:
         self.soft_starts += sum(not start.is_hard for start in starts)
         world.set_target(env_idx, [start.target for start in starts])
         poses = torch.stack([start.T_world_camera for start in starts]).double()
-        near = torch.tensor([START_RPY], dtype=torch.float64, device=world.device).expand(len(starts), 3)
+        near = torch.tensor([FORWARD_RPY], dtype=torch.float64, device=world.device).expand(len(starts), 3)
         viewpoint = camera_to_viewpoint(poses, near).float()
         world.set_arm(env_idx, torch.stack([start.qpos for start in starts]), viewpoint)
         for i, rng, start in zip(indices, rngs, starts, strict=True):

@@ -10,13 +10,12 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from maniskill_tomato.deploy.clock import SimulatedClock
-from maniskill_tomato.deploy.collision import CollisionChecker
+from maniskill_tomato.deploy.collision import Box, CollisionChecker
 from maniskill_tomato.deploy.deploy_errors import DeviceTimeoutError, FaultError, RefusedError
 from maniskill_tomato.deploy.guarded_arm import GuardedArm
 from maniskill_tomato.deploy.interface import Arm, ArmState, JointMove
 from maniskill_tomato.deploy.plant_points import sphere_distances
-from maniskill_tomato.deploy.safety import Safety, joint_path
-from maniskill_tomato.deploy.safety_config import Box, SafetyConfig
+from maniskill_tomato.deploy.safety import Safety, SafetyConfig, joint_path
 from maniskill_tomato.errors import InvalidInputError
 from maniskill_tomato.robot.d435 import T_flange_camera_color_optical
 from maniskill_tomato.robot.iiwa14 import JOINT_AXES, JOINT_ORIGINS, JOINT_UPPER, READY_QPOS
