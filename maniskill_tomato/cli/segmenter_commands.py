@@ -8,7 +8,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from maniskill_tomato.cli.arguments import Flat
-from maniskill_tomato.cli.early_checks import check_count, check_file, check_place
+from maniskill_tomato.cli.early_checks import check_counts, check_file, check_place
+from maniskill_tomato.cli.shared_options import say
 from maniskill_tomato.errors import InvalidInputError
 from maniskill_tomato.segmentation.detector_configs import MASK_RCNN_PRESETS, LightTrainConfig
 
@@ -48,7 +49,7 @@ class ImageOptions:
             check_place("--validation", self.validation)
         if self.shares and len(self.shares) != len(self.data):
             raise InvalidInputError(f"--shares must be one for each folder of --data, got {len(self.shares)}")
-        check_count("--limit", self.limit)
+        check_counts(limit=self.limit)
 
     def read(self) -> "TrainingImages":
         """The images; what is left out is named on standard error."""
@@ -106,8 +107,7 @@ class TrainMaskRcnn(ImageOptions):
     def run(self) -> None:
         """Trains and says where the weights are."""
         self.check()
-        check_count("--epochs", self.epochs)
-        check_count("--steps-per-epoch", self.steps_per_epoch)
+        check_counts(epochs=self.epochs, steps_per_epoch=self.steps_per_epoch)
         preset = MASK_RCNN_PRESETS[self.preset]
         config = replace(
             preset,
@@ -138,7 +138,7 @@ class TrainYolo(ImageOptions):
     def run(self) -> None:
         """Trains and says where the weights are."""
         self.check()
-        check_count("--epochs", self.epochs)
+        check_counts(epochs=self.epochs)
 
         from maniskill_tomato.segmentation.training.yolo_training import YOLO_SETTINGS, train_yolo
 
@@ -153,7 +153,7 @@ def _train(training: "DetectorTraining[Any]", out: Path) -> Path | None:
     from maniskill_tomato.segmentation.metrics.detection_plots import plot_losses
 
     with stop_on_signals() as request:
-        path = training.run(out, lambda line: print(line, flush=True), lambda: request.reason is not None)
+        path = training.run(out, say, lambda: request.reason is not None)
     if training.history:
         plot_losses({out.name: training.history}, out / "losses.png")
     return path

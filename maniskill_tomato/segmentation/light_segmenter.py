@@ -1,10 +1,13 @@
 """The light segmenter that ships: one small network, boxes, masks, ripeness and whole boxes in one pass on a CPU."""
 
+import warnings
 from dataclasses import fields
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
+import onnxruntime
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
@@ -21,7 +24,6 @@ from maniskill_tomato.segmentation.fruit_network import (
     FruitNetwork,
     place_centres,
 )
-from maniskill_tomato.segmentation.fruit_session import FruitSession
 from maniskill_tomato.segmentation.instances import (
     FRUIT_CATEGORIES,
     TOMATO,
@@ -48,6 +50,45 @@ COARSE_SIDES = (32.0, 192.0)
 
 Fruits with a side longer than the second bound are taken from the next smaller size instead. At that size fruits with a
 side shorter than the first bound are left out."""
+
+
+class FruitSession:
+    """A trained `FruitNetwork` in ONNX Runtime, for looking at one image at a time.
+
+    On one core it is 1.8 times as quick as in PyTorch, where convolutions of single channels are slow.
+    """
+
+    def __init__(self, network: FruitNetwork) -> None:
+        """Translates the network as it is now; it uses as many threads as PyTorch does.
+
+        Args:
+            network: It is set to evaluation mode.
+        """
+        network = network.eval().requires_grad_(False)
+        example = torch.zeros(1, 3, 2 * SIZE_MULTIPLE, 2 * SIZE_MULTIPLE)
+        with warnings.catch_warnings(), TemporaryDirectory() as folder:
+            path = Path(folder) / "fruit.onnx"
+            # The exporter by tracing is called old; the new one would need two more packages.
+            warnings.simplefilter("ignore")
+            torch.onnx.export(
+                network,
+                (example,),
+                path,
+                dynamo=False,
+                input_names=["image"],
+                output_names=list(FruitMaps._fields),
+                dynamic_axes={"image": {2: "height", 3: "width"}},
+            )
+            translated = path.read_bytes()
+        options = onnxruntime.SessionOptions()
+        options.intra_op_num_threads = torch.get_num_threads()
+        options.log_severity_level = 3
+        self._session = onnxruntime.InferenceSession(translated, options, providers=["CPUExecutionProvider"])
+
+    def __call__(self, image: Tensor) -> FruitMaps:
+        """The maps for one image of colours from 0 to 255. Shape (1, 3, H, W), multiples of `SIZE_MULTIPLE`."""
+        outputs = self._session.run(None, {"image": image.contiguous().numpy()})
+        return FruitMaps(*(torch.from_numpy(output) for output in outputs))
 
 
 class LightSegmenter:

@@ -9,11 +9,14 @@ from typing import Protocol
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
+from maniskill_tomato.errors import InvalidInputError
 from maniskill_tomato.raycast.view_rays import ViewRays
 from maniskill_tomato.sensing.observation import ViewpointObserver
 from maniskill_tomato.sensing.sensor_noise import SensorErrors, SensorNoise
+from maniskill_tomato.sensing.simulated_camera import COARSE_POSITION, RENDERED, Perception, make_camera
 from maniskill_tomato.tasks.world import World
 from maniskill_tomato.tasks.world_state import NOISE_SEEDS
 
@@ -22,7 +25,7 @@ VIEWS_A_SEED = 256
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class Sight:
+class ViewMeasurement:
     """What N environments sense in a view."""
 
     rays: ViewRays
@@ -36,11 +39,11 @@ class Sight:
     tomato_seen: Tensor
     """Whether any ripe tomato is in view. Shape (N,), bool."""
 
-    def where(self, mask: Tensor, other: "Sight") -> "Sight":
-        """This sight where `mask` is True, else the other one. Shape (N,), bool."""
+    def where(self, mask: Tensor, other: "ViewMeasurement") -> "ViewMeasurement":
+        """This where `mask` is True, else the other one. Shape (N,), bool."""
         column = mask[:, None]
         mine, others = self.rays, other.rays
-        return Sight(
+        return ViewMeasurement(
             rays=ViewRays(
                 torch.where(column[..., None], mine.direction_c, others.direction_c),
                 torch.where(column, mine.distance, others.distance),
@@ -54,7 +57,7 @@ class Sight:
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class Vantage:
+class ViewPoses:
     """From where environments look."""
 
     T_w_camera: Tensor
@@ -98,7 +101,7 @@ class Senses(Protocol):
         """Where the targets are believed to be, world frame, in [m]. Shape (N, 3)."""
         ...
 
-    def look(self, vantage: Vantage) -> tuple[Sight, Tensor | None]:
+    def look(self, view: ViewPoses) -> tuple[ViewMeasurement, Tensor | None]:
         """Looks; the second is which environments have located their target just now. Shape (b,)."""
         ...
 
@@ -142,18 +145,16 @@ class ExactSenses:
         position = self._world.target_position_w
         return position + self._world.state.position_error if self._noise.target_position else position
 
-    def look(self, vantage: Vantage) -> tuple[Sight, Tensor | None]:
+    def look(self, view: ViewPoses) -> tuple[ViewMeasurement, Tensor | None]:
         """Casts rays."""
         world = self._world
-        target, T_w_plant = world.state.target, world.planting.T_world_plant
-        seen = world.scene.visibility(vantage.T_w_camera, target, T_w_plant, vantage.T_w_links)
-        rays = world.scene.view_rays(
-            vantage.T_w_camera, target, self.known_target(), T_w_plant, vantage.T_w_links
-        )
+        target, T_w_plant = world.state.target, world.plant_batch.T_world_plant
+        seen = world.scene.visibility(view.T_w_camera, target, T_w_plant, view.T_w_links)
+        rays = world.scene.view_rays(view.T_w_camera, target, self.known_target(), T_w_plant, view.T_w_links)
         if self._errors.are_in_rays:
-            rays = self._errors.rays(rays, vantage.seeds(world.state.noise_seed))
+            rays = self._errors.rays(rays, view.seeds(world.state.noise_seed))
         fraction = seen.visible_fraction
-        return Sight(
+        return ViewMeasurement(
             rays=rays,
             visible_fraction=fraction,
             told_fraction=self._errors.visible_fraction(fraction),
@@ -163,3 +164,97 @@ class ExactSenses:
 
     def revise(self, observer: ViewpointObserver, env_idx: Tensor) -> None:
         """Nothing: where a target is believed to be does not change."""
+
+
+class CameraSenses:
+    """Measures what a camera sees; where the truth is needed only to be told beside it, rays are cast."""
+
+    def __init__(self, world: World, perception: Perception) -> None:
+        """Senses in a world.
+
+        Args:
+            world: The plants and arms, with a renderer for those in `RENDERED`.
+            perception: Which camera and estimator.
+        """
+        made = make_camera(perception, world.scene, world.intrinsics, self._picture)
+        assert made is not None
+        self._world = world
+        self._camera, self._perception = made
+        self._qpos = world.state.qpos
+
+    def begin(self, env_index: int, rng: np.random.RandomState, hidden_below: float) -> None:
+        """Draws the seed that the errors of an episode follow from."""
+        state = self._world.state
+        state.noise_seed[env_index] = int(rng.randint(2**31 - 1)) % NOISE_SEEDS
+        state.hidden_below[env_index] = hidden_below
+
+    def begin_targets(self, env_idx: Tensor) -> None:
+        """Draws where the targets are believed to be, which are known from afar only."""
+        state = self._world.state
+        for i in env_idx.tolist():
+            # Streams of targets and of views differ in the length of their keys.
+            key = (int(state.noise_seed[i]), int(state.targets_begun[i]), 0)
+            error = np.random.default_rng(key).normal(0.0, COARSE_POSITION, 3)
+            state.position_error[i] = torch.as_tensor(error).to(state.position_error)
+            self._begin_target(i, is_first=int(state.targets_begun[i]) == 0)
+
+    def recall_targets(self, env_idx: Tensor) -> None:
+        """Begins with the same positions again; the views follow."""
+        for i in env_idx.tolist():
+            self._begin_target(i, is_first=int(self._world.state.targets_begun[i]) == 1)
+
+    def _begin_target(self, env_index: int, *, is_first: bool) -> None:
+        state = self._world.state
+        position = self._world.target_position_w[env_index] + state.position_error[env_index]
+        hidden_below = float(state.hidden_below[env_index]) if is_first else 0.0
+        self._perception.begin(
+            env_index,
+            position.double().cpu().numpy(),
+            hidden_below=hidden_below or None,
+        )
+
+    def known_target(self) -> Tensor:
+        """Where the targets were measured, or are thought to be. Shape (N, 3)."""
+        return self._perception.target_position
+
+    def look(self, view: ViewPoses) -> tuple[ViewMeasurement, Tensor | None]:
+        """Takes and measures frames."""
+        world = self._world
+        target, T_w_plant = world.state.target, world.plant_batch.T_world_plant
+        for i, seed in view.seeds(world.state.noise_seed).items():
+            self._camera.seed(i, seed)
+        self._qpos = view.qpos
+        frames = self._camera.take(view.T_w_camera, target, T_w_plant, view.T_w_links, view.mask)
+        located = self._perception.look(frames)
+        seen = world.scene.visibility(view.T_w_camera, target, T_w_plant, view.T_w_links)
+        fraction = self._perception.visible_fraction
+        measured = ViewMeasurement(
+            rays=self._perception.rays(),
+            visible_fraction=fraction,
+            told_fraction=fraction,
+            true_fraction=seen.visible_fraction,
+            tomato_seen=seen.any_visible,
+        )
+        return measured, located.nonzero()[:, 0]
+
+    def revise(self, observer: ViewpointObserver, env_idx: Tensor) -> None:
+        """Reads the kept measurements again."""
+        self._perception.recall(observer, env_idx)
+
+    def _picture(self, env_index: int) -> NDArray[np.uint8]:
+        picture = self._world.picture
+        if picture is None:
+            raise InvalidInputError("this perception needs colours, and the world has no renderer")
+        return picture(env_index, self._qpos[env_index])
+
+
+def make_senses(perception: Perception, world: World, noise: SensorNoise) -> Senses:
+    """The senses of a kind of perception; `noise` is for ground truth only."""
+    if perception == "ground_truth":
+        return ExactSenses(world, noise)
+    if perception in RENDERED and world.picture is None:
+        raise InvalidInputError(
+            f"perception={perception!r} renders colours, which a world without a simulator cannot; use "
+            "gymnasium.make, or 'occlusion_model'"
+        )
+    return CameraSenses(world, perception)

@@ -14,8 +14,8 @@ from maniskill_tomato.assets import asset_path
 from maniskill_tomato.errors import CheckpointError, InvalidInputError
 from maniskill_tomato.experiments.episode_record import EpisodeRecord
 from maniskill_tomato.experiments.rollout import run_episode
+from maniskill_tomato.learning.imitation.imitation_config import RegressionConfig
 from maniskill_tomato.learning.imitation.move_to_see_training import MoveToSeeData, train_move_network
-from maniskill_tomato.learning.imitation.regression_config import RegressionConfig
 from maniskill_tomato.plants.generator import generate_plant
 from maniskill_tomato.plants.organs import Plant
 from maniskill_tomato.policies import baselines, moves

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import torch
 from numpy.typing import NDArray
+from torchvision.ops import box_iou
 
 from maniskill_tomato.errors import CheckpointError, InvalidInputError
 from maniskill_tomato.segmentation.datasets.annotations import AnnotatedImage, Instance
@@ -24,8 +25,8 @@ from maniskill_tomato.segmentation.fruit_network import (
     FruitNetwork,
     place_centres,
 )
-from maniskill_tomato.segmentation.fruit_session import FruitSession
 from maniskill_tomato.segmentation.light_segmenter import (
+    FruitSession,
     LightSegmenter,
     find_fruits,
     mirror,
@@ -33,7 +34,6 @@ from maniskill_tomato.segmentation.light_segmenter import (
     split_by_votes,
 )
 from maniskill_tomato.segmentation.masks import EncodedMask
-from maniskill_tomato.segmentation.metrics.detection_metrics import box_overlaps
 from maniskill_tomato.segmentation.training.augmentation import augmented
 from maniskill_tomato.segmentation.training.fruit_targets import fruit_losses, make_targets
 from maniskill_tomato.segmentation.training.light_training import LightTraining
@@ -424,7 +424,8 @@ def test_two_looks_at_one_image_are_joined_in_order_and_sizes_are_shared_out() -
     both = LightSegmenter(network, score_threshold=0.0, overlap_threshold=0.5)(image)
     fine = LightSegmenter(network, score_threshold=0.0, overlap_threshold=0.5, scales=(1.0,))(image)
     assert len(both) > 0 and (np.diff(both.scores) <= 0).all()
-    overlaps, _ = box_overlaps(both.boxes.astype(np.float64), both.boxes.astype(np.float64))
+    boxes = torch.from_numpy(both.boxes).double()
+    overlaps = box_iou(boxes, boxes).numpy()
     assert (overlaps - np.eye(len(both))).max() <= 0.5 + 1e-6
     # Small boxes can only come from the fine look.
     small = (both.boxes[:, 2:] - both.boxes[:, :2]).min(axis=1) < 60
@@ -450,7 +451,11 @@ def square(size: int, left: float, side: float) -> TrainingPicture:
     )
 
 
-@pytest.mark.parametrize(("side", "found_at"), [(40, [20]), (120, [20, 400]), (240, [400])])
+# The fine look keeps fruits of up to 192 px, the coarse one those of 32 px or more in its image of half the size.
+@pytest.mark.parametrize(
+    ("side", "found_at"),
+    [(40, [20]), (60, [20]), (68, [20, 400]), (120, [20, 400]), (188, [20, 400]), (196, [400]), (240, [400])],
+)
 def test_fruits_too_large_for_the_fine_look_are_left_to_the_coarse_one_and_the_other_way_round(
     monkeypatch: pytest.MonkeyPatch, side: float, found_at: list[float]
 ) -> None:

@@ -117,7 +117,7 @@ def test_rendered_perceptions_run_and_their_pictures_lie_on_the_cast_labels(perc
         task.camera_intrinsics,
         task.world.camera_poses(T_w_links),
         task.target_fruit,
-        task.planting.T_world_plant,
+        task.plant_batch.T_world_plant,
         T_w_links,
     )
     target = (images.label[0] == int(PixelLabel.TARGET)).numpy()
@@ -147,7 +147,7 @@ class Eye:
         T_w_links = link_transforms(self.env.agent.robot.get_qpos())
         T_w_camera = self.env.world.camera_poses(T_w_links)
         frames = self.camera.take(
-            T_w_camera, self.env.target_fruit, self.env.planting.T_world_plant, T_w_links
+            T_w_camera, self.env.target_fruit, self.env.plant_batch.T_world_plant, T_w_links
         )
         self.perception.look(frames)
         return float(self.perception.visible_fraction[0])
@@ -193,7 +193,7 @@ class LabelSegmenter:
             color_intrinsics(*IMAGE_SIZE),
             env.world.camera_poses(T_w_links),
             env.target_fruit,
-            env.planting.T_world_plant,
+            env.plant_batch.T_world_plant,
             T_w_links,
         )
         target = (images.label[0] == int(PixelLabel.TARGET)).numpy()

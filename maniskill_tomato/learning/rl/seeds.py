@@ -1,7 +1,6 @@
 """Several seeds of one configuration, each trained in a process and a folder of its own."""
 
 import contextlib
-import json
 import logging
 import math
 import multiprocessing
@@ -21,13 +20,12 @@ from tqdm import tqdm
 
 import maniskill_tomato
 from maniskill_tomato.errors import InvalidInputError, TomatoError
-from maniskill_tomato.files import write_atomically
+from maniskill_tomato.files import write_json
 from maniskill_tomato.learning.interrupt import stop_on_signals
 from maniskill_tomato.learning.rl.presets import TrainConfig
 from maniskill_tomato.learning.rl.progress import Progress
-from maniskill_tomato.learning.rl.run import train
 from maniskill_tomato.learning.rl.run_folder import LOG_NAME, check_run_dir, clear_run
-from maniskill_tomato.learning.rl.trainer import TrainResult
+from maniskill_tomato.learning.rl.trainer import TrainResult, train
 from maniskill_tomato.worker_pool import start_process
 
 logger = logging.getLogger(__name__)
@@ -115,7 +113,7 @@ def train_seeds(
         "env_options": env_options,
         "config": config.to_dict(),
     }
-    write_atomically(out / SEEDS_FILE, (json.dumps(content, indent=2) + "\n").encode())
+    write_json(out / SEEDS_FILE, content)
     waiting = deque(
         _Worker(seed, folder, env_id, config, env_options, resume) for seed, folder in folders.items()
     )

@@ -55,6 +55,11 @@ _REMOVED = {
 }
 """Options of earlier versions, each with the default with which a run equals one without the option."""
 
+_CHOICES = {
+    "critic": ("scalar", "categorical"),
+    "normalize_observations": ("none", "fixed", "running"),
+}
+
 
 @dataclass(frozen=True, kw_only=True)
 class TrainConfig:
@@ -218,6 +223,9 @@ class TrainConfig:
                 "categorical critics need 2 or more value_atoms over a rising value_range, got "
                 f"{self.value_atoms} over {self.value_range}"
             )
+        for name, allowed in _CHOICES.items():
+            if getattr(self, name) not in allowed:
+                raise InvalidInputError.choice(name, getattr(self, name), allowed)
         if self.exploration_noise_per_env and self.exploration == "epsilon-greedy":
             raise InvalidInputError(
                 "exploration_noise_per_env needs an exploration with noise: decaying-gaussian, look-at-goals or "
