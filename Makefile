@@ -9,8 +9,8 @@ MAKEFLAGS += --no-builtin-rules --no-print-directory
 # make venv PYTHON=/path/to/python3.12 chooses the interpreter; ARGS="..." goes on to demo, test and test-all.
 PYTHON ?=
 ARGS ?=
-# Processes that `make test` runs tests in.
-WORKERS ?= 2
+# Processes that `make test` runs tests in; one more than two cores, because some tests wait for other processes.
+WORKERS ?= 3
 export PYTHON
 
 BIN := .venv/bin

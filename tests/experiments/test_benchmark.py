@@ -201,6 +201,7 @@ class LineWorld:
 
     device = torch.device("cpu")
     spec = None
+    keeps_belief = True
 
     def __init__(self, num_envs: int = 1) -> None:
         self.num_envs = num_envs

@@ -87,6 +87,7 @@ class FreeWorld(Truth):
 
     num_envs = 1
     device = torch.device("cpu")
+    keeps_belief = True
 
     def __init__(self, plants: list[Plant], box: Box = Box()) -> None:
         self._plants = plants
