@@ -44,7 +44,7 @@ demo: $(STAMP) ## Train the guided task, evaluate it, write a report and a video
 
 .PHONY: test
 test: $(STAMP) ## Run the tests that need no GPU and little time
-	@$(BIN)/python -m pytest -n $(WORKERS) --dist loadfile -m "not slow and not gpu" $(ARGS)
+	@$(BIN)/python -m pytest -n $(WORKERS) --dist loadfile --no-loadscope-reorder -m "not slow and not gpu" $(ARGS)
 
 .PHONY: test-all
 test-all: $(STAMP) ## Run every test that this machine can run

@@ -23,7 +23,7 @@ from maniskill_tomato.tasks.row.search_game import SearchGame
 from maniskill_tomato.tasks.row.target_sequence import Transits
 from maniskill_tomato.tasks.thesis.thesis_config import ViewpointTaskConfig, guided_task, sparse_task
 from maniskill_tomato.tasks.thesis.thesis_game import ThesisGame
-from maniskill_tomato.tasks.world import Game, Picture, TaskConfig, World
+from maniskill_tomato.tasks.world import Game, Pictures, TaskConfig, World
 
 IMAGE_SIZE = (160, 120)
 """Width and height of the wrist camera's picture unless somebody says otherwise, in [px]."""
@@ -160,7 +160,7 @@ class TaskSetup:
         *,
         control: Control,
         intrinsics: CameraIntrinsics,
-        picture: Picture | None = None,
+        pictures: Pictures | None = None,
     ) -> World:
         """A world; see `make_world`."""
         moves = ArmMoves(
@@ -179,7 +179,7 @@ class TaskSetup:
             rays_per_side=self.rays_per_side,
             num_envs=num_envs,
             device=device,
-            picture=picture,
+            pictures=pictures,
         )
 
 
@@ -190,7 +190,7 @@ def make_world(
     *,
     control: Control | None = None,
     intrinsics: CameraIntrinsics | None = None,
-    picture: Picture | None = None,
+    pictures: Pictures | None = None,
     **options: Any,
 ) -> World:
     """N environments of a task without a simulator.
@@ -201,7 +201,7 @@ def make_world(
         device: Where all tensors live.
         control: What an action is; the task's own if None.
         intrinsics: Of the wrist's camera; the D435's colour camera at `IMAGE_SIZE` if None.
-        picture: A renderer, for perception that needs colours.
+        pictures: A renderer, for perception that needs colours.
         options: `ThesisOptions`, `SearchOptions` or `RowOptions`.
 
     Raises:
@@ -212,7 +212,7 @@ def make_world(
         device,
         control=control or default_control(env_id),
         intrinsics=intrinsics or wrist_intrinsics(),
-        picture=picture,
+        pictures=pictures,
     )
 
 

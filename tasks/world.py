@@ -37,9 +37,9 @@ FIRST_ORGAN_ID = 24
 FIRST_SEED = 2022
 """Before it is seeded, environment i has the generator of this plus i, as in ManiSkill."""
 
-Picture = Callable[[int, Tensor], NDArray[np.uint8]]
-"""Renders the colours of an environment, by its index and its arm's joint positions of shape (7,), in [rad]; gives an
-array of shape (H, W, 3)."""
+Pictures = Callable[[Tensor], NDArray[np.uint8]]
+"""Renders the colours that all wrist cameras see, by the joint positions of shape (N, 7), in [rad]; gives an array
+of shape (N, H, W, 3)."""
 
 
 class TaskConfig(Protocol):
@@ -135,7 +135,7 @@ class World:
         rays_per_side: int = 16,
         num_envs: int = 1,
         device: str | torch.device = "cpu",
-        picture: Picture | None = None,
+        pictures: Pictures | None = None,
     ) -> None:
         """Grows the first plant; `reset` begins episodes.
 
@@ -149,14 +149,14 @@ class World:
             rays_per_side: A visible fraction is counted with the square of this number of rays.
             num_envs: N.
             device: Where all tensors live.
-            picture: The renderer, where there is one.
+            pictures: The renderer, where there is one.
         """
         if num_envs < 1:
             raise InvalidInputError(f"num_envs must be 1 or more; got {num_envs}")
         self.num_envs = num_envs
         self.device = torch.device(device)
         self.intrinsics = intrinsics
-        self.picture = picture
+        self.pictures = pictures
         self.moves = moves
         self.state = WorldState.zeros(num_envs, self.device)
         self.plant_batch = PlantBatch(plant, self.state)

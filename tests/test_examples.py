@@ -190,10 +190,13 @@ def test_stable_baselines_bootstraps_an_episode_that_ran_out_of_time_and_no_othe
             ("sb3_ppo.py", "--total-timesteps", "400", "--n-steps", "100", "--num-envs", "2"),
             marks=pytest.mark.slow,
         ),
-        (
-            "cleanrl_style.py",
-            *("--total-timesteps", "400", "--learning-starts", "256"),
-            *("--vectorization", "async", "--autoreset", "next-step", "--env-id", THESIS_IDS[1]),
+        pytest.param(
+            (
+                "cleanrl_style.py",
+                *("--total-timesteps", "400", "--learning-starts", "256"),
+                *("--vectorization", "async", "--autoreset", "next-step", "--env-id", THESIS_IDS[1]),
+            ),
+            marks=pytest.mark.slow,
         ),
     ],
     ids=lambda arguments: arguments[0],

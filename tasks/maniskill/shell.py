@@ -142,7 +142,7 @@ class TomatoEnv(BaseEnv):  # type: ignore[misc]
                 self.device,
                 control=CONTROL_MODES.get(self.control_mode, default_control(self.env_id)),
                 intrinsics=self.camera_intrinsics,
-                picture=self._wrist_picture if self._setup.needs_pictures else None,
+                pictures=self._wrist_pictures if self._setup.needs_pictures else None,
             )
         world = self.world
         self._hand_over_generators()
@@ -171,19 +171,23 @@ class TomatoEnv(BaseEnv):  # type: ignore[misc]
             width=camera.width, height=camera.height, fx=K[0, 0], fy=K[1, 1], cx=K[0, 2], cy=K[1, 2]
         )
 
-    def _wrist_picture(self, env_index: int, qpos: Tensor) -> NDArray[np.uint8]:
-        """What the wrist's colour camera sees with an arm at some joint positions. Shape (height, width, 3)."""
+    def _wrist_pictures(self, qpos: Tensor) -> NDArray[np.uint8]:
+        """What the wrists' colour cameras see with the arms at some joint positions, rendered once for all.
+
+        Args:
+            qpos: In [rad]. Shape (num_envs, 7).
+
+        Returns:
+            Shape (num_envs, height, width, 3).
+        """
         self._plants.follow()
-        present = self.agent.robot.get_qpos()
-        if not torch.equal(present[env_index], qpos):
-            goal = present.clone()
-            goal[env_index] = qpos
-            self._put_joints(goal)
+        if not torch.equal(self.agent.robot.get_qpos(), qpos):
+            self._put_joints(qpos)
         self.scene.update_render(update_sensors=True, update_human_render_cameras=False)
         camera = self.scene.sensors["d435"]
         camera.capture()
         colours = camera.get_obs(rgb=True, depth=False, position=False, segmentation=False)["rgb"]
-        return np.asarray(colours[env_index].cpu().numpy())
+        return np.asarray(colours.cpu().numpy())
 
     # ---------------------------------------------------------------- episode
 

@@ -181,6 +181,7 @@ class CameraSenses:
         self._world = world
         self._camera, self._perception = made
         self._qpos = world.state.qpos
+        self._pictures: NDArray[np.uint8] | None = None
 
     def begin(self, env_index: int, rng: np.random.RandomState, hidden_below: float) -> None:
         """Draws the seed that the errors of an episode follow from."""
@@ -223,7 +224,7 @@ class CameraSenses:
         target, T_w_plant = world.state.target, world.plant_batch.T_world_plant
         for i, seed in view.seeds(world.state.noise_seed).items():
             self._camera.seed(i, seed)
-        self._qpos = view.qpos
+        self._qpos, self._pictures = view.qpos, None
         frames = self._camera.take(view.T_w_camera, target, T_w_plant, view.T_w_links, view.mask)
         located = self._perception.look(frames)
         seen = world.scene.visibility(view.T_w_camera, target, T_w_plant, view.T_w_links)
@@ -242,17 +243,19 @@ class CameraSenses:
         self._perception.recall(observer, env_idx)
 
     def _picture(self, env_index: int) -> NDArray[np.uint8]:
-        picture = self._world.picture
-        if picture is None:
-            raise InvalidInputError("this perception needs colours, and the world has no renderer")
-        return picture(env_index, self._qpos[env_index])
+        if self._pictures is None:
+            if self._world.pictures is None:
+                raise InvalidInputError("this perception needs colours, and the world has no renderer")
+            self._pictures = self._world.pictures(self._qpos)
+        picture: NDArray[np.uint8] = self._pictures[env_index]
+        return picture
 
 
 def make_senses(perception: Perception, world: World, noise: SensorNoise) -> Senses:
     """The senses of a kind of perception; `noise` is for ground truth only."""
     if perception == "ground_truth":
         return ExactSenses(world, noise)
-    if perception in RENDERED and world.picture is None:
+    if perception in RENDERED and world.pictures is None:
         raise InvalidInputError(
             f"perception={perception!r} renders colours, which a world without a simulator cannot; use "
             "gymnasium.make, or 'occlusion_model'"

@@ -16,6 +16,7 @@ from maniskill_tomato.segmentation.instances import Instances
 from maniskill_tomato.sensing.camera_perception import CameraPerception
 from maniskill_tomato.sensing.fruit_detector import FruitDetector
 from maniskill_tomato.sensing.simulated_camera import COARSE_POSITION, IMAGE_SIZE, SimulatedCamera
+from maniskill_tomato.tasks.making import make_world
 
 
 def make(**options: Any) -> Any:
@@ -95,6 +96,23 @@ def test_options_that_make_no_sense_are_refused(options: dict[str, Any]) -> None
         make(**options)
 
 
+def test_one_rendering_serves_all_environments_of_a_look() -> None:
+    asked = []
+
+    def render(qpos: torch.Tensor) -> np.ndarray[Any, np.dtype[np.uint8]]:
+        asked.append(qpos.clone())
+        return np.zeros((3, 120, 160, 3), dtype=np.uint8)
+
+    options = {"perception": "thesis_model", "intrinsics": color_intrinsics(160, 120)}
+    world = make_world("TomatoViewpoint-v1", 3, pictures=render, **options)
+    world.reset(seed=0)
+    before = len(asked)
+    for k in range(2):
+        world.step(torch.full((3, 3), 0.3))
+        assert len(asked) == before + 1 + k
+        assert torch.equal(asked[-1], world.qpos)
+
+
 @pytest.mark.render
 @pytest.mark.parametrize("perception", ["thesis_model", "improved_model", "segmenter"])
 def test_rendered_perceptions_run_and_their_pictures_lie_on_the_cast_labels(perception: str) -> None:
@@ -110,7 +128,7 @@ def test_rendered_perceptions_run_and_their_pictures_lie_on_the_cast_labels(perc
     *_, info = task.step(torch.tensor([0.0, 0.6, 0.3]))
     assert 0.0 <= float(info["visible_fraction"][0]) <= 1.0
     assert set(info) >= {"true_visible_fraction", "true_success"}
-    picture = task._wrist_picture(0, task.qpos[0]).astype(int)
+    picture = task._wrist_pictures(task.qpos)[0].astype(int)
     assert picture.shape == (240, 320, 3)
     T_w_links = link_transforms(task.agent.robot.get_qpos())
     images = task.world.scene.image(
