@@ -103,8 +103,10 @@ def test_one_rendering_serves_all_environments_of_a_look() -> None:
         asked.append(qpos.clone())
         return np.zeros((3, 120, 160, 3), dtype=np.uint8)
 
-    options = {"perception": "thesis_model", "intrinsics": color_intrinsics(160, 120)}
-    world = make_world("TomatoViewpoint-v1", 3, pictures=render, **options)
+    intrinsics = color_intrinsics(160, 120)
+    world = make_world(
+        "TomatoViewpoint-v1", 3, perception="thesis_model", pictures=render, intrinsics=intrinsics
+    )
     world.reset(seed=0)
     before = len(asked)
     for k in range(2):
