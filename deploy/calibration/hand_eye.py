@@ -170,7 +170,7 @@ def _closed_form(flanges: Float64, boards: Float64) -> Float64:
             f"the views hardly turn about a second axis ({np.degrees(spread[1]):.1f} degrees, "
             f"{np.degrees(MIN_TURN):.1f} are needed): tilt the camera and roll it between views"
         )
-    rotation, _ = Rotation.align_vectors(turns, Rotation.from_matrix(b[:, :3, :3]).as_rotvec())
+    rotation = Rotation.align_vectors(turns, Rotation.from_matrix(b[:, :3, :3]).as_rotvec())[0]
     matrix = np.concatenate(a[:, :3, :3] - np.eye(3))
     right = np.concatenate(rotation.apply(b[:, :3, 3]) - a[:, :3, 3])
     return transform(rotation, np.linalg.lstsq(matrix, right, rcond=None)[0])
@@ -205,10 +205,14 @@ def _refine(
         in_camera = (chains[:, :3, :3] @ stacked[:, :, None])[..., 0] + chains[:, :3, 3]
         return np.nan_to_num((seen - intrinsics.project(in_camera)).ravel(), nan=1e4)
 
+    def fit() -> Any:
+        return least_squares(residual, np.zeros(12), "3-point", x_scale="jac", ftol=1e-12, xtol=1e-12)
+
+    found = fit()
     # Once more from the solution, where the Jacobian is wanted for the covariance.
-    for _ in range(2):
-        found: Any = least_squares(residual, np.zeros(12), "3-point", x_scale="jac", ftol=1e-12, xtol=1e-12)
-        pose, about = moved(pose, found.x[:6]), moved(about, found.x[6:])
+    pose, about = moved(pose, found.x[:6]), moved(about, found.x[6:])
+    found = fit()
+    pose, about = moved(pose, found.x[:6]), moved(about, found.x[6:])
     error = found.fun
     variance = float(error @ error) / max(1, len(error) - 12)
     covariance = np.asarray(variance * np.linalg.pinv(found.jac.T @ found.jac), np.float64)

@@ -86,7 +86,7 @@ def camera_poses(
         sideways = math.cos(azimuth) * x + math.sin(azimuth) * y
         away = math.cos(tilt) * normal + math.sin(tilt) * sideways
         # Turned from the first view by the shortest way: "upright" means little for a camera that looks down.
-        turn, _ = Rotation.align_vectors(-away, T_base_camera[:3, 2])
+        turn = Rotation.align_vectors(-away, T_base_camera[:3, 2])[0]
         rotation = turn * first * Rotation.from_rotvec([0.0, 0.0, roll])
         poses.append(transform(rotation, middle[:3] + distance * away))
     return np.asarray(poses, dtype=np.float64)

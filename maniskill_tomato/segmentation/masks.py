@@ -98,7 +98,8 @@ class EncodedMask:
             return cls(height, width, counts)
         from pycocotools import mask as coco_mask
 
-        coded: Any = coco_mask.frPyObjects({"size": [height, width], "counts": counts}, height, width)
+        uncoded: Any = {"size": [height, width], "counts": counts}
+        coded: Any = coco_mask.frPyObjects(uncoded, height, width)
         return cls(height, width, coded["counts"].decode("ascii"))
 
     def decode(self) -> BinaryMask:
