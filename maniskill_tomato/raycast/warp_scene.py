@@ -111,22 +111,24 @@ class WarpScene:
     def visible_fraction_from(
         self,
         T_w_camera: Tensor,
-        target_fruit: int,
+        target_fruit: Tensor,
         T_w_plant: Tensor,
         T_w_links: Tensor | None,
-        env_index: int,
+        env_idx: Tensor,
     ) -> Tensor:
-        """See `RayScene.visible_fraction_from`."""
+        """See `RayScene.visible_fraction_from`; the numbers are tensors of shape () or (K,)."""
         if self._many_views is None:
             self._many_views = _Views(VIEWS_AT_ONCE, self._links.count, self._device)
         views, count = self._many_views, T_w_camera.shape[0]
         recorded = self._recorded(self._record_visibility, views)
-        views.environments.fill_(env_index)
+        targets, environments = target_fruit.expand(count), env_idx.expand(count)
+        T_w_plants = T_w_plant.expand(count, 4, 4)
         answers = torch.empty(count, device=self._device)
         for first in range(0, count, VIEWS_AT_ONCE):
             part = slice(first, min(first + VIEWS_AT_ONCE, count))
             links = None if T_w_links is None else T_w_links[part]
-            views.place(T_w_camera[part], target_fruit, T_w_plant, links)
+            views.environments[: part.stop - first] = environments[part]
+            views.place(T_w_camera[part], targets[part], T_w_plants[part], links)
             recorded.launch(part.stop - first)
             answers[part] = recorded.outputs[0][0, : part.stop - first]
         return answers
@@ -414,15 +416,18 @@ class _Views:
             T_w_links: Shape (K, 9, 4, 4), or (9, 4, 4) for one; None for no robot.
         """
         count = T_w_camera.shape[0] if T_w_camera.dim() == 3 else 1
-        whole = count == self.count
-        (self._camera_poses if whole else self._camera_poses[:count]).copy_(T_w_camera)
-        self._plant_poses.copy_(T_w_plant)
+        tables = self._camera_poses, self._plant_poses, self._targets, self._link_poses
+        if count != self.count:
+            tables = tuple(table[:count] for table in tables)
+        cameras, plants, targets, links = tables
+        cameras.copy_(T_w_camera)
+        plants.copy_(T_w_plant)
         if isinstance(target_fruit, int):
-            self._targets.fill_(target_fruit)
+            targets.fill_(target_fruit)
         else:
-            self._targets.copy_(target_fruit)
+            targets.copy_(target_fruit)
         if T_w_links is not None:
-            (self._link_poses if whole else self._link_poses[:count]).copy_(T_w_links)
+            links.copy_(T_w_links)
             self._robot_present = True
         elif self._robot_present:
             self._link_poses.copy_(self._links_away)

@@ -114,7 +114,7 @@ class FreeWorld(Truth):
         self, T_world_camera: Tensor, env_index: int = 0, qpos: Tensor | None = None
     ) -> Tensor:
         return self._scene.visible_fraction_from(
-            T_world_camera, self._fruit, self._T_world_plant, env_index=env_index
+            T_world_camera, self._fruit, self._T_world_plant, env_idx=env_index
         )
 
     def reset(self, *, seed: int, options: Any = None) -> tuple[Tensor, dict[str, Tensor]]:

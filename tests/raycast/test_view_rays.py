@@ -267,7 +267,7 @@ def test_many_views_at_once_have_the_visible_fractions_of_single_views(device: s
         centre = torch.from_numpy(plants[env_index].fruits[target].centre) + T_world_plant[:3, 3].cpu()
         cameras = random_cameras(centre, count).to(device)
         for given in (None, links):
-            at_once = scene.visible_fraction_from(cameras, target, T_world_plant, given, env_index=env_index)
+            at_once = scene.visible_fraction_from(cameras, target, T_world_plant, given, env_idx=env_index)
             for k in (0, VIEWS_AT_ONCE - 1, VIEWS_AT_ONCE, count - 1):
                 single = scene.visibility(
                     cameras[k : k + 1].expand(2, 4, 4),
@@ -286,6 +286,6 @@ def test_views_that_do_not_exist_are_refused() -> None:
     with pytest.raises(InvalidInputError, match=r"target_fruit must be from 0 to 0, got 1"):
         scene.visible_fraction_from(pose[None], 1, pose)
     with pytest.raises(InvalidInputError, match=r"env_index must be from 0 to 0, got 2"):
-        scene.visible_fraction_from(pose[None], 0, pose, env_index=2)
+        scene.visible_fraction_from(pose[None], 0, pose, env_idx=2)
     with pytest.raises(InvalidInputError, match=r"T_w_plant must have shape \(4, 4\)"):
         scene.visible_fraction_from(pose[None], 0, pose[None])
