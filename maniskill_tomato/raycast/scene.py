@@ -3,10 +3,10 @@
 scene = RayScene(plants, intrinsics, robot_meshes=link_meshes())
 seen = scene.visibility(T_w_camera, target_fruit, T_w_plant, link_transforms(qpos))
 seen.visible_fraction, seen.any_visible
-scene.replace_plant(env_index, new_plant)
+scene.replace_plants({env_index: new_plant})
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Final
 
 import torch
@@ -96,17 +96,21 @@ class RayScene:
         """The plant that an environment shows."""
         return self._plants[env_index]
 
-    def replace_plant(self, env_index: int, plant: Plant) -> None:
-        """Shows another plant in one environment.
+    def replace_plants(self, plants: Mapping[int, Plant]) -> None:
+        """Shows other plants in some environments.
 
         Args:
-            env_index: Which environment, from 0 to N - 1.
-            plant: A plant object used lately is found again, a new one costs the time to sort its triangles.
+            plants: By the index of the environment, from 0 to N - 1. A plant object used lately is found again, a new
+                one costs the time to sort its triangles.
         """
-        if not 0 <= env_index < self.num_envs:
-            raise InvalidInputError(f"env_index must be from 0 to {self.num_envs - 1}, got {env_index}")
-        self._rays.show(env_index, plant)
-        self._plants[env_index] = plant
+        for env_index in plants:
+            if not 0 <= env_index < self.num_envs:
+                raise InvalidInputError(
+                    f"plants must be keyed by environments from 0 to {self.num_envs - 1}, got {env_index}"
+                )
+        self._rays.show(plants)
+        for env_index, plant in plants.items():
+            self._plants[env_index] = plant
 
     def visibility(
         self, T_w_camera: Tensor, target_fruit: Tensor, T_w_plant: Tensor, T_w_links: Tensor | None = None
@@ -162,8 +166,8 @@ class RayScene:
         environments = torch.as_tensor(env_idx, device=self._device)
         for name, numbers in (("target_fruit", targets), ("env_idx", environments)):
             _check_shape(name, numbers, (count,) if numbers.dim() else ())
-        pairs = torch.broadcast_tensors(environments, targets)
-        for env, target in set(zip(*(numbers.reshape(-1).tolist() for numbers in pairs), strict=True)):
+        pairs = torch.stack([environments.expand(count), targets.expand(count)], dim=-1)
+        for env, target in {(int(env), int(target)) for env, target in pairs.tolist()}:
             if not 0 <= env < self.num_envs:
                 raise InvalidInputError(f"env_idx must be from 0 to {self.num_envs - 1}, got {env}")
             fruits = len(self._plants[env].fruits)
