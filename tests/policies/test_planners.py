@@ -114,13 +114,13 @@ class FreeWorld(Truth):
         self, T_world_camera: Tensor, env_index: int = 0, qpos: Tensor | None = None
     ) -> Tensor:
         return self._scene.visible_fraction_from(
-            T_world_camera, self._fruit, self._T_world_plant, env_index=env_index
+            T_world_camera, self._fruit, self._T_world_plant, env_idx=env_index
         )
 
     def reset(self, *, seed: int, options: Any = None) -> tuple[Tensor, dict[str, Tensor]]:
         rng = np.random.default_rng(seed)
         plant = self._plants[int(rng.integers(len(self._plants)))]
-        self._scene.replace_plant(0, plant)
+        self._scene.replace_plants({0: plant})
         ripe = [i for i, f in enumerate(plant.fruits) if f.ripeness == "ripe" and 0.4 < f.centre[2] < 1.2]
         while True:
             self._fruit = int(rng.choice(ripe))
