@@ -2,6 +2,7 @@
 
 import warnings
 from dataclasses import fields, replace
+from importlib.util import find_spec
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -12,10 +13,9 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 from torch.nn import functional
-from torchvision.ops import nms
 
 from maniskill_tomato.assets import asset_path
-from maniskill_tomato.errors import CheckpointError, InvalidInputError
+from maniskill_tomato.errors import CheckpointError, InvalidInputError, MissingPackageError
 from maniskill_tomato.segmentation.detector_configs import FruitNetworkConfig
 from maniskill_tomato.segmentation.fruit_network import (
     SIZE_MULTIPLE,
@@ -165,7 +165,7 @@ class LightSegmenter:
         # Which fruits are the same, and their masks, keep to the boxes at the peaks: fruits that touch stay two.
         order = np.argsort(-np.concatenate([part.scores for part in parts]), kind="stable")
         boxes, scores = torch.from_numpy(np.concatenate(peaks)[order]), torch.from_numpy(together.scores)
-        return together.chosen(nms(boxes, scores, self.overlap_threshold).numpy())
+        return together.chosen(best_apart(boxes, scores, self.overlap_threshold).numpy())
 
     def _found_at(self, x: Tensor, factor: float) -> tuple[Instances, NDArray[np.float32]]:
         """The fruits in an image (1, 3, H, W) that is scaled by a factor, and their `voted_boxes` in its pixels."""
@@ -251,7 +251,10 @@ def open_light(weights: Path | str | None = None, **options: Any) -> LightSegmen
     Raises:
         CheckpointError: The file is missing, damaged or of something else.
         InvalidInputError: A threshold is out of its range.
+        MissingPackageError: torchvision is not installed.
     """
+    if find_spec("torchvision") is None:
+        raise MissingPackageError.extra("torchvision", "perception")
     try:
         path = Path(weights) if weights is not None else asset_path(SHIPPED_WEIGHTS)
     except FileNotFoundError as error:
@@ -289,13 +292,21 @@ def find_fruits(maps: FruitMaps, score_threshold: float, overlap_threshold: floa
         return torch.stack([x - left, y - top, x + right, y + bottom], dim=1)
 
     boxes = corners(maps.box)
-    kept = nms(boxes, scores, overlap_threshold)
+    kept = best_apart(boxes, scores, overlap_threshold)
     return {
         "boxes": boxes[kept],
         "whole": corners(maps.whole)[kept],
         "scores": scores[kept],
         "category": maps.category[0].flatten(1)[:, places].argmax(0)[kept],
     }
+
+
+def best_apart(boxes: Tensor, scores: Tensor, overlap_threshold: float) -> Tensor:
+    """Indices of the boxes (N, 4) that no better one overlaps by more than the threshold, best first."""
+    from torchvision.ops import nms  # An extra, which `open_light` asks for.
+
+    kept: Tensor = nms(boxes, scores, overlap_threshold)
+    return kept
 
 
 def voted_boxes(maps: FruitMaps, boxes: Tensor) -> Tensor:

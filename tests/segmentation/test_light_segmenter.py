@@ -1,6 +1,7 @@
 """The light segmenter: decoding undoes the targets, pictures keep their annotation, training goes on bit for bit."""
 
 import json
+import sys
 from dataclasses import asdict, replace
 from pathlib import Path
 
@@ -11,7 +12,7 @@ import torch
 from numpy.typing import NDArray
 from torchvision.ops import box_iou
 
-from maniskill_tomato.errors import CheckpointError, InvalidInputError
+from maniskill_tomato.errors import CheckpointError, InvalidInputError, MissingPackageError
 from maniskill_tomato.segmentation.datasets.annotations import AnnotatedImage, Instance
 from maniskill_tomato.segmentation.detector_configs import (
     AugmentationConfig,
@@ -561,6 +562,12 @@ def test_weights_that_do_not_fit_are_refused(tmp_path: Path) -> None:
     (tmp_path / "broken.pt").write_bytes((tmp_path / "w.pt").read_bytes()[:1000])
     with pytest.raises(CheckpointError, match="truncated"):
         open_light(tmp_path / "broken.pt")
+
+
+def test_without_torchvision_opening_the_segmenter_names_the_extra(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "torchvision", None)
+    with pytest.raises(MissingPackageError, match="perception"):
+        open_light()
 
 
 def test_a_network_of_boxes_only_gives_ellipses() -> None:
