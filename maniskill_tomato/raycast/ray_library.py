@@ -72,6 +72,7 @@ class RayLibrary(Protocol):
         T_w_camera: Tensor,
         T_w_plant: Tensor,
         T_w_links: Tensor | None,
+        env_index: int,
     ) -> Picture:
         """See `RayScene.picture`."""
         ...

@@ -6,7 +6,14 @@ from typing import Final, Literal
 import numpy as np
 from torch import Tensor
 
-from maniskill_tomato.raycast.images import PixelLabel
+from maniskill_tomato.plants.organs import Plant
+from maniskill_tomato.raycast.images import (
+    BACKGROUND_DEPTH,
+    FIRST_ORGAN_LABEL,
+    NOTHING_LABEL,
+    ROBOT_LABEL,
+    Picture,
+)
 from maniskill_tomato.raycast.scene import RayScene
 from maniskill_tomato.raycast.view_rays import DEPTH_MODE
 from maniskill_tomato.robot.d435 import CameraIntrinsics, color_intrinsics
@@ -37,6 +44,9 @@ RENDERED_SIZE: Final = (640, 480)
 COARSE_POSITION: Final = 0.03
 """Standard deviation of each coordinate of a target's position before it was first seen, in [m]: that of a map of the
 row made from further away."""
+
+
+_CATEGORIES: Final = {"ripe": "tomato_ripe", "turning": "tomato_turning", "green": "tomato_unripe"}
 
 
 class SimulatedCamera:
@@ -71,7 +81,6 @@ class SimulatedCamera:
     def take(
         self,
         T_world_camera: Tensor,
-        target: Tensor,
         T_world_plant: Tensor,
         links: Tensor,
         mask: Tensor | None = None,
@@ -80,31 +89,47 @@ class SimulatedCamera:
 
         Args:
             T_world_camera: Poses of the optical frames. Shape (N, 4, 4).
-            target: Indices of the targets in `Plant.fruits`; `PosedFrame.true_fruits` has the target alone. Shape (N,).
             T_world_plant: Poses of the plants. Shape (N, 4, 4).
             links: World poses of the links. Shape (N, 9, 4, 4).
             mask: Which environments take one, all if None; the others get None. Shape (N,), bool.
         """
-        images = self._scene.image(self._intrinsics, T_world_camera, target, T_world_plant, links)
         frames: list[PosedFrame | None] = []
         for k, generator in enumerate(self._generators):
             if mask is not None and not bool(mask[k]):
                 frames.append(None)
                 continue
-            exact = images.depth[k].cpu().numpy().astype(np.float64)
-            depth = measure_depth(exact, self._intrinsics, self._noise, generator, stereo=DEPTH_MODE)
-            label = images.label[k].cpu().numpy()
+            cast = self._scene.picture(
+                self._intrinsics, T_world_camera[k], T_world_plant[k], links[k], env_index=k
+            )
+            is_plant = cast.labels != NOTHING_LABEL
+            exact = np.where(is_plant, np.minimum(cast.depth, BACKGROUND_DEPTH), BACKGROUND_DEPTH)
+            depth = measure_depth(
+                exact.astype(np.float64), self._intrinsics, self._noise, generator, stereo=DEPTH_MODE
+            )
+            fruits, numbers = true_fruits(cast, self._scene.plant(k))
             frames.append(
                 PosedFrame(
                     depth_m=depth.astype(np.float32),
                     intrinsics=self._intrinsics,
                     T_world_camera=T_world_camera[k].double().cpu().numpy(),
                     rgb=None if self._picture is None else self._picture(k),
-                    robot_mask=label == int(PixelLabel.ROBOT),
-                    true_fruits=Instances.from_masks(label[None] == int(PixelLabel.TARGET)),
+                    robot_mask=cast.labels == ROBOT_LABEL,
+                    true_fruits=fruits,
+                    true_numbers=numbers,
                 )
             )
         return frames
+
+
+def true_fruits(cast: Picture, plant: Plant) -> tuple[Instances, tuple[int, ...]]:
+    """The fruits in a cast picture and their indices in `Plant.fruits`, ordered by these."""
+    shown = set(np.unique(cast.labels).tolist())
+    numbers = tuple(
+        j for j, fruit in enumerate(plant.fruits) if fruit.organ_index + FIRST_ORGAN_LABEL in shown
+    )
+    labels = np.array([plant.fruits[j].organ_index + FIRST_ORGAN_LABEL for j in numbers], np.int32)
+    categories = tuple(_CATEGORIES[plant.fruits[j].ripeness] for j in numbers)
+    return Instances.from_masks(cast.labels[None] == labels[:, None, None], categories=categories), numbers
 
 
 def make_camera(
