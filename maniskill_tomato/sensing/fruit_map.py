@@ -1,0 +1,575 @@
+"""A map of fruits: tracks over views, each a sphere in the world with its uncertainty.
+
+A detection is a sphere fitted to a mask and depth. `FruitMap.update` assigns the detections of a view to the tracks
+jointly: the sum of their log likelihood ratios against new fruits is largest (`scipy.optimize.linear_sum_assignment`),
+none farther than the chi-square gate allows. Each track is a Kalman filter of (x, y, z, radius); what is left begins
+new tracks. Tracks that are more likely one sphere than two are merged, and a mask that covers several tracks is
+divided among them. A track that a view does not show although it should have loses existence; one that is hidden in
+it does not.
+"""
+
+import itertools
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import linear_sum_assignment
+from scipy.stats import chi2
+
+from maniskill_tomato.robot.d435 import CameraIntrinsics
+from maniskill_tomato.segmentation.masks import BinaryMask
+from maniskill_tomato.sensing.measurement import DetectedFruit, Measurement, Position
+from maniskill_tomato.sensing.visible_fraction.estimate import (
+    RADIUS_SPREAD,
+    USUAL_RADIUS,
+    Float64,
+    filled_depth,
+    fruit_depth,
+)
+from maniskill_tomato.sensing.visible_fraction.sphere import SphereConfig, whole_silhouette
+
+GATE: Final = float(chi2.ppf(0.9995, 4))
+"""Largest squared Mahalanobis distance of a detection from the track that it is assigned to."""
+
+MERGE_GATE: Final = float(chi2.ppf(0.99, 4))
+"""Largest squared Mahalanobis distance of two tracks that are merged."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class MapConfig:
+    """Errors of detections and habits of fruits, measured on validation plants."""
+
+    lateral_error_m: float = 0.0015
+    """Standard deviation across the viewing direction of the centre of a wholly visible fruit, in [m]."""
+    lateral_hidden_m: float = 0.012
+    """What a fruit of which nearly nothing is visible adds to it, in [m]."""
+    depth_error_m: float = 0.003
+    """The same along the viewing direction, in [m]."""
+    depth_hidden_m: float = 0.012
+    """As `lateral_hidden_m`, in [m]."""
+    radius_error_m: float = 0.0015
+    """The same of the radius, in [m]."""
+    radius_hidden_m: float = 0.004
+    """As `lateral_hidden_m`, in [m]."""
+    few_pixels: float = 30.0
+    """Visible pixels at which all of these are twice as large in variance."""
+    fruit_density: float = 1000.0
+    """Fruits in a cubic metre of a truss, in [1/m^3]: how likely another fruit stands at a place beside a known one."""
+    detection_rate: float = 0.95
+    """Share of the well visible fruits that a view's detections hold."""
+    false_rate: float = 0.05
+    """Share of the detections that are no fruit."""
+    ripeness_rate: float = 0.95
+    """Share of the fruits whose ripeness is told correctly."""
+    single_error: float = 0.03
+    """Standard error of one image's V_f of a fruit that is wholly visible."""
+    single_hidden: float = 0.12
+    """What a fruit that is half hidden adds to it."""
+    fused_error: float = 0.03
+    """The same for V_f by the map's sphere, its radius known."""
+    fused_hidden: float = 0.06
+    """As `single_hidden`."""
+    error_scale: float = 1.0
+    """Standard error of both together over that of two independent estimates."""
+    stop_errors: float = 1.0
+    """A fruit is taken for fully visible when V_f less so many standard errors is above the threshold."""
+
+
+@dataclass(eq=False, kw_only=True)
+class Track:
+    """One fruit."""
+
+    number: int
+    """Its name in the map; no two tracks have had the same."""
+    mean: Float64
+    """Centre in the world frame and radius, in [m]. Shape (4,)."""
+    covariance: Float64
+    """Of these, in [m^2]. Shape (4, 4)."""
+    ripe_log_odds: float = 0.0
+    """Of being ripe."""
+    existence_log_odds: float = 0.0
+    """Of being a fruit at all."""
+    views: int = 0
+    """Views that it was detected in."""
+    best_fraction: float = 0.0
+    """Largest V_f of any view."""
+    best_pose: Float64 | None = None
+    """Pose of the optical frame of that view. Shape (4, 4)."""
+    apart_from: set[int] = field(default_factory=set)
+    """Numbers of tracks that were detected beside it in one view: they are other fruits."""
+
+    @property
+    def position_w(self) -> Position:
+        """Centre in the world frame, in [m]. Shape (3,)."""
+        return self.mean[:3]
+
+    @property
+    def radius_m(self) -> float:
+        """In [m]."""
+        return float(self.mean[3])
+
+    @property
+    def is_ripe(self) -> bool:
+        """Whether it is more likely ripe than not."""
+        return self.ripe_log_odds > 0.0
+
+    @property
+    def existence(self) -> float:
+        """Probability that there is a fruit."""
+        return float(1.0 / (1.0 + np.exp(-self.existence_log_odds)))
+
+
+@dataclass(frozen=True, kw_only=True)
+class Fraction:
+    """V_f of a fruit in a view."""
+
+    value: float
+    """The estimate."""
+    error: float
+    """Its standard error."""
+    single: float
+    """What the view alone says; NaN if nothing."""
+    fused: float
+    """By the map's sphere; NaN if it does not stand in the view."""
+
+    @classmethod
+    def nothing(cls) -> "Fraction":
+        """Of a fruit that is not seen."""
+        return cls(value=0.0, error=0.0, single=0.0, fused=0.0)
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class MappedView:
+    """A view with what the map makes of it."""
+
+    measurement: Measurement
+    """The detections, a mask that covered several tracks divided."""
+    tracks: tuple[int, ...]
+    """Number of each detection's track."""
+
+    def detection(self, number: int | None) -> int | None:
+        """Index of a track's detection; None if the view has none."""
+        return self.tracks.index(number) if number in self.tracks else None
+
+
+Divide = Callable[[Measurement, int, Sequence[BinaryMask]], Measurement]
+"""Measures a view anew with other masks instead of one of its detections."""
+
+
+class FruitMap:
+    """The tracks of one environment."""
+
+    def __init__(self, config: MapConfig | None = None, divide: Divide | None = None) -> None:
+        """Begins without a track.
+
+        Args:
+            config: Errors and habits; measured defaults if None.
+            divide: Divides masks that cover several tracks; if None they stay whole.
+        """
+        self.config = config or MapConfig()
+        self.tracks: dict[int, Track] = {}
+        """By their numbers."""
+        self._divide = divide
+        self._next = 0
+        self._merged: dict[int, int] = {}
+
+    def current(self, number: int) -> int | None:
+        """What a track is called now that others may have taken it in; None if it is gone."""
+        while number in self._merged:
+            number = self._merged[number]
+        return number if number in self.tracks else None
+
+    def update(self, measurement: Measurement, identities: Sequence[int | None] | None = None) -> MappedView:
+        """Takes in a view.
+
+        Args:
+            measurement: Its detections.
+            identities: Which fruit each detection shows, for a true association: the fruit's number is then its
+                track's. None to find out.
+
+        Returns:
+            The view with the track of each detection.
+        """
+        if identities is None:
+            measurement = self._divided(measurement)
+            numbers = self._assigned(measurement)
+        else:
+            numbers = self._identified(identities)
+        camera = measurement.camera_position
+        assigned: list[int] = []
+        for fruit, number in zip(measurement.fruits, numbers, strict=True):
+            mean, covariance = self.sphere_of(fruit, camera)
+            if number is None:
+                number, self._next = self._next, self._next + 1
+            if number in self.tracks:
+                self._correct(self.tracks[number], mean, covariance)
+            else:
+                self.tracks[number] = self._born(number, mean, covariance)
+            self._count(self.tracks[number], fruit)
+            assigned.append(number)
+        for number in assigned:
+            self.tracks[number].apart_from |= set(assigned) - {number}
+        self._miss(measurement, set(assigned))
+        names = {number: number for number in assigned}
+        if identities is None:
+            self._merge()
+            names = {number: self.current(number) or number for number in assigned}
+        view = MappedView(measurement=measurement, tracks=tuple(names[number] for number in assigned))
+        self._keep_best(view)
+        return view
+
+    def sphere_of(self, fruit: DetectedFruit, camera: Position) -> tuple[Float64, Float64]:
+        """A detection as a measurement of centre and radius.
+
+        Along the viewing direction it is less certain than across, and the less of the fruit is visible the less it is
+        certain.
+
+        Args:
+            fruit: The detection.
+            camera: Where it was seen from, world frame, in [m]. Shape (3,).
+
+        Returns:
+            Mean and covariance, world frame, in [m] and [m^2]. Shapes (4,), (4, 4).
+        """
+        c = self.config
+        fraction = fruit.visible_fraction if np.isfinite(fruit.visible_fraction) else 0.0
+        hidden = (1.0 - fraction) ** 2
+        few = 1.0 + c.few_pixels / max(fruit.pixels, 1)
+        lateral = (c.lateral_error_m**2 + (c.lateral_hidden_m * hidden) ** 2) * few
+        along = (c.depth_error_m**2 + (c.depth_hidden_m * hidden) ** 2) * few
+        radius = (c.radius_error_m**2 + (c.radius_hidden_m * hidden) ** 2) * few
+        centre, radius_m = fruit.centre_w, fruit.radius_m
+        if centre is None:
+            # Nearer than the depth camera measures: somewhere in front of the lens.
+            centre, along = camera + NEAR_CENTRE * fruit.direction_w, NEAR_CENTRE**2
+        if not np.isfinite(radius_m):
+            radius_m, radius = USUAL_RADIUS, (USUAL_RADIUS * RADIUS_SPREAD) ** 2
+        away = (centre - camera) / max(float(np.linalg.norm(centre - camera)), 1e-9)
+        covariance = np.zeros((4, 4))
+        covariance[:3, :3] = lateral * np.eye(3) + (along - lateral) * np.outer(away, away)
+        covariance[3, 3] = radius
+        return np.array([*centre, radius_m]), covariance
+
+    def fraction(self, measurement: Measurement, index: int | None, number: int | None) -> Fraction:
+        """V_f of a track in a view: that of the single image and that by the map's sphere, weighted by their variances.
+
+        Args:
+            measurement: The view.
+            index: The track's detection; None if it has none, which makes V_f 0.
+            number: The track.
+        """
+        if index is None or number is None:
+            return Fraction.nothing()
+        c, fruit, track = self.config, measurement.fruits[index], self.tracks[number]
+        single = float(fruit.visible_fraction)
+        fused = _fused_fraction(measurement, index, track)
+        parts = []
+        if np.isfinite(single):
+            parts.append((single, c.single_error + c.single_hidden * 2 * min(single, 1 - single)))
+        if np.isfinite(fused):
+            radius = 2.0 * float(np.sqrt(track.covariance[3, 3])) / track.radius_m
+            shape = c.fused_error + c.fused_hidden * 2 * min(fused, 1 - fused)
+            parts.append((fused, float(np.hypot(shape, fused * (1 - fused) * 2 * radius))))
+        if not parts:
+            return Fraction(value=0.0, error=1.0, single=single, fused=fused)
+        weights = np.array([1.0 / error**2 for _, error in parts])
+        value = float(weights @ [v for v, _ in parts] / weights.sum())
+        error = c.error_scale / float(np.sqrt(weights.sum()))
+        return Fraction(value=value, error=error, single=single, fused=fused)
+
+    # ------------------------------------------------------------------ assignment
+
+    def _identified(self, identities: Sequence[int | None]) -> list[int | None]:
+        self._next = max([self._next, *(j + 1 for j in identities if j is not None)], default=0)
+        taken: set[int] = set()
+        numbers: list[int | None] = []
+        for j in identities:
+            if j in taken or j is None:
+                numbers.append(None)
+            else:
+                taken.add(j)
+                numbers.append(j)
+        self._next = max(self._next, UNKNOWN_FRUITS)
+        return numbers
+
+    def _assigned(self, measurement: Measurement) -> list[int | None]:
+        """The track of each detection; None for a new one."""
+        tracks = list(self.tracks.values())
+        if not tracks or not measurement.fruits:
+            return [None] * len(measurement.fruits)
+        spheres = [self.sphere_of(fruit, measurement.camera_position) for fruit in measurement.fruits]
+        gains = np.array(
+            [
+                [self._gain(track, *sphere, fruit) for track in tracks]
+                for sphere, fruit in zip(spheres, measurement.fruits, strict=True)
+            ]
+        )
+        rows, columns = linear_sum_assignment(np.maximum(gains, 0.0), maximize=True)
+        numbers: list[int | None] = [None] * len(measurement.fruits)
+        for row, column in zip(rows, columns, strict=True):
+            if gains[row, column] > 0.0:
+                numbers[row] = tracks[column].number
+        return numbers
+
+    def _gain(self, track: Track, mean: Float64, covariance: Float64, fruit: DetectedFruit) -> float:
+        """Log likelihood ratio: a detection of this track, against one of another fruit with this track missed."""
+        c = self.config
+        innovation = mean - track.mean
+        spread = track.covariance + covariance
+        distance = float(innovation @ np.linalg.solve(spread, innovation))
+        if distance > GATE:
+            return -np.inf
+        density = -0.5 * distance - 0.5 * float(np.linalg.slogdet(2.0 * np.pi * spread)[1])
+        new = np.log(c.fruit_density / (np.sqrt(2 * np.pi) * USUAL_RADIUS * RADIUS_SPREAD))
+        ripe = 1.0 / (1.0 + np.exp(-track.ripe_log_odds))
+        same = ripe if fruit.is_ripe else 1.0 - ripe
+        agreement = np.log(2.0 * (c.ripeness_rate * same + (1.0 - c.ripeness_rate) * (1.0 - same)))
+        return float(density - new + agreement)
+
+    # ------------------------------------------------------------------ tracks
+
+    def _born(self, number: int, mean: Float64, covariance: Float64) -> Track:
+        # The radius is known beforehand, from other fruits.
+        track = Track(number=number, mean=mean.copy(), covariance=covariance.copy())
+        usual = (USUAL_RADIUS * RADIUS_SPREAD) ** 2
+        gain = track.covariance[:, 3] / (track.covariance[3, 3] + usual)
+        track.mean = track.mean + gain * (USUAL_RADIUS - track.mean[3])
+        track.covariance = track.covariance - np.outer(gain, track.covariance[3])
+        return track
+
+    def _correct(self, track: Track, mean: Float64, covariance: Float64) -> None:
+        """Kalman's correction with a measurement of the whole state, in Joseph's form."""
+        gain = np.linalg.solve((track.covariance + covariance).T, track.covariance.T).T
+        rest = np.eye(4) - gain
+        track.mean = track.mean + gain @ (mean - track.mean)
+        track.covariance = rest @ track.covariance @ rest.T + gain @ covariance @ gain.T
+
+    def _count(self, track: Track, fruit: DetectedFruit) -> None:
+        c = self.config
+        told = float(np.log(c.ripeness_rate / (1.0 - c.ripeness_rate)))
+        if fruit.category != "tomato":
+            track.ripe_log_odds += told if fruit.is_ripe else -told
+        elif track.views == 0:
+            track.ripe_log_odds = told
+        track.ripe_log_odds = float(np.clip(track.ripe_log_odds, -LARGEST_LOG_ODDS, LARGEST_LOG_ODDS))
+        track.existence_log_odds += float(np.log(c.detection_rate / c.false_rate)) * float(
+            np.clip(fruit.score, 0.0, 1.0)
+        )
+        track.existence_log_odds = min(track.existence_log_odds, LARGEST_LOG_ODDS)
+        track.views += 1
+
+    def _miss(self, measurement: Measurement, detected: set[int]) -> None:
+        """Takes existence from tracks that should have been detected; those that are hidden keep theirs."""
+        for number, track in list(self.tracks.items()):
+            if number in detected:
+                continue
+            shown = shown_share(track, measurement)
+            if shown is None:
+                continue
+            track.existence_log_odds += float(np.log(1.0 - self.config.detection_rate * shown))
+            if track.existence_log_odds < SMALLEST_LOG_ODDS:
+                del self.tracks[number]
+
+    def _merge(self) -> None:
+        for a, b in itertools.combinations(sorted(self.tracks), 2):
+            if a not in self.tracks or b not in self.tracks:
+                continue
+            first, second = self.tracks[a], self.tracks[b]
+            if b in first.apart_from or a in second.apart_from:
+                continue
+            if not self._is_one(first, second):
+                continue
+            self._correct(first, second.mean, second.covariance)
+            first.ripe_log_odds = float(
+                np.clip(
+                    first.ripe_log_odds + second.ripe_log_odds, -LARGEST_LOG_ODDS, LARGEST_LOG_ODDS
+                )
+            )
+            first.existence_log_odds = max(first.existence_log_odds, second.existence_log_odds)
+            first.views += second.views
+            first.apart_from |= second.apart_from
+            if second.best_fraction > first.best_fraction:
+                first.best_fraction, first.best_pose = second.best_fraction, second.best_pose
+            self._merged[b] = a
+            del self.tracks[b]
+
+    def _is_one(self, first: Track, second: Track) -> bool:
+        difference = first.mean - second.mean
+        if np.linalg.norm(difference[:3]) > 0.5 * (first.radius_m + second.radius_m):
+            return False  # Two solid fruits can be as near as that.
+        spread = first.covariance + second.covariance
+        distance = float(difference @ np.linalg.solve(spread, difference))
+        if distance > MERGE_GATE:
+            return False
+        density = -0.5 * distance - 0.5 * float(np.linalg.slogdet(2.0 * np.pi * spread)[1])
+        other = np.log(self.config.fruit_density / (np.sqrt(2 * np.pi) * USUAL_RADIUS * RADIUS_SPREAD))
+        return bool(density > other)
+
+    def _keep_best(self, view: MappedView) -> None:
+        for index, number in enumerate(view.tracks):
+            track = self.tracks.get(number)
+            if track is None:
+                continue
+            value = float(view.measurement.fruits[index].visible_fraction)
+            if np.isfinite(value) and value > track.best_fraction:
+                track.best_fraction = value
+                track.best_pose = view.measurement.frame.T_world_camera
+
+    # ------------------------------------------------------------------- division
+
+    def _divided(self, measurement: Measurement) -> Measurement:
+        """The view with masks that cover several known fruits divided among these."""
+        if self._divide is None:
+            return measurement
+        index = 0
+        while index < len(measurement.fruits):
+            parts = self._parts(measurement, index)
+            if parts is None:
+                index += 1
+            else:
+                measurement = self._divide(measurement, index, parts)
+                index += len(parts)
+        return measurement
+
+    def _parts(self, measurement: Measurement, index: int) -> list[BinaryMask] | None:
+        """A detection's mask divided among the well-known tracks that it covers; None if it is of one fruit."""
+        frame = measurement.frame
+        circles = []
+        mask = measurement.mask(index)
+        for track in self.tracks.values():
+            if track.views < SURE_VIEWS or track.existence_log_odds <= 0.0:
+                continue
+            circle = outline(track.mean, frame.T_world_camera, frame.intrinsics)
+            if circle is not None and _covered(mask, circle) > COVERED_SHARE:
+                circles.append(circle)
+        if len(circles) < 2:
+            return None
+        rows, columns = np.nonzero(mask)
+        away = np.stack([np.hypot(columns + 0.5 - x, rows + 0.5 - y) / r for x, y, r in circles])
+        nearest = away.argmin(0)
+        parts = []
+        for k in range(len(circles)):
+            part = np.zeros_like(mask)
+            part[rows[nearest == k], columns[nearest == k]] = True
+            if part.any():
+                parts.append(part)
+        return parts if len(parts) > 1 else None
+
+
+NEAR_CENTRE: Final = 0.1
+"""How far from the camera the centre of a fruit without depth is taken to be, in [m]."""
+
+UNKNOWN_FRUITS: Final = 10_000
+"""With true identities, numbers from here on are those of detections that show no fruit."""
+
+LARGEST_LOG_ODDS: Final = 8.0
+SMALLEST_LOG_ODDS: Final = -2.0
+"""A track with a smaller log-odds of existence is forgotten."""
+
+SURE_VIEWS: Final = 2
+"""A mask is divided only among tracks that were detected in so many views."""
+
+COVERED_SHARE: Final = 0.6
+"""A mask covers a track when it holds this share of its outline's pixels."""
+
+SURFACE_MARGIN: Final = 1.0
+"""Depths up to so many radii in front of a fruit's centre and as many behind it are its own."""
+
+
+def outline(
+    sphere: Float64, T_world_camera: Float64, intrinsics: CameraIntrinsics
+) -> tuple[float, float, float] | None:
+    """The circle that a sphere makes in a picture.
+
+    Args:
+        sphere: Centre in the world frame and radius, in [m]. Shape (4,).
+        T_world_camera: Pose of the optical frame. Shape (4, 4).
+        intrinsics: The camera's.
+
+    Returns:
+        x, y, radius, in [px]; None for a sphere that reaches behind the camera.
+    """
+    centre = T_world_camera[:3, :3].T @ (sphere[:3] - T_world_camera[:3, 3])
+    x, y, z, radius = float(centre[0]), float(centre[1]), float(centre[2]), float(sphere[3])
+    if z <= 1.2 * radius:
+        return None
+    i = intrinsics
+    return i.fx * x / z + i.cx, i.fy * y / z + i.cy, i.fx * radius / float(np.sqrt(z**2 - radius**2))
+
+
+def shown_share(track: Track, measurement: Measurement) -> float | None:
+    """The share of a track's outline that a view should show by its depth.
+
+    Returns:
+        1 if nothing is in front of it, also where the depth is that of what stands behind; 0 if it is hidden; None if
+        it lies outside the picture.
+    """
+    frame = measurement.frame
+    circle = outline(track.mean, frame.T_world_camera, frame.intrinsics)
+    if circle is None:
+        return None
+    x, y, radius = circle
+    height, width = frame.depth_m.shape
+    if not (radius < x < width - radius and radius < y < height - radius):
+        return None
+    step = max(radius / 6.0, 1.0)
+    offsets = np.arange(-radius, radius + step, step)
+    dx, dy = np.meshgrid(offsets, offsets)
+    disc = dx**2 + dy**2 < (0.8 * radius) ** 2
+    columns = np.clip((x + dx[disc]).astype(int), 0, width - 1)
+    rows = np.clip((y + dy[disc]).astype(int), 0, height - 1)
+    depth = frame.depth_m[rows, columns]
+    if frame.robot_mask is not None:
+        depth = np.where(frame.robot_mask[rows, columns], 0.0, depth)
+    z = float((frame.T_world_camera[:3, :3].T @ (track.position_w - frame.T_world_camera[:3, 3]))[2])
+    deviation = float(np.sqrt(np.trace(track.covariance[:3, :3])))
+    front = z - SURFACE_MARGIN * track.radius_m - deviation
+    return float(np.mean(np.isfinite(depth) & (depth > front)))
+
+
+def _covered(mask: BinaryMask, circle: tuple[float, float, float]) -> float:
+    """The share of a circle's pixels that a mask holds."""
+    x, y, radius = circle
+    height, width = mask.shape
+    left, top = max(int(x - radius), 0), max(int(y - radius), 0)
+    right, bottom = min(int(x + radius) + 1, width), min(int(y + radius) + 1, height)
+    if left >= right or top >= bottom:
+        return 0.0
+    u, v = np.meshgrid(np.arange(left, right) + 0.5, np.arange(top, bottom) + 0.5)
+    disc = (u - x) ** 2 + (v - y) ** 2 < radius**2
+    return float(np.count_nonzero(mask[top:bottom, left:right] & disc) / (np.pi * radius**2))
+
+
+def _fused_fraction(measurement: Measurement, index: int, track: Track) -> float:
+    """V_f of a detection by the track's sphere: visible pixels over those and the hidden ones of its outline."""
+    frame = measurement.frame
+    circle = outline(track.mean, frame.T_world_camera, frame.intrinsics)
+    if circle is None:
+        return float("nan")
+    mask = measurement.mask(index)
+    measured = np.where(np.isfinite(frame.depth_m) & (frame.depth_m > 0), frame.depth_m, 0.0).astype(np.float64)
+    own = fruit_depth(measured, mask)
+    if not np.isfinite(own):
+        return float("nan")
+    depth, fruits = _fruit_depths(measurement, measured)
+    edge = SphereConfig().edge_step_m
+    whole, outside = whole_silhouette(mask, circle, depth, own + edge, own, fruits)
+    visible = np.count_nonzero(mask)
+    return float(min(visible / (np.count_nonzero(whole) + outside), 1.0))
+
+
+def _fruit_depths(
+    measurement: Measurement, measured: NDArray[np.float64]
+) -> tuple[Float64, NDArray[np.bool_]]:
+    """Depth without holes, each detection at one depth, and the pixels of all detections. Shapes (H, W)."""
+    depth = filled_depth(measured)
+    fruits = np.zeros(depth.shape, np.bool_)
+    for k in range(len(measurement.fruits)):
+        mask = measurement.mask(k)
+        own = fruit_depth(measured, mask)
+        if np.isfinite(own):
+            depth[mask] = own
+        fruits |= mask
+    return depth, fruits
