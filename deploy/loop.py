@@ -167,7 +167,7 @@ class Loop:
         blind = self._capture.is_blind(frame)
         step = self._look(frame, joints)
         view = step.view
-        if view.visible_fraction > config.threshold:
+        if view.sure_fraction > config.threshold:
             self._end(step, "success", f"V_f = {view.visible_fraction:.2f} after {self._moves} moves")
         if self._moves >= config.max_moves:
             self._end(step, "budget", f"V_f = {view.visible_fraction:.2f} after all {config.max_moves} moves")

@@ -60,6 +60,8 @@ class RobotBelief:
             target = torch.as_tensor(sighting.target_position, dtype=torch.float32)[None]
             self._observer.begin(torch.zeros(1, dtype=torch.int64), target)
             self._has_views = True
+        elif sighting.recall is not None:
+            sighting.recall(self._observer)
         T_world_flange, T_world_camera = self._poses(joint_positions)
         self._rpy = matrix_to_rpy(T_world_flange[:, :3, :3], self._rpy)
         viewpoint = torch.cat([T_world_flange[:, :3, 3], self._rpy], dim=-1)

@@ -1,10 +1,12 @@
 """The robot's frames through `sensing`: what a picture tells about the target."""
 
 import importlib
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, Final, Literal, Protocol
 
 import numpy as np
+import torch
 
 from maniskill_tomato.deploy.deploy_errors import PerceptionError, ProfileError
 from maniskill_tomato.deploy.interface import Float64, Frame
@@ -16,15 +18,23 @@ from maniskill_tomato.segmentation.masks import BinaryMask
 from maniskill_tomato.segmentation.segmenter import Segmenter
 from maniskill_tomato.sensing.camera_perception import CameraPerception
 from maniskill_tomato.sensing.fruit_detector import FruitDetector
+from maniskill_tomato.sensing.fruit_map import FruitMap
 from maniskill_tomato.sensing.measurement import RIPE_CATEGORIES
+from maniskill_tomato.sensing.observation import ViewpointObserver
 from maniskill_tomato.sensing.posed_frame import PosedFrame
-from maniskill_tomato.sensing.target_tracker import choose_new_target
 
 Sight = Literal["images", "rays"]
 """From masks and depth images, as on a robot; or from the twin's exact rays, as in the simulated task."""
 
 TRUE_MASKS: Final = "ground_truth"
 """Name of the segmenter that takes the masks that only a simulated camera knows."""
+
+
+PLACE_ERROR: Final = 0.01
+"""Standard deviation of each coordinate of a target's position that a profile gives, in [m]."""
+
+FULL_VISIBILITY: Final = 0.8
+"""A fruit of which more is visible needs no better view, as in `TomatoViewpoint-v1`."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -35,12 +45,16 @@ class Sighting:
     """The pattern about the target, as the simulated task has it."""
     visible_fraction: float
     """V_f, 0 if the target is not seen."""
+    sure_fraction: float
+    """Lower bound of V_f, by which a run ends."""
     mask: BinaryMask
     """Visible pixels of the target. Shape (H, W)."""
     fruits_seen: int
     """How many ripe fruits the picture shows."""
     target_position: Float64
     """Where the target is believed to be, world frame, in [m]. Shape (3,)."""
+    recall: Callable[[ViewpointObserver], None] | None = None
+    """Makes a memory of earlier views anew, if the target turned out to stand elsewhere."""
 
     @property
     def target_seen(self) -> bool:
@@ -95,11 +109,11 @@ class ImagePerception:
         self.begin(None)
 
     def begin(self, target_position: Float64 | None) -> None:
-        """Forgets all views; without a position the largest sure ripe fruit of the first picture is the target."""
+        """Forgets all views; without a position the largest sure ripe fruit of the first picture is the target, of
+        those that it does not show fully if there are any."""
         self._perception = CameraPerception(1, self._detector)
-        self._has_target = target_position is not None
-        if target_position is not None:
-            self._perception.begin(0, target_position, is_located=True)
+        self._perception.begin(0, target_position, place_error=PLACE_ERROR)
+        self._chooses = target_position is None
 
     def look(self, frame: Frame, T_world_camera: Float64) -> Sighting | None:
         """The sighting by masks and depth; see `Perception`."""
@@ -108,21 +122,31 @@ class ImagePerception:
             measured = self._detector.measure(self._posed(frame, T_world_camera))
         except TomatoError as error:
             raise PerceptionError(f"the picture cannot be segmented: {error}") from error
-        if not self._has_target:
-            chosen = choose_new_target(measured.fruits)
-            centre = None if chosen is None else measured.fruits[chosen].centre_w
-            if centre is None:
+        moved = perception.add(0, measured)
+        if self._chooses:
+            perception.choose(0, FULL_VISIBILITY)
+            if perception.target(0) is None:
+                perception.choose(0, 1.0)
+            if perception.target(0) is None:
                 return None
-            perception.begin(0, centre, is_located=True)
-            self._has_target = True
-        perception.add(0, measured)
+            self._chooses, moved = False, True
         return Sighting(
             rays=perception.rays(),
             visible_fraction=float(perception.visible_fraction[0]),
-            mask=measured.mask(perception.target_fruit(0)),
+            sure_fraction=float(perception.sure_fraction[0]),
+            mask=perception.mask(0),
             fruits_seen=sum(fruit.is_ripe for fruit in measured.fruits),
             target_position=perception.position_w(0),
+            recall=self._recall if moved else None,
         )
+
+    @property
+    def map(self) -> FruitMap:
+        """The fruits that were seen since `begin`."""
+        return self._perception.map(0)
+
+    def _recall(self, observer: ViewpointObserver) -> None:
+        self._perception.recall(observer, torch.zeros(1, dtype=torch.int64))
 
     def _posed(self, frame: Frame, T_world_camera: Float64) -> PosedFrame:
         robot_mask, fruits = None, None
@@ -164,6 +188,7 @@ class TruthPerception:
         return Sighting(
             rays=truth.rays,
             visible_fraction=truth.visible_fraction,
+            sure_fraction=truth.visible_fraction,
             mask=np.asarray(truth.labels == truth.target_label),
             fruits_seen=sum(bool((truth.labels == label).any()) for label in truth.ripe_labels),
             target_position=self._target,

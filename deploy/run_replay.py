@@ -149,9 +149,7 @@ def replay(recorded: RecordedRun, policy: str | None = None) -> Replay:
         stops=Stops(),
         recorder=comparison,
         mode="unattended",
-        target_position=np.array(recorded.steps[0].facts["target_position"])
-        if profile.target.source != "seen"
-        else None,
+        target_position=_given_target(recorded),
     )
     result = loop.run()
     differences = list(comparison.differences)
@@ -298,6 +296,14 @@ def _frame(parts: dict[str, dict[str, Any]], facts: dict[str, Any]) -> Frame:
         number=int(facts["frame_number"]),
         truth=_truth(parts["/truth"]) if "/truth" in parts else None,
     )
+
+
+def _given_target(recorded: RecordedRun) -> Float64 | None:
+    """What the run was told about its target; None if it chose one. Shape (3,)."""
+    target, truth = recorded.profile.target, recorded.steps[0].frame.truth
+    if target.source == "given":
+        return np.array(target.position)
+    return None if target.source == "seen" or truth is None else truth.target_position
 
 
 def _truth(message: dict[str, Any]) -> FrameTruth:

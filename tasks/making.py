@@ -23,7 +23,7 @@ from maniskill_tomato.tasks import (
 )
 from maniskill_tomato.tasks.arm_moves import ArmMoves, Control
 from maniskill_tomato.tasks.row.episode_selection import EpisodeChoice
-from maniskill_tomato.tasks.row.row_config import GeneralTaskConfig
+from maniskill_tomato.tasks.row.row_config import CameraConfig, GeneralTaskConfig
 from maniskill_tomato.tasks.row.search_game import SearchGame
 from maniskill_tomato.tasks.row.target_sequence import Transits
 from maniskill_tomato.tasks.thesis.thesis_config import ViewpointTaskConfig, guided_task, sparse_task
@@ -81,6 +81,12 @@ class SearchOptions(WorldOptions):
     """What camera and segmenter get wrong about exact labels."""
     perception: Perception = "ground_truth"
     """Where V_f, the target's position and the rays' labels come from."""
+    target: str | None = None
+    """How the target is named to a robot that sees through a camera, one of `Naming`; `track` if None."""
+    map_noise: float | None = None
+    """With `target="map"`: standard deviation of each coordinate of the place that is given, in [m]; 0.03 if None."""
+    association: str | None = None
+    """Who says which track a camera's detection belongs to, one of `Association`; `map` if None."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -251,6 +257,7 @@ def _search_setup(options: SearchOptions) -> TaskSetup:
             "sensor_noise disturbs ground truth; leave it out with perception='occlusion_model', "
             "whose depth has noise of its own"
         )
+    camera = _camera_config(options)
     task = options.task
     if options.start_visibility is not None:
         start_visibility = option_checks.check_range("start_visibility", options.start_visibility)
@@ -274,12 +281,33 @@ def _search_setup(options: SearchOptions) -> TaskSetup:
             layout=shape,
             noise=noise,
             perception=options.perception,
+            camera=camera,
             transits=transits,
         ),
         needs_pictures=options.perception in RENDERED,
         follows_list=episodes.episodes is not None,
         **_standing(options, task, plant, task.plant_pose_noise),
     )
+
+
+def _camera_config(options: SearchOptions) -> CameraConfig:
+    """How targets are named; a row gives a place for each."""
+    given: dict[str, Any] = {
+        name: value
+        for name in ("target", "map_noise", "association")
+        if (value := getattr(options, name)) is not None
+    }
+    if given and options.perception == "ground_truth":
+        raise InvalidInputError(
+            f"{next(iter(given))} is for a robot that sees through a camera; choose perception= as well"
+        )
+    is_row = isinstance(options, RowOptions)
+    if is_row and given.setdefault("target", "map") != "map":
+        raise InvalidInputError(f"target must be 'map' in a row; got {options.target!r}")
+    config = CameraConfig(**given)
+    if options.map_noise is not None and config.target != "map":
+        raise InvalidInputError(f"map_noise goes with target='map'; got target={config.target!r}")
+    return config
 
 
 def _standing(

@@ -57,6 +57,7 @@ def evaluate(config: EvaluationConfig) -> EvaluationResult:
     found = find_policy(config.policy or shipped_policy(config.env_id), _required_task(config))
     path = found if isinstance(found, Path) else None
     episodes, baseline, threshold, policy = _run(config, found)
+    true_association = _with_true_association(config, found)
     description = {
         "path": None if path is None else str(path),
         **(policy.describe() if isinstance(policy, Planner) else {"kind": policy.name}),
@@ -69,6 +70,7 @@ def evaluate(config: EvaluationConfig) -> EvaluationResult:
         policy=description,
         wall_seconds=time.perf_counter() - start,
         baseline=baseline,
+        true_association=true_association,
     )
     write_json(config.out / "metrics.json", metrics)
     write_trajectories(config.out / "trajectories.npz", episodes)
@@ -182,6 +184,21 @@ def _run(
     finally:
         env.close()
     return episodes, baseline, threshold, policy
+
+
+def _with_true_association(config: EvaluationConfig, found: str | Path) -> list[EpisodeRecord] | None:
+    """The policy's episodes when the truth tells which fruit each detection is; None where no camera decides, or the
+    options say already who tells."""
+    options = config.env_options
+    if options.get("perception", "ground_truth") == "ground_truth" or "association" in options:
+        return None
+    logger.info("the same episodes with a true association, to compare")
+    env = make_env(config.env_id, **options, association="truth")
+    try:
+        policy = _open(config, found, env)
+        return run_episodes(env, policy, config.episodes, config.seed, config.show_progress)
+    finally:
+        env.close()
 
 
 def _plot_episodes(

@@ -164,6 +164,10 @@ def run_batch(
                 clearance=step.get("clearance"),
                 true_visible_fraction=view.get("true_visible_fraction"),
                 true_target=view.get("true_target"),
+                chosen_visible_fraction=view.get("chosen_visible_fraction"),
+                chosen_fruit=_indices(view.get("chosen_fruit")),
+                target_fruit=_indices(view["target_fruit"]) if "chosen_fruit" in view else None,
+                target_named=_flags(view.get("target_named")),
                 oracle_moves=None if oracle_moves is None else oracle_moves[i],
                 row=_row_search(targets[i], view, step) if searches else None,
             )
@@ -185,6 +189,9 @@ def _view(world: Any, observations: Any, info: dict[str, Any]) -> dict[str, Floa
     if (true := info.get("true_visible_fraction")) is not None:
         view["true_visible_fraction"] = _array(true)
         view["true_target"] = _array(world.target_position_w)
+    if "chosen_fruit" in info:
+        for name in ("chosen_visible_fraction", "chosen_fruit", "target_named"):
+            view[name] = _array(info[name])
     if (fruit := getattr(world, "target_fruit", None)) is not None:
         view["target_fruit"] = _array(fruit)
     return view
@@ -233,6 +240,10 @@ def _stacked(parts: Sequence[dict[str, Float64]]) -> dict[str, Float64]:
 
 def _flags(values: Float64 | None) -> Any:
     return None if values is None else values.astype(np.bool_)
+
+
+def _indices(values: Float64 | None) -> Any:
+    return None if values is None else values.astype(np.int64)
 
 
 def _array(values: Any) -> Float64:

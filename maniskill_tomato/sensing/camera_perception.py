@@ -14,6 +14,7 @@ from torch import Tensor
 
 from maniskill_tomato.errors import InvalidInputError
 from maniskill_tomato.raycast.view_rays import RAYS_PER_SIDE, RayLabel, ViewRays
+from maniskill_tomato.segmentation.masks import BinaryMask
 from maniskill_tomato.sensing.fruit_detector import FruitDetector
 from maniskill_tomato.sensing.fruit_map import Fraction, FruitMap, MapConfig, MappedView, Track
 from maniskill_tomato.sensing.measurement import Measurement, Position
@@ -146,6 +147,18 @@ class CameraPerception:
         search.target = number
         return self._aim(search)
 
+    def choose(self, env_index: int, threshold: float) -> bool:
+        """Makes the largest ripe, sure fruit of the last view the target, if its V_f there is not above a threshold.
+
+        Returns:
+            Whether memory and rays must be centred anew, with `recall`.
+        """
+        search = self._searches[env_index]
+        if search.views:
+            search.threshold = threshold
+            self._choose(search, search.views[-1])
+        return self._aim(search)
+
     def look(self, frames: Sequence[PosedFrame | None]) -> Tensor:
         """Measures new frames and finds the targets in them.
 
@@ -207,6 +220,17 @@ class CameraPerception:
         """Index of the target among the fruits of the last view; None if it does not show it."""
         view = self.last_view(env_index)
         return None if view is None else view.detection(self._searches[env_index].target)
+
+    def mask(self, env_index: int) -> BinaryMask:
+        """Visible pixels of the target in the last view. Shape (H, W).
+
+        Raises:
+            InvalidInputError: There is no view yet.
+        """
+        view = self.last_view(env_index)
+        if view is None:
+            raise InvalidInputError("there is no mask before the first view")
+        return view.measurement.mask(self.target_fruit(env_index))
 
     def position_w(self, env_index: int) -> Position:
         """About which an environment's memory and rays stand, world frame, in [m]: where the target is believed to be,
@@ -297,7 +321,7 @@ class CameraPerception:
         best, pixels = None, 0
         for index, (fruit, number) in enumerate(zip(view.measurement.fruits, view.tracks, strict=True)):
             track = search.map.tracks.get(number)
-            if track is None or not track.is_ripe or fruit.score < SURE_SCORE or fruit.centre_w is None:
+            if track is None or not track.is_ripe or fruit.score < SURE_SCORE or not fruit.is_depth_measured:
                 continue
             seen = search.map.fraction(view.measurement, index, number)
             if seen.value <= search.threshold and fruit.pixels > pixels:

@@ -128,6 +128,7 @@ def _fruit(
         visible_fraction=estimate.visible_fraction,
         centre_w=None if centre is None else rotation @ centre + frame.T_world_camera[:3, 3],
         radius_m=estimate.radius_m,
+        is_depth_measured=bool(np.isfinite(fruit_depth(view.depth_m, mask))),
         direction_w=rotation @ (ray / np.linalg.norm(ray)),
     )
 

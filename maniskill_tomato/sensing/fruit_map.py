@@ -21,13 +21,7 @@ from scipy.stats import chi2
 from maniskill_tomato.robot.d435 import CameraIntrinsics
 from maniskill_tomato.segmentation.masks import BinaryMask
 from maniskill_tomato.sensing.measurement import DetectedFruit, Measurement, Position
-from maniskill_tomato.sensing.visible_fraction.estimate import (
-    RADIUS_SPREAD,
-    USUAL_RADIUS,
-    Float64,
-    filled_depth,
-    fruit_depth,
-)
+from maniskill_tomato.sensing.visible_fraction.estimate import Float64, filled_depth, fruit_depth
 from maniskill_tomato.sensing.visible_fraction.sphere import SphereConfig, whole_silhouette
 
 GATE: Final = float(chi2.ppf(0.9995, 4))
@@ -43,34 +37,36 @@ class MapConfig:
 
     lateral_error_m: float = 0.0015
     """Standard deviation across the viewing direction of the centre of a wholly visible fruit, in [m]."""
-    lateral_hidden_m: float = 0.012
-    """What a fruit of which nearly nothing is visible adds to it, in [m]."""
     depth_error_m: float = 0.003
-    """The same along the viewing direction, in [m]."""
-    depth_hidden_m: float = 0.012
-    """As `lateral_hidden_m`, in [m]."""
+    """The same along it, in [m]."""
     radius_error_m: float = 0.0015
     """The same of the radius, in [m]."""
-    radius_hidden_m: float = 0.004
-    """As `lateral_hidden_m`, in [m]."""
+    lateral_growth: float = 1.6
+    """Natural logarithm of how many times larger it is for a fruit that is all but hidden."""
+    depth_growth: float = 1.6
+    """The same along the viewing direction."""
+    radius_growth: float = 1.4
+    """The same of the radius."""
     few_pixels: float = 30.0
-    """Visible pixels at which all of these are twice as large in variance."""
+    """Visible pixels at which the variances are twice as large."""
+    usual_radius_m: float = 0.027
+    """Radius of a fruit of which nothing is known, in [m]."""
+    radius_spread_m: float = 0.003
+    """Standard deviation of that, in [m]."""
     fruit_density: float = 1000.0
     """Fruits in a cubic metre of a truss, in [1/m^3]: how likely another fruit stands at a place beside a known one."""
+    outlier_rate: float = 0.03
+    """Share of the detections whose depth is not their own but of what stands before or behind them."""
     detection_rate: float = 0.95
     """Share of the well visible fruits that a view's detections hold."""
     false_rate: float = 0.05
     """Share of the detections that are no fruit."""
     ripeness_rate: float = 0.95
     """Share of the fruits whose ripeness is told correctly."""
-    single_error: float = 0.03
-    """Standard error of one image's V_f of a fruit that is wholly visible."""
-    single_hidden: float = 0.12
-    """What a fruit that is half hidden adds to it."""
-    fused_error: float = 0.03
-    """The same for V_f by the map's sphere, its radius known."""
-    fused_hidden: float = 0.06
-    """As `single_hidden`."""
+    single_error: float = 0.15
+    """Standard error of one image's V_f of a fruit that is half visible; see `fraction_error`."""
+    fused_error: float = 0.10
+    """The same for V_f by the map's sphere."""
     error_scale: float = 1.0
     """Standard error of both together over that of two independent estimates."""
     stop_errors: float = 1.0
@@ -200,13 +196,13 @@ class FruitMap:
         camera = measurement.camera_position
         assigned: list[int] = []
         for fruit, number in zip(measurement.fruits, numbers, strict=True):
-            mean, covariance = self.sphere_of(fruit, camera)
             if number is None:
                 number, self._next = self._next, self._next + 1
             if number in self.tracks:
-                self._correct(self.tracks[number], mean, covariance)
+                track = self.tracks[number]
+                self._correct(track, *self._measured_sphere(track, fruit, camera))
             else:
-                self.tracks[number] = self._born(number, mean, covariance)
+                self.tracks[number] = self._born(number, *self.sphere_of(fruit, camera))
             self._count(self.tracks[number], fruit)
             assigned.append(number)
         for number in assigned:
@@ -220,7 +216,9 @@ class FruitMap:
         self._keep_best(view)
         return view
 
-    def sphere_of(self, fruit: DetectedFruit, camera: Position) -> tuple[Float64, Float64]:
+    def sphere_of(
+        self, fruit: DetectedFruit, camera: Position, *, by_ray: bool = False
+    ) -> tuple[Float64, Float64]:
         """A detection as a measurement of centre and radius.
 
         Along the viewing direction it is less certain than across, and the less of the fruit is visible the less it is
@@ -229,23 +227,25 @@ class FruitMap:
         Args:
             fruit: The detection.
             camera: Where it was seen from, world frame, in [m]. Shape (3,).
+            by_ray: Leave its depth out, which may be that of what stands before or behind it.
 
         Returns:
             Mean and covariance, world frame, in [m] and [m^2]. Shapes (4,), (4, 4).
         """
         c = self.config
         fraction = fruit.visible_fraction if np.isfinite(fruit.visible_fraction) else 0.0
-        hidden = (1.0 - fraction) ** 2
-        few = 1.0 + c.few_pixels / max(fruit.pixels, 1)
-        lateral = (c.lateral_error_m**2 + (c.lateral_hidden_m * hidden) ** 2) * few
-        along = (c.depth_error_m**2 + (c.depth_hidden_m * hidden) ** 2) * few
-        radius = (c.radius_error_m**2 + (c.radius_hidden_m * hidden) ** 2) * few
+        hidden, few = 1.0 - fraction, 1.0 + c.few_pixels / max(fruit.pixels, 1)
+        lateral = few * (c.lateral_error_m * np.exp(c.lateral_growth * hidden)) ** 2
+        along = few * (c.depth_error_m * np.exp(c.depth_growth * hidden)) ** 2
+        radius = few * (c.radius_error_m * np.exp(c.radius_growth * hidden)) ** 2
+        if by_ray or not fruit.is_depth_measured:
+            along, radius = OUTLIER_DEPTH**2, c.radius_spread_m**2 + radius
         centre, radius_m = fruit.centre_w, fruit.radius_m
         if centre is None:
             # Nearer than the depth camera measures: somewhere in front of the lens.
             centre, along = camera + NEAR_CENTRE * fruit.direction_w, NEAR_CENTRE**2
         if not np.isfinite(radius_m):
-            radius_m, radius = USUAL_RADIUS, (USUAL_RADIUS * RADIUS_SPREAD) ** 2
+            radius_m, radius = c.usual_radius_m, c.radius_spread_m**2
         away = (centre - camera) / max(float(np.linalg.norm(centre - camera)), 1e-9)
         covariance = np.zeros((4, 4))
         covariance[:3, :3] = lateral * np.eye(3) + (along - lateral) * np.outer(away, away)
@@ -267,11 +267,11 @@ class FruitMap:
         fused = _fused_fraction(measurement, index, track)
         parts = []
         if np.isfinite(single):
-            parts.append((single, c.single_error + c.single_hidden * 2 * min(single, 1 - single)))
+            parts.append((single, fraction_error(single, c.single_error)))
         if np.isfinite(fused):
-            radius = 2.0 * float(np.sqrt(track.covariance[3, 3])) / track.radius_m
-            shape = c.fused_error + c.fused_hidden * 2 * min(fused, 1 - fused)
-            parts.append((fused, float(np.hypot(shape, fused * (1 - fused) * 2 * radius))))
+            # What is not known of the radius counts as far as something hides the outline.
+            radius = 2.0 * float(np.sqrt(track.covariance[3, 3])) / track.radius_m * fused * (1.0 - fused)
+            parts.append((fused, float(np.hypot(fraction_error(fused, c.fused_error), radius))))
         if not parts:
             return Fraction(value=0.0, error=1.0, single=single, fused=fused)
         weights = np.array([1.0 / error**2 for _, error in parts])
@@ -299,13 +299,18 @@ class FruitMap:
         tracks = list(self.tracks.values())
         if not tracks or not measurement.fruits:
             return [None] * len(measurement.fruits)
-        spheres = [self.sphere_of(fruit, measurement.camera_position) for fruit in measurement.fruits]
-        gains = np.array(
-            [
-                [self._gain(track, *sphere, fruit) for track in tracks]
-                for sphere, fruit in zip(spheres, measurement.fruits, strict=True)
-            ]
-        )
+        camera = measurement.camera_position
+        gains = np.full((len(measurement.fruits), len(tracks)), -np.inf)
+        towards = np.stack([fruit.direction_w for fruit in measurement.fruits])
+        for column, track in enumerate(tracks):
+            # Only detections whose ray passes near the track can be it.
+            away = track.position_w - camera
+            beside = np.linalg.norm(away - (towards @ away)[:, None] * towards, axis=1)
+            near = np.flatnonzero(beside < FARTHEST_RAY * track.radius_m)
+            if len(near):
+                shown = shown_share(track, measurement)
+                for row in near:
+                    gains[row, column] = self._gain(track, measurement.fruits[row], camera, shown)
         rows, columns = linear_sum_assignment(np.maximum(gains, 0.0), maximize=True)
         numbers: list[int | None] = [None] * len(measurement.fruits)
         for row, column in zip(rows, columns, strict=True):
@@ -313,29 +318,50 @@ class FruitMap:
                 numbers[row] = tracks[column].number
         return numbers
 
-    def _gain(self, track: Track, mean: Float64, covariance: Float64, fruit: DetectedFruit) -> float:
+    def _gain(self, track: Track, fruit: DetectedFruit, camera: Position, shown: float | None) -> float:
         """Log likelihood ratio: a detection of this track, against one of another fruit with this track missed."""
         c = self.config
+        ripe = 1.0 / (1.0 + np.exp(-track.ripe_log_odds))
+        same = ripe if fruit.is_ripe else 1.0 - ripe
+        agreement = np.log(2.0 * (c.ripeness_rate * same + (1.0 - c.ripeness_rate) * (1.0 - same)))
+        rate = c.detection_rate * (0.5 if shown is None else max(shown, LEAST_SHOWN))
+        density = max(
+            np.log(1.0 - c.outlier_rate) + self._density(track, *self.sphere_of(fruit, camera)),
+            np.log(c.outlier_rate) + self._density(track, *self.sphere_of(fruit, camera, by_ray=True)),
+        )
+        return float(density - self._new_density() + agreement + np.log(rate / (1.0 - rate)))
+
+    def _density(self, track: Track, mean: Float64, covariance: Float64) -> float:
+        """Logarithm of a track's density at a measurement, in [1/m^4]; minus infinity beyond the gate."""
         innovation = mean - track.mean
         spread = track.covariance + covariance
         distance = float(innovation @ np.linalg.solve(spread, innovation))
         if distance > GATE:
             return -np.inf
-        density = -0.5 * distance - 0.5 * float(np.linalg.slogdet(2.0 * np.pi * spread)[1])
-        new = np.log(c.fruit_density / (np.sqrt(2 * np.pi) * USUAL_RADIUS * RADIUS_SPREAD))
-        ripe = 1.0 / (1.0 + np.exp(-track.ripe_log_odds))
-        same = ripe if fruit.is_ripe else 1.0 - ripe
-        agreement = np.log(2.0 * (c.ripeness_rate * same + (1.0 - c.ripeness_rate) * (1.0 - same)))
-        return float(density - new + agreement)
+        return -0.5 * distance - 0.5 * float(np.linalg.slogdet(2.0 * np.pi * spread)[1])
+
+    def _measured_sphere(
+        self, track: Track, fruit: DetectedFruit, camera: Position
+    ) -> tuple[Float64, Float64]:
+        """The likelier one of a detection's two readings for a track: by its depth, or by the ray to it alone."""
+        c = self.config
+        by_depth, by_ray = self.sphere_of(fruit, camera), self.sphere_of(fruit, camera, by_ray=True)
+        depth_fits = np.log(1.0 - c.outlier_rate) + self._density(track, *by_depth)
+        return by_depth if depth_fits >= np.log(c.outlier_rate) + self._density(track, *by_ray) else by_ray
+
+    def _new_density(self) -> float:
+        """Logarithm of the density of other fruits in place and radius, in [1/m^4]."""
+        c = self.config
+        return float(np.log(c.fruit_density / (np.sqrt(2.0 * np.pi) * c.radius_spread_m)))
 
     # ------------------------------------------------------------------ tracks
 
     def _born(self, number: int, mean: Float64, covariance: Float64) -> Track:
         # The radius is known beforehand, from other fruits.
         track = Track(number=number, mean=mean.copy(), covariance=covariance.copy())
-        usual = (USUAL_RADIUS * RADIUS_SPREAD) ** 2
-        gain = track.covariance[:, 3] / (track.covariance[3, 3] + usual)
-        track.mean = track.mean + gain * (USUAL_RADIUS - track.mean[3])
+        c = self.config
+        gain = track.covariance[:, 3] / (track.covariance[3, 3] + c.radius_spread_m**2)
+        track.mean = track.mean + gain * (c.usual_radius_m - track.mean[3])
         track.covariance = track.covariance - np.outer(gain, track.covariance[3])
         return track
 
@@ -383,9 +409,7 @@ class FruitMap:
                 continue
             self._correct(first, second.mean, second.covariance)
             first.ripe_log_odds = float(
-                np.clip(
-                    first.ripe_log_odds + second.ripe_log_odds, -LARGEST_LOG_ODDS, LARGEST_LOG_ODDS
-                )
+                np.clip(first.ripe_log_odds + second.ripe_log_odds, -LARGEST_LOG_ODDS, LARGEST_LOG_ODDS)
             )
             first.existence_log_odds = max(first.existence_log_odds, second.existence_log_odds)
             first.views += second.views
@@ -404,8 +428,7 @@ class FruitMap:
         if distance > MERGE_GATE:
             return False
         density = -0.5 * distance - 0.5 * float(np.linalg.slogdet(2.0 * np.pi * spread)[1])
-        other = np.log(self.config.fruit_density / (np.sqrt(2 * np.pi) * USUAL_RADIUS * RADIUS_SPREAD))
-        return bool(density > other)
+        return bool(density > self._new_density())
 
     def _keep_best(self, view: MappedView) -> None:
         for index, number in enumerate(view.tracks):
@@ -461,6 +484,15 @@ class FruitMap:
 NEAR_CENTRE: Final = 0.1
 """How far from the camera the centre of a fruit without depth is taken to be, in [m]."""
 
+OUTLIER_DEPTH: Final = 0.1
+"""Standard deviation of a depth that is not the fruit's own, in [m]."""
+
+FARTHEST_RAY: Final = 4.0
+"""A track's detections have their middle at most so many radii beside its centre."""
+
+LEAST_SHOWN: Final = 0.1
+"""A track that seems hidden may yet be detected, as often as one that is shown by this share."""
+
 UNKNOWN_FRUITS: Final = 10_000
 """With true identities, numbers from here on are those of detections that show no fruit."""
 
@@ -473,6 +505,9 @@ SURE_VIEWS: Final = 2
 
 COVERED_SHARE: Final = 0.6
 """A mask covers a track when it holds this share of its outline's pixels."""
+
+LEAST_FRACTION_ERROR: Final = 0.01
+"""Standard error of V_f of a fruit that seems wholly visible."""
 
 SURFACE_MARGIN: Final = 1.0
 """Depths up to so many radii in front of a fruit's centre and as many behind it are its own."""
@@ -529,6 +564,16 @@ def shown_share(track: Track, measurement: Measurement) -> float | None:
     return float(np.mean(np.isfinite(depth) & (depth > front)))
 
 
+def fraction_error(fraction: float, half: float) -> float:
+    """Standard error of an estimate of V_f, largest for a fruit that is half visible.
+
+    Args:
+        fraction: The estimate.
+        half: The error at V_f = 0.5.
+    """
+    return float(LEAST_FRACTION_ERROR + half * (4.0 * fraction * (1.0 - fraction)) ** 0.7)
+
+
 def _covered(mask: BinaryMask, circle: tuple[float, float, float]) -> float:
     """The share of a circle's pixels that a mask holds."""
     x, y, radius = circle
@@ -549,7 +594,9 @@ def _fused_fraction(measurement: Measurement, index: int, track: Track) -> float
     if circle is None:
         return float("nan")
     mask = measurement.mask(index)
-    measured = np.where(np.isfinite(frame.depth_m) & (frame.depth_m > 0), frame.depth_m, 0.0).astype(np.float64)
+    measured = np.where(np.isfinite(frame.depth_m) & (frame.depth_m > 0), frame.depth_m, 0.0).astype(
+        np.float64
+    )
     own = fruit_depth(measured, mask)
     if not np.isfinite(own):
         return float("nan")

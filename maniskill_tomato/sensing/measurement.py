@@ -35,6 +35,8 @@ class DetectedFruit:
     """Centre in the world frame, in [m]; None where the picture has no depth of the fruit. Shape (3,)."""
     radius_m: float
     """Radius in [m]; NaN where it is not known."""
+    is_depth_measured: bool
+    """Whether its depth was measured; if not, it is that of what is seen round it."""
     direction_w: Position
     """Unit vector from the camera through the middle of the visible pixels, world frame. Shape (3,)."""
 

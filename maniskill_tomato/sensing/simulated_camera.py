@@ -41,10 +41,15 @@ IMAGE_SIZE: Final = (320, 240)
 RENDERED_SIZE: Final = (640, 480)
 """Width and height of rendered ones unless `sensor_configs` says otherwise, in [px]: the camera's own."""
 
-COARSE_POSITION: Final = 0.03
-"""Standard deviation of each coordinate of a target's position before it was first seen, in [m]: that of a map of the
-row made from further away."""
+Naming = Literal["track", "map", "any"]
+"""How a robot that sees through a camera is told its target.
 
+`track`: the episode's target is fixed beforehand; the robot moves until it has a track that holds most of the target's
+visible pixels, and that track is named to it. `map`: a place is given, with an error. `any`: the robot chooses a ripe
+fruit that it does not see fully yet."""
+
+Association = Literal["map", "truth"]
+"""Who says which track a detection belongs to: the fruit map, or the simulator."""
 
 _CATEGORIES: Final = {"ripe": "tomato_ripe", "turning": "tomato_turning", "green": "tomato_unripe"}
 
@@ -137,6 +142,8 @@ def make_camera(
     scene: RayScene,
     intrinsics: CameraIntrinsics,
     picture: Callable[[int], UInt8],
+    *,
+    true_association: bool = False,
 ) -> tuple[SimulatedCamera, CameraPerception] | None:
     """The camera of a kind of perception and what measures its frames; None for ground truth.
 
@@ -145,6 +152,7 @@ def make_camera(
         scene: The environments' plants and links.
         intrinsics: Of rendered pictures.
         picture: Renders them, by the index of an environment.
+        true_association: Whether no fruit is mistaken for another.
     """
     if perception == "ground_truth":
         return None
@@ -157,5 +165,6 @@ def make_camera(
         camera = SimulatedCamera(scene, intrinsics=intrinsics, picture=picture)
     else:
         camera = SimulatedCamera(scene)
-    known = perception != "segmenter"
-    return camera, CameraPerception(scene.num_envs, detector, identity_known=known, device=scene.device)
+    return camera, CameraPerception(
+        scene.num_envs, detector, true_association=true_association, device=scene.device
+    )

@@ -24,7 +24,7 @@ from maniskill_tomato.tasks.arm_moves import Plan
 from maniskill_tomato.tasks.row.camera_senses import make_senses
 from maniskill_tomato.tasks.row.episode_selection import EpisodeChoice
 from maniskill_tomato.tasks.row.hidden_starts import HardStarts, Start
-from maniskill_tomato.tasks.row.row_config import GeneralTaskConfig
+from maniskill_tomato.tasks.row.row_config import CameraConfig, GeneralTaskConfig
 from maniskill_tomato.tasks.row.senses import Sight, Vantage
 from maniskill_tomato.tasks.row.target_sequence import TargetSequence, Transits, with_transits
 from maniskill_tomato.tasks.world import World
@@ -52,6 +52,7 @@ class SearchGame:
         layout: ObservationLayout,
         noise: SensorNoise,
         perception: Perception,
+        camera: CameraConfig,
         transits: Transits | None,
     ) -> None:
         """Plays in a world.
@@ -63,6 +64,7 @@ class SearchGame:
             layout: What the observation holds.
             noise: What is wrong with exact labels.
             perception: Where labels and V_f come from.
+            camera: How targets are named to a robot with a camera.
             transits: When arms go by their ready posture in a row; None for the task with one target.
         """
         self.task = task
@@ -70,7 +72,7 @@ class SearchGame:
         self.episodes = episodes
         self._world = world
         self._observer = ViewpointObserver(world.num_envs, world.device, layout, task.max_moves)
-        self._senses = make_senses(perception, world, noise)
+        self._senses = make_senses(perception, world, noise, camera, task.full_visibility)
         self._is_camera = perception != "ground_truth"
         self._starts = HardStarts(task, world.scene, world.device)
         self.sequence = None if transits is None else TargetSequence(world, self._observer.lattice, transits)
@@ -348,6 +350,12 @@ class SearchGame:
         if self._is_camera:
             info["true_visible_fraction"] = sight.true_fraction.clone()
             info["true_success"] = sight.true_fraction > self.task.full_visibility
+            assert sight.chosen_fraction is not None and sight.chosen_fruit is not None
+            assert sight.named is not None
+            info["told_visible_fraction"] = sight.told_fraction.clone()
+            info["chosen_visible_fraction"] = sight.chosen_fraction.clone()
+            info["chosen_fruit"] = sight.chosen_fruit.clone()
+            info["target_named"] = sight.named.clone()
         if self.sequence is not None:
             info["success"] = state.seen_count >= state.target_count
             over = self.sequence.is_over() | (state.moves >= MAX_ROW_STEPS)

@@ -35,6 +35,12 @@ class Sight:
     """V_f as it is. Shape (N,)."""
     tomato_seen: Tensor
     """Whether any ripe tomato is in view. Shape (N,), bool."""
+    chosen_fraction: Tensor | None = None
+    """V_f as it is of the fruit that a camera took for the target, 0 if of none; None without a camera. Shape (N,)."""
+    chosen_fruit: Tensor | None = None
+    """Which that is, as an index in `Plant.fruits`, -1 for none. Shape (N,)."""
+    named: Tensor | None = None
+    """Whether the robot knows which track its target is. Shape (N,), bool."""
 
     def where(self, mask: Tensor, other: "Sight") -> "Sight":
         """This sight where `mask` is True, else the other one. Shape (N,), bool."""
@@ -50,7 +56,14 @@ class Sight:
             told_fraction=torch.where(mask, self.told_fraction, other.told_fraction),
             true_fraction=torch.where(mask, self.true_fraction, other.true_fraction),
             tomato_seen=torch.where(mask, self.tomato_seen, other.tomato_seen),
+            chosen_fraction=_where(mask, self.chosen_fraction, other.chosen_fraction),
+            chosen_fruit=_where(mask, self.chosen_fruit, other.chosen_fruit),
+            named=_where(mask, self.named, other.named),
         )
+
+
+def _where(mask: Tensor, mine: Tensor | None, others: Tensor | None) -> Tensor | None:
+    return None if mine is None or others is None else torch.where(mask, mine, others)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

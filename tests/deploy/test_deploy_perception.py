@@ -9,7 +9,7 @@ import torch
 from maniskill_tomato.deploy.interface import Frame, FrameTruth
 from maniskill_tomato.deploy.mock.episode import load_episode
 from maniskill_tomato.deploy.robot_belief import FIRST_RPY, RobotBelief
-from maniskill_tomato.deploy.robot_perception import TRUE_MASKS, ImagePerception
+from maniskill_tomato.deploy.robot_perception import PLACE_ERROR, TRUE_MASKS, ImagePerception
 from maniskill_tomato.raycast.images import FIRST_ORGAN_LABEL, ROBOT_LABEL
 from maniskill_tomato.raycast.scene import RayScene
 from maniskill_tomato.raycast.view_rays import ViewRays
@@ -21,6 +21,7 @@ from maniskill_tomato.robot.rotations import matrix_to_rpy
 from maniskill_tomato.segmentation.instances import Instances
 from maniskill_tomato.sensing.camera_perception import CameraPerception
 from maniskill_tomato.sensing.fruit_detector import FruitDetector
+from maniskill_tomato.sensing.fruit_map import FruitMap
 from maniskill_tomato.sensing.observation import ViewpointObserver
 from maniskill_tomato.sensing.posed_frame import PosedFrame
 from maniskill_tomato.sensing.simulated_camera import SimulatedCamera
@@ -35,9 +36,10 @@ def robot_frame(frame: PosedFrame, number: int) -> Frame:
     assert frame.true_fruits is not None and frame.robot_mask is not None
     labels = np.zeros(frame.depth_m.shape, np.int32)
     labels[frame.robot_mask] = ROBOT_LABEL
-    ripe = tuple(FIRST_ORGAN_LABEL + k for k in range(len(frame.true_fruits)))
-    for label, mask in zip(ripe, frame.true_fruits.masks, strict=True):
-        labels[mask] = label
+    for k, mask in enumerate(frame.true_fruits.masks):
+        labels[mask] = FIRST_ORGAN_LABEL + k
+    categories = enumerate(frame.true_fruits.categories)
+    ripe = tuple(FIRST_ORGAN_LABEL + k for k, category in categories if category == "tomato_ripe")
     return Frame(
         color=np.zeros((*labels.shape, 3), np.uint8),
         depth=frame.depth_m,
@@ -68,6 +70,14 @@ class FrameSegmenter:
         return Instances.from_masks(fruits.masks, np.full(len(fruits), 0.7, np.float32), fruits.categories)
 
 
+def assert_same_map(robot: FruitMap, simulated: FruitMap) -> None:
+    assert robot.tracks.keys() == simulated.tracks.keys()
+    for number, track in robot.tracks.items():
+        np.testing.assert_allclose(track.mean, simulated.tracks[number].mean, atol=1e-9)
+        np.testing.assert_allclose(track.covariance, simulated.tracks[number].covariance, atol=1e-12)
+        assert track.is_ripe == simulated.tracks[number].is_ripe
+
+
 @pytest.mark.parametrize("masks", ["true", "segmented"])
 def test_the_same_frames_give_the_same_observation_in_the_simulator_and_on_the_robot(masks: str) -> None:
     """Two environments at once against a robot before each plant: fruits, V_f, position, rays, observation."""
@@ -79,7 +89,6 @@ def test_the_same_frames_give_the_same_observation_in_the_simulator_and_on_the_r
     segmenter = None if masks == "true" else FrameSegmenter()
     targets = torch.stack([e.target_position for e in episodes])
     T_world_plant = torch.stack([e.T_world_plant for e in episodes])
-    fruit = torch.tensor([e.target for e in episodes])
 
     perception = CameraPerception(n, FruitDetector(segmenter))
     observer = ViewpointObserver(n, max_moves=20)
@@ -89,22 +98,25 @@ def test_the_same_frames_give_the_same_observation_in_the_simulator_and_on_the_r
     for k, episode in enumerate(episodes):
         camera.seed(k, k)
         place = episode.target_position.double().numpy()
-        perception.begin(k, place, is_located=True)
+        perception.begin(k, place, place_error=PLACE_ERROR)
         robots[k].begin(place)
 
     qpos = torch.tensor(np.array([e.start_joints for e in episodes]), dtype=torch.float32)
     rpy = torch.tensor([FIRST_RPY] * n)
-    mover, seen = LookAtMover(), 0
+    mover, seen, recalled = LookAtMover(), 0, 0
     for step in range(len(MOVES) + 1):
         links = link_transforms(qpos)
         T_world_camera = links[:, -1] @ mount
-        frames = camera.take(T_world_camera, fruit, T_world_plant, links)
+        frames = camera.take(T_world_camera, T_world_plant, links)
         if segmenter is not None:
             segmenter.known = [frame for frame in frames if frame is not None]
-        perception.look(frames)
+        moved = perception.look(frames)
         rpy = matrix_to_rpy(links[:, -1, :3, :3], rpy)
         viewpoint = torch.cat([links[:, -1, :3, 3], rpy], dim=-1)
         left = torch.full((n,), 20 - step)
+        if bool(moved.any()):
+            perception.recall(observer, moved.nonzero()[:, 0])
+            recalled += int(moved.sum()) if step else 0
         rays, fractions = perception.rays(), perception.visible_fraction
         observation = observer.observe(viewpoint, T_world_camera, rays, fractions, left)
         for k, frame in enumerate(frames):
@@ -114,9 +126,11 @@ def test_the_same_frames_give_the_same_observation_in_the_simulator_and_on_the_r
             sighting = robots[k].look(robot_frame(frame, step), pose)
             assert sighting is not None
             mine = perception.views(k)[-1]
-            assert sighting.fruits_seen == len(mine.fruits)
+            assert sighting.fruits_seen == sum(found.is_ripe for found in mine.fruits)
+            assert_same_map(robots[k].map, perception.map(k))
             np.testing.assert_array_equal(sighting.mask, mine.mask(perception.target_fruit(k)))
             assert sighting.visible_fraction == pytest.approx(float(fractions[k]), abs=1e-6)
+            assert sighting.sure_fraction == pytest.approx(float(perception.sure_fraction[k]), abs=1e-6)
             np.testing.assert_allclose(sighting.target_position, perception.position_w(k), atol=1e-6)
             torch.testing.assert_close(sighting.rays.label[0], rays.label[k])
             torch.testing.assert_close(sighting.rays.distance[0], rays.distance[k], rtol=0.0, atol=1e-6)

@@ -23,9 +23,13 @@ from maniskill_tomato.sensing.visible_fraction.estimate import (
     SegmentedImage,
     filled_depth,
     fruit_depth,
+    surrounding_depth,
 )
 
 Floats = NDArray[np.floating[Any]]
+
+NEAREST_MEASURED: Final = 0.15
+"""A fruit at least as far away as this, in [m], has depth unless something nearer shadows it."""
 
 SAMPLES: Final = 64
 """Points of each kind that a circle is judged by."""
@@ -151,8 +155,11 @@ class _Fit:
         own = fruit_depth(view.depth_m[box], mask[box])
         measured = bool(np.isfinite(own))
         if not measured:
-            # Nearer than the camera measures; the mask's own extent then stands for the size.
+            # Nearer than the camera measures, where the mask's own extent stands for the size; or in a stereo shadow.
             own = config.radius_m * focal / (0.5 * (max(width, height) + 1))
+            around = surrounding_depth(view.depth_m, mask)
+            if own > NEAREST_MEASURED and np.isfinite(around):
+                own, measured = around, True
         size = config.radius_m * focal / own
         reach = int(np.ceil(1.4 * size)) + 4
         top, left = max(first_y - reach, 0), max(first_x - reach, 0)
