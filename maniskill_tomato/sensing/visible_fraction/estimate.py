@@ -97,9 +97,9 @@ class OcclusionModel(Protocol):
 
 
 LEAST_MEASURED_SHARE: Final = 0.2
-"""A fruit of which the camera measured a smaller share of the visible pixels has no depth of its own: the few pixels lie
-in the shadow that stereo leaves beside a nearer leaf. Of 1,380 detections on validation plants those farther than 5 cm
-from their fruit had a share of 0.02 (median; 0.14 for nine of ten), the others 0.94 (0.49)."""
+"""A fruit of which the camera measured a smaller share of the visible pixels has no depth of its own: the few pixels
+lie in the shadow that stereo leaves beside a nearer leaf. Of 1,380 detections on validation plants those farther than
+5 cm from their fruit had a share of 0.02 (median; 0.14 for nine of ten), the others 0.94 (0.49)."""
 
 FARTHEST_PLANT: Final = 1.6
 """What is farther away is not the plant that is looked at, in [m]."""
