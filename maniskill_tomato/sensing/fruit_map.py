@@ -55,8 +55,6 @@ class MapConfig:
     """Standard deviation of that, in [m]."""
     fruit_density: float = 1000.0
     """Fruits in a cubic metre of a truss, in [1/m^3]: how likely another fruit stands at a place beside a known one."""
-    outlier_rate: float = 0.03
-    """Share of the detections whose depth is not their own but of what stands before or behind them."""
     detection_rate: float = 0.95
     """Share of the well visible fruits that a view's detections hold."""
     false_rate: float = 0.05
@@ -200,7 +198,7 @@ class FruitMap:
                 number, self._next = self._next, self._next + 1
             if number in self.tracks:
                 track = self.tracks[number]
-                self._correct(track, *self._measured_sphere(track, fruit, camera))
+                self._correct(track, *self.sphere_of(fruit, camera))
             else:
                 self.tracks[number] = self._born(number, *self.sphere_of(fruit, camera))
             self._count(self.tracks[number], fruit)
@@ -216,9 +214,7 @@ class FruitMap:
         self._keep_best(view)
         return view
 
-    def sphere_of(
-        self, fruit: DetectedFruit, camera: Position, *, by_ray: bool = False
-    ) -> tuple[Float64, Float64]:
+    def sphere_of(self, fruit: DetectedFruit, camera: Position) -> tuple[Float64, Float64]:
         """A detection as a measurement of centre and radius.
 
         Along the viewing direction it is less certain than across, and the less of the fruit is visible the less it is
@@ -227,7 +223,6 @@ class FruitMap:
         Args:
             fruit: The detection.
             camera: Where it was seen from, world frame, in [m]. Shape (3,).
-            by_ray: Leave its depth out, which may be that of what stands before or behind it.
 
         Returns:
             Mean and covariance, world frame, in [m] and [m^2]. Shapes (4,), (4, 4).
@@ -238,8 +233,8 @@ class FruitMap:
         lateral = few * (c.lateral_error_m * np.exp(c.lateral_growth * hidden)) ** 2
         along = few * (c.depth_error_m * np.exp(c.depth_growth * hidden)) ** 2
         radius = few * (c.radius_error_m * np.exp(c.radius_growth * hidden)) ** 2
-        if by_ray or not fruit.is_depth_measured:
-            along, radius = OUTLIER_DEPTH**2, c.radius_spread_m**2 + radius
+        if not fruit.is_depth_measured:
+            along, radius = UNMEASURED_DEPTH**2, c.radius_spread_m**2 + radius
         centre, radius_m = fruit.centre_w, fruit.radius_m
         if centre is None:
             # Nearer than the depth camera measures: somewhere in front of the lens.
@@ -325,10 +320,7 @@ class FruitMap:
         same = ripe if fruit.is_ripe else 1.0 - ripe
         agreement = np.log(2.0 * (c.ripeness_rate * same + (1.0 - c.ripeness_rate) * (1.0 - same)))
         rate = c.detection_rate * (0.5 if shown is None else max(shown, LEAST_SHOWN))
-        density = max(
-            np.log(1.0 - c.outlier_rate) + self._density(track, *self.sphere_of(fruit, camera)),
-            np.log(c.outlier_rate) + self._density(track, *self.sphere_of(fruit, camera, by_ray=True)),
-        )
+        density = self._density(track, *self.sphere_of(fruit, camera))
         return float(density - self._new_density() + agreement + np.log(rate / (1.0 - rate)))
 
     def _density(self, track: Track, mean: Float64, covariance: Float64) -> float:
@@ -339,15 +331,6 @@ class FruitMap:
         if distance > GATE:
             return -np.inf
         return -0.5 * distance - 0.5 * float(np.linalg.slogdet(2.0 * np.pi * spread)[1])
-
-    def _measured_sphere(
-        self, track: Track, fruit: DetectedFruit, camera: Position
-    ) -> tuple[Float64, Float64]:
-        """The likelier one of a detection's two readings for a track: by its depth, or by the ray to it alone."""
-        c = self.config
-        by_depth, by_ray = self.sphere_of(fruit, camera), self.sphere_of(fruit, camera, by_ray=True)
-        depth_fits = np.log(1.0 - c.outlier_rate) + self._density(track, *by_depth)
-        return by_depth if depth_fits >= np.log(c.outlier_rate) + self._density(track, *by_ray) else by_ray
 
     def _new_density(self) -> float:
         """Logarithm of the density of other fruits in place and radius, in [1/m^4]."""
@@ -484,8 +467,8 @@ class FruitMap:
 NEAR_CENTRE: Final = 0.1
 """How far from the camera the centre of a fruit without depth is taken to be, in [m]."""
 
-OUTLIER_DEPTH: Final = 0.1
-"""Standard deviation of a depth that is not the fruit's own, in [m]."""
+UNMEASURED_DEPTH: Final = 0.1
+"""Standard deviation of a depth that is not the fruit's own but of what is seen round it, in [m]."""
 
 FARTHEST_RAY: Final = 4.0
 """A track's detections have their middle at most so many radii beside its centre."""
