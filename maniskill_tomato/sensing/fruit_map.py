@@ -228,7 +228,8 @@ class FruitMap:
             Mean and covariance, world frame, in [m] and [m^2]. Shapes (4,), (4, 4).
         """
         c = self.config
-        fraction = fruit.visible_fraction if np.isfinite(fruit.visible_fraction) else 0.0
+        is_known = fruit.is_depth_measured and np.isfinite(fruit.visible_fraction)
+        fraction = fruit.visible_fraction if is_known else 0.0
         hidden, few = 1.0 - fraction, 1.0 + c.few_pixels / max(fruit.pixels, 1)
         lateral = few * (c.lateral_error_m * np.exp(c.lateral_growth * hidden)) ** 2
         along = few * (c.depth_error_m * np.exp(c.depth_growth * hidden)) ** 2
@@ -250,6 +251,8 @@ class FruitMap:
     def fraction(self, measurement: Measurement, index: int | None, number: int | None) -> Fraction:
         """V_f of a track in a view: that of the single image and that by the map's sphere, weighted by their variances.
 
+        A view without depth of the fruit, from too near or in the shadow of a leaf, says nothing by itself.
+
         Args:
             measurement: The view.
             index: The track's detection; None if it has none, which makes V_f 0.
@@ -261,7 +264,7 @@ class FruitMap:
         single = float(fruit.visible_fraction)
         fused = _fused_fraction(measurement, index, track)
         parts = []
-        if np.isfinite(single):
+        if np.isfinite(single) and fruit.is_depth_measured:
             parts.append((single, fraction_error(single, c.single_error)))
         if np.isfinite(fused):
             # What is not known of the radius counts as far as something hides the outline.
@@ -581,11 +584,10 @@ def _fused_fraction(measurement: Measurement, index: int, track: Track) -> float
         np.float64
     )
     own = fruit_depth(measured, mask)
-    if not np.isfinite(own):
-        return float("nan")
     depth, fruits = _fruit_depths(measurement, measured)
-    edge = SphereConfig().edge_step_m
-    whole, outside = whole_silhouette(mask, circle, depth, own + edge, own, fruits)
+    # Without depth nobody knows what is hidden: all of the outline that is not seen counts.
+    farthest = own + SphereConfig().edge_step_m if np.isfinite(own) else np.inf
+    whole, outside = whole_silhouette(mask, circle, depth, farthest, own, fruits)
     visible = np.count_nonzero(mask)
     return float(min(visible / (np.count_nonzero(whole) + outside), 1.0))
 

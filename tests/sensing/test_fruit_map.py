@@ -299,3 +299,23 @@ def test_less_of_a_fruit_says_less_of_where_it_is_most_of_all_along_the_view() -
 
 def _overlap(a: BinaryMask, b: BinaryMask) -> float:
     return float(np.count_nonzero(a & b) / np.count_nonzero(a | b))
+
+
+def test_a_view_without_depth_is_judged_by_the_maps_sphere_alone() -> None:
+    """A mask without depth looks like a whole small fruit; the map knows how large it is."""
+    fruits = FruitMap()
+    for camera in CAMERAS:
+        fruits.update(DETECTOR.measure(cast(camera, [FRUIT])))
+    frame = cast((0.5, 0.0, 0.6), [FRUIT])
+    assert frame.true_fruits is not None
+    mask = frame.true_fruits.masks[0].copy()
+    rows = np.flatnonzero(mask.any(axis=1))
+    mask[rows[len(rows) // 2] :] = False
+    half = replace(
+        frame,
+        depth_m=np.where(mask, 0.0, frame.depth_m).astype(np.float32),
+        true_fruits=Instances.from_masks(mask[None], categories=("tomato_ripe",)),
+    )
+    measured = DETECTOR.measure(half)
+    assert not measured.fruits[0].is_depth_measured
+    assert fruits.fraction(measured, 0, only(fruits)).value == pytest.approx(0.5, abs=0.1)
