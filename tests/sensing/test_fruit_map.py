@@ -64,7 +64,7 @@ def cast(
         np.stack([owner == k for k in range(len(spheres))]) if spheres else np.zeros((0, *depth.shape), bool)
     )
     if merged:
-        masks = masks.any(0)[None]
+        masks = np.asarray(masks.any(0))[None]
     return PosedFrame(
         depth_m=depth.astype(np.float32),
         intrinsics=INTRINSICS,
