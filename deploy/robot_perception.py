@@ -135,7 +135,7 @@ class ImagePerception:
             visible_fraction=float(perception.visible_fraction[0]),
             sure_fraction=float(perception.sure_fraction[0]),
             mask=perception.mask(0),
-            fruits_seen=sum(fruit.is_ripe for fruit in measured.fruits),
+            fruits_seen=sum(fruit.is_ripe for fruit in perception.views(0)[-1].fruits),
             target_position=perception.position_w(0),
             recall=self._recall if moved else None,
         )

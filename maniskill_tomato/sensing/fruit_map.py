@@ -451,7 +451,9 @@ class FruitMap:
             if track.views < SURE_VIEWS or track.existence_log_odds <= 0.0:
                 continue
             circle = outline(track.mean, frame.T_world_camera, frame.intrinsics)
-            if circle is not None and _covered(mask, circle) > COVERED_SHARE:
+            if circle is None or _covered(mask, circle) <= COVERED_SHARE:
+                continue
+            if all(np.hypot(circle[0] - x, circle[1] - y) > max(circle[2], r) for x, y, r in circles):
                 circles.append(circle)
         if len(circles) < 2:
             return None

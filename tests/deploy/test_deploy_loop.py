@@ -106,7 +106,8 @@ def test_a_planner_finds_the_tomato_and_the_run_ends_with_success() -> None:
 def test_a_view_that_never_gets_better_ends_with_the_budget() -> None:
     result, _ = go(profile("depth_noise = 0.0"), open_policy("stay", env_id=TASK))
     assert (result.reason, result.moves, result.is_fault, result.success) == ("budget", 6, False, False)
-    assert len(set(result.visible_fractions)) == 1
+    # The map's sphere, by which V_f is judged, changes a little with every look.
+    assert max(result.visible_fractions) - min(result.visible_fractions) < 0.02
 
 
 @pytest.mark.parametrize(
@@ -137,7 +138,7 @@ def test_without_depth_the_arm_goes_back_once_and_no_farther() -> None:
     # Three attempts at one view fail, then there is depth again: the run goes on from the view before.
     covered, _ = go(profile(faults % ", camera_reads = 3", "threshold = 0.99"))
     assert not covered.is_fault and covered.moves == 6
-    assert covered.visible_fractions[1] == covered.visible_fractions[3]
+    assert covered.visible_fractions[1] == pytest.approx(covered.visible_fractions[3], abs=0.01)
 
 
 @pytest.mark.parametrize("fault", ["late", "black", "zero_depth", "wrong_size", "silent"])
