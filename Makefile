@@ -9,8 +9,8 @@ MAKEFLAGS += --no-builtin-rules --no-print-directory
 # make venv PYTHON=/path/to/python3.12 chooses the interpreter; ARGS="..." goes on to demo, test and test-all.
 PYTHON ?=
 ARGS ?=
-# Processes that `make test` runs tests in.
-WORKERS ?= 2
+# Processes that `make test` runs tests in; one more than two cores, because some tests wait for other processes.
+WORKERS ?= 3
 export PYTHON
 
 BIN := .venv/bin
@@ -44,7 +44,7 @@ demo: $(STAMP) ## Train the guided task, evaluate it, write a report and a video
 
 .PHONY: test
 test: $(STAMP) ## Run the tests that need no GPU and little time
-	@$(BIN)/python -m pytest -n $(WORKERS) --dist loadfile -m "not slow and not gpu" $(ARGS)
+	@$(BIN)/python -m pytest -n $(WORKERS) --dist loadfile --no-loadscope-reorder -m "not slow and not gpu" $(ARGS)
 
 .PHONY: test-all
 test-all: $(STAMP) ## Run every test that this machine can run

@@ -1,6 +1,7 @@
 """Takes a picture that is recent and usable, or raises an error that says what is wrong with it."""
 
 import logging
+import math
 from dataclasses import dataclass
 from typing import Final
 
@@ -9,7 +10,7 @@ import numpy as np
 from maniskill_tomato.deploy.clock import Clock
 from maniskill_tomato.deploy.deploy_errors import DeployError, NotConnectedError, PerceptionError, StaleError
 from maniskill_tomato.deploy.interface import Camera, Frame
-from maniskill_tomato.errors import InvalidInputError
+from maniskill_tomato.errors import check_positive, check_ranges
 
 _logger = logging.getLogger(__name__)
 
@@ -31,12 +32,8 @@ class CaptureConfig:
     """Share of the pixels that must have depth; small, because a leaf before the lens leaves hardly any."""
 
     def __post_init__(self) -> None:
-        if self.attempts < 1:
-            raise InvalidInputError(f"attempts must be at least 1, got {self.attempts}")
-        if not self.pause >= 0.0 or not self.max_age > 0.0:
-            raise InvalidInputError("pause must be 0 or more and max_age above 0")
-        if not 0.0 <= self.min_depth_share < 1.0:
-            raise InvalidInputError(f"min_depth_share must be in [0, 1), got {self.min_depth_share}")
+        check_ranges(self, attempts=(1, math.inf), pause=(0.0, math.inf), min_depth_share=(0.0, 0.999))
+        check_positive(self, "max_age")
 
 
 class Capture:

@@ -11,23 +11,23 @@ import numpy as np
 from maniskill_tomato.deploy.capture import Capture
 from maniskill_tomato.deploy.deploy_errors import DeployError, RecordingError
 from maniskill_tomato.deploy.interface import JointMove
-from maniskill_tomato.deploy.policies import TASK, decide, default_policy
+from maniskill_tomato.deploy.loop import TASK, decide, default_policy
 from maniskill_tomato.deploy.profile import Profile
-from maniskill_tomato.deploy.robot_belief import RobotBelief
-from maniskill_tomato.deploy.workcell import make_workcell
+from maniskill_tomato.deploy.robot_perception import RobotBelief
+from maniskill_tomato.deploy.workcell import Workcell, make_workcell
 from maniskill_tomato.errors import TomatoError
 from maniskill_tomato.files import write_atomically
 from maniskill_tomato.policies.opening import open_policy
 from maniskill_tomato.raycast.view_rays import NEAREST_DEPTH
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True)
 class Finding:
     """One line of the check."""
 
     what: str
-    good: bool
     detail: str
+    good: bool = True
 
     def __str__(self) -> str:
         return f"{'ok  ' if self.good else 'FAIL'}  {self.what:<12}  {self.detail}"
@@ -45,18 +45,18 @@ def check(profile: Profile, policy: str | None, seed: int, out: Path | None) -> 
     Yields:
         A finding each; after a device that cannot be used no more of it.
     """
-    yield Finding(what="profile", good=True, detail=f"{profile.name}: {profile.description}")
+    yield Finding("profile", f"{profile.name}: {profile.description}")
     name = default_policy() if policy is None else policy
     opened: Any = None
     try:
         opened = open_policy(name, env_id=TASK, seed=seed)
-        yield Finding(what="policy", good=True, detail=f"{name} ({opened.name})")
+        yield Finding("policy", f"{name} ({opened.name})")
     except TomatoError as error:
-        yield Finding(what="policy", good=False, detail=str(error))
+        yield Finding("policy", str(error), good=False)
     try:
         workcell = make_workcell(profile, seed)
     except TomatoError as error:
-        yield Finding(what="drivers", good=False, detail=str(error))
+        yield Finding("drivers", str(error), good=False)
         return
     calibrated = profile.calibrated or workcell.simulated
     where = np.round(profile.T_flange_camera[:3, 3] * 1e3, 1).tolist()
@@ -65,41 +65,39 @@ def check(profile: Profile, policy: str | None, seed: int, out: Path | None) -> 
     )
     if not calibrated:
         detail += "; run `maniskill-tomato deploy calibrate`, without it only dry runs are allowed"
-    yield Finding(what="calibration", good=calibrated, detail=detail)
+    yield Finding("calibration", detail, calibrated)
     joints: Any = None
     try:
         with workcell.arm:
-            yield Finding(what="arm", good=True, detail=_facts(workcell.arm.describe()))
+            yield Finding("arm", _facts(workcell.arm.describe()))
             joints = workcell.guarded_arm.read().joint_positions
             degrees = ", ".join(f"{v:.1f}" for v in np.rad2deg(joints))
-            yield Finding(what="state", good=True, detail=f"joints at ({degrees}) deg")
+            yield Finding("state", f"joints at ({degrees}) deg")
             stay = JointMove(joint_positions=joints, speed_fraction=profile.safety.speed_fraction)
             refusal = workcell.guarded_arm.safety.check(
                 stay, workcell.guarded_arm.read(), workcell.clock.now()
             )
-            yield Finding(
-                what="limits",
-                good=refusal is None,
-                detail="the arm stands inside the envelope" if refusal is None else str(refusal),
-            )
+            detail = "the arm stands inside the envelope" if refusal is None else str(refusal)
+            yield Finding("limits", detail, refusal is None)
             can_stop = workcell.guarded_arm.can_stop
             detail = "can be stopped" if can_stop else "only the smartPAD or the emergency stop halts a move"
-            yield Finding(what="stop", good=True, detail=detail)
+            yield Finding("stop", detail)
             with workcell.camera:
                 yield from _look(workcell, profile, joints, opened, out)
     except DeployError as error:
-        yield Finding(what="device", good=False, detail=str(error))
+        yield Finding("device", str(error), good=False)
 
 
-def _look(workcell: Any, profile: Profile, joints: Any, opened: Any, out: Path | None) -> Iterator[Finding]:
-    yield Finding(what="camera", good=True, detail=_facts(workcell.camera.describe()))
+def _look(
+    workcell: Workcell, profile: Profile, joints: Any, opened: Any, out: Path | None
+) -> Iterator[Finding]:
+    yield Finding("camera", _facts(workcell.camera.describe()))
     frame = Capture(workcell.camera, profile.capture, workcell.clock).take(-np.inf)
     share = float((frame.depth > 0.0).mean())
     near = float((frame.depth[frame.depth > 0.0] < 2.0 * NEAREST_DEPTH).mean()) if share else 0.0
     yield Finding(
-        what="picture",
-        good=True,
-        detail=f"{frame.intrinsics.width} x {frame.intrinsics.height} px, {share:.0%} with depth, {near:.0%} of it "
+        "picture",
+        f"{frame.intrinsics.width} x {frame.intrinsics.height} px, {share:.0%} with depth, {near:.0%} of it "
         f"nearer than {2.0 * NEAREST_DEPTH:.1f} m",
     )
     if out is not None:
@@ -110,20 +108,17 @@ def _look(workcell: Any, profile: Profile, joints: Any, opened: Any, out: Path |
                 write_atomically(path, content.tobytes())
         except TomatoError as error:
             raise RecordingError(f"cannot write {path}: {error.__cause__ or error}") from error
-        yield Finding(what="saved", good=True, detail=str(path))
+        yield Finding("saved", str(path))
     perception = workcell.perception
     robot_belief = RobotBelief(profile.T_flange_camera, profile.loop.max_moves)
     perception.begin(workcell.target_position())
     view = perception.look(frame, robot_belief.camera_pose(joints))
     if view is None:
-        yield Finding(
-            what="target", good=False, detail="no ripe fruit in the picture; point the camera at one"
-        )
+        yield Finding("target", "no ripe fruit in the picture; point the camera at one", good=False)
         return
     yield Finding(
-        what="target",
-        good=True,
-        detail=f"at {np.round(view.target_position, 3).tolist()} m, V_f {view.visible_fraction:.2f}, "
+        "target",
+        f"at {np.round(view.target_position, 3).tolist()} m, V_f {view.visible_fraction:.2f}, "
         f"{view.fruits_seen} ripe fruits in the picture",
     )
     if opened is None:
@@ -135,9 +130,9 @@ def _look(workcell: Any, profile: Profile, joints: Any, opened: Any, out: Path |
         opened.begin(belief, torch.zeros(1, dtype=torch.int64))
         action = decide(opened, belief)
         detail = f"answers {np.round(action, 3).tolist()} (right, up, forward; 1 is 0.12 m)"
-        yield Finding(what="decision", good=True, detail=detail)
+        yield Finding("decision", detail)
     except TomatoError as error:
-        yield Finding(what="decision", good=False, detail=str(error))
+        yield Finding("decision", str(error), good=False)
 
 
 def _facts(facts: dict[str, Any]) -> str:

@@ -7,7 +7,7 @@ import mujoco
 import numpy as np
 
 from maniskill_tomato.deploy.interface import Float64
-from maniskill_tomato.deploy.safety_config import Box
+from maniskill_tomato.errors import InvalidInputError
 from maniskill_tomato.robot.d435 import CAMERA_LINK_NAME, T_flange_camera_color_optical, camera_link_pose
 from maniskill_tomato.robot.robot_description import urdf_path
 
@@ -15,6 +15,25 @@ mj: Any = mujoco
 
 TABLE: Final = "table"
 OBSTACLE: Final = "obstacle"
+
+
+Corner = tuple[float, float, float]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Box:
+    """An axis-aligned box in the base frame."""
+
+    low: Corner
+    """Lower corner x, y, z, in [m]."""
+    high: Corner
+    """Upper corner, in [m]."""
+
+    def __post_init__(self) -> None:
+        if not all(low < high for low, high in zip(self.low, self.high, strict=True)):
+            raise InvalidInputError(
+                f"low must lie below high along every axis, got {self.low} and {self.high}"
+            )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -128,8 +147,7 @@ class CollisionChecker:
 
     def _are_neighbours(self, a: int, b: int) -> bool:
         """Whether two shapes belong to links with at most one joint between them."""
-        in_world = [self._model.geom_bodyid[g] == 0 for g in (a, b)]
-        if any(in_world):
+        if 0 in (self._model.geom_bodyid[a], self._model.geom_bodyid[b]):
             return False
         return bool(
             self._weld[a] == self._weld[b]

@@ -41,8 +41,8 @@ LEG_STEPS: Final = 60
 ARRIVED: Final = 0.05
 """Joints this near to the goal are there, in [rad]."""
 
-CELL: Final = 0.03
-"""Plant points in one cube of this size become one ball of this diameter, in [m]."""
+BALL: Final = 0.03
+"""Plant points in one cube of this edge become one ball of this diameter, in [m]."""
 
 NEAR: Final = 0.1
 """Points farther than this from the straight move's spheres are left out, in [m]; `safety` still sees them."""
@@ -102,8 +102,8 @@ class DetourPlanner:
         """Centres of the balls that stand for the plant beside the way, the nearest first. Shape (N, 3)."""
         if self._safety.config.plant_clearance is None or not len(points_w):
             return np.zeros((0, 3))
-        cells = np.unique(np.floor(points_w / CELL), axis=0)
-        centres: Float64 = (cells + 0.5) * CELL
+        cells = np.unique(np.floor(points_w / BALL), axis=0)
+        centres: Float64 = (cells + 0.5) * BALL
         distances = sphere_distances(joint_path(start, goal, 0.1), centres, self._T_flange_camera).min(axis=0)
         order = np.argsort(distances, kind="stable")
         near: Float64 = centres[order[distances[order] < NEAR][:MAX_BALLS]]
@@ -146,7 +146,7 @@ class _SteeredArm:
             )
         for k, centre in enumerate(balls):
             spec.worldbody.add_geom(
-                name=f"ball {k}", type=mj.mjtGeom.mjGEOM_SPHERE, size=[CELL / 2, 0.0, 0.0], pos=centre
+                name=f"ball {k}", type=mj.mjtGeom.mjGEOM_SPHERE, size=[BALL / 2, 0.0, 0.0], pos=centre
             )
         self._model: Any = spec.compile()
         names = [geom.name for geom in shapes]
@@ -160,7 +160,7 @@ class _SteeredArm:
             self._limits.append(self._keep_apart(names, around[1:], config.obstacle_clearance))
         if len(balls) and config.plant_clearance is not None:
             named = [f"sphere {k}" for k in range(len(spheres))], [f"ball {k}" for k in range(len(balls))]
-            self._limits.append(self._keep_apart(*named, config.plant_clearance - CELL / 2))
+            self._limits.append(self._keep_apart(*named, config.plant_clearance - BALL / 2))
 
     def _keep_apart(self, first: list[str], second: list[str], clearance: float) -> Any:
         return mink.CollisionAvoidanceLimit(

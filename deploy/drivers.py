@@ -67,10 +67,7 @@ def make_arm(name: str, options: Mapping[str, Any], context: DriverContext) -> A
     Raises:
         ProfileError: There is no such driver, it cannot be loaded, or an option is wrong.
     """
-    made = _load("arm", name)(options, context)
-    if not isinstance(made, Arm):
-        raise ProfileError(f"the driver arm.{name} made {type(made).__name__}, which is no Arm")
-    return made
+    return _made("arm", Arm, name, options, context)  # type: ignore[type-abstract]
 
 
 def make_camera(name: str, options: Mapping[str, Any], context: DriverContext) -> Camera:
@@ -79,23 +76,28 @@ def make_camera(name: str, options: Mapping[str, Any], context: DriverContext) -
     Raises:
         ProfileError: As for `make_arm`.
     """
-    made = _load("camera", name)(options, context)
-    if not isinstance(made, Camera):
-        raise ProfileError(f"the driver camera.{name} made {type(made).__name__}, which is no Camera")
+    return _made("camera", Camera, name, options, context)  # type: ignore[type-abstract]
+
+
+def _made(kind: Kind, device: type[T], name: str, options: Mapping[str, Any], context: DriverContext) -> T:
+    made = _load(kind, name)(options, context)
+    if not isinstance(made, device):
+        raise ProfileError(
+            f"the driver {kind}.{name} made {type(made).__name__}, which is no {device.__name__}"
+        )
     return made
 
 
-def _load(kind: Kind, name: str) -> Callable[[Mapping[str, Any], DriverContext], Any]:
+def _load(kind: Kind, name: str) -> Callable[[Mapping[str, Any], DriverContext], object]:
+    make: Callable[[Mapping[str, Any], DriverContext], object]
     try:
         if name in BUILT_IN[kind]:
             module, _, attribute = BUILT_IN[kind][name].partition(":")
-            found: Callable[[Mapping[str, Any], DriverContext], Any] = getattr(
-                importlib.import_module(module), attribute
-            )
-            return found
+            make = getattr(importlib.import_module(module), attribute)
+            return make
         for entry in entry_points(group=ENTRY_POINT_GROUP, name=f"{kind}.{name}"):
-            loaded: Callable[[Mapping[str, Any], DriverContext], Any] = entry.load()
-            return loaded
+            make = entry.load()
+            return make
     except (ImportError, AttributeError) as error:
         raise ProfileError(
             f"the driver {kind}.{name} cannot be loaded: {error}; is its package installed?"

@@ -7,14 +7,11 @@ import numpy as np
 
 from maniskill_tomato.deploy.clock import Clock
 from maniskill_tomato.deploy.deploy_errors import DeviceTimeoutError, FaultError, RefusedError
-from maniskill_tomato.deploy.interface import Arm, ArmState, Float64, JointMove
+from maniskill_tomato.deploy.interface import LIMIT_SLACK, Arm, ArmState, Float64, JointMove
 from maniskill_tomato.deploy.safety import Safety
 from maniskill_tomato.robot.iiwa14 import JOINT_LOWER, JOINT_NAMES, JOINT_UPPER, VELOCITY_LIMITS
 
 _logger = logging.getLogger(__name__)
-
-LIMIT_SLACK: Final = np.deg2rad(1.0)
-"""Measured joints may be this far beyond their limits, in [rad]."""
 
 JUMP_SLACK: Final = 0.02
 """A joint may seem to turn this much beyond what its largest speed allows between two states, in [rad]."""

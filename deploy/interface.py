@@ -4,10 +4,11 @@ The world frame is the robot's base frame (`link_0`), z up. Units are metres, ra
 the driver's `Clock` and say when the device took the measurement, as far as the driver knows.
 """
 
+import math
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
 from types import TracebackType
-from typing import Any, Self
+from typing import Any, Final, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,6 +19,9 @@ from maniskill_tomato.robot.d435 import CameraIntrinsics
 from maniskill_tomato.robot.iiwa14 import NUM_JOINTS
 
 Float64 = NDArray[np.float64]
+
+LIMIT_SLACK: Final = math.radians(1.0)
+"""Measured joints may be this far beyond their limits, in [rad]."""
 
 
 def frozen_array(values: Any, shape: tuple[int, ...], name: str) -> Float64:

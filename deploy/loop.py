@@ -8,38 +8,42 @@ camera has not moved and tries something else.
 
 import logging
 import time
-from collections.abc import Callable
-from contextlib import suppress
+from collections import defaultdict
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager, suppress
 from dataclasses import replace
 from typing import Final
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 
 from maniskill_tomato.deploy.capture import Capture
-from maniskill_tomato.deploy.clock import Clock
 from maniskill_tomato.deploy.deploy_errors import (
     DeployError,
     FaultError,
     HeartbeatLostError,
     PerceptionError,
-    RecordingError,
     RefusedError,
 )
-from maniskill_tomato.deploy.guarded_arm import GuardedArm
-from maniskill_tomato.deploy.interface import Camera, Float64, Frame, JointMove
-from maniskill_tomato.deploy.loop_config import LoopConfig, Mode, Proposal
+from maniskill_tomato.deploy.interface import Float64, Frame, JointMove
 from maniskill_tomato.deploy.move_choice import MoveChooser, MoveRequest
 from maniskill_tomato.deploy.plant_points import PlantPoints
-from maniskill_tomato.deploy.policies import decide
-from maniskill_tomato.deploy.robot_belief import RobotBelief
-from maniskill_tomato.deploy.robot_perception import Perception
-from maniskill_tomato.deploy.run_records import Recorder, RunResult, Step
+from maniskill_tomato.deploy.robot_perception import RobotBelief
+from maniskill_tomato.deploy.run_records import Mode, Proposal, Recorder, RunResult, Step
 from maniskill_tomato.deploy.safety import Refusal
-from maniskill_tomato.deploy.stage_times import StageTimes
 from maniskill_tomato.deploy.stops import Stops
+from maniskill_tomato.deploy.workcell import Workcell
 from maniskill_tomato.errors import PolicyError, TomatoError
+from maniskill_tomato.policies.opening import shipped_policy
 from maniskill_tomato.policies.protocol import Policy
+from maniskill_tomato.sensing.belief import Belief
+
+TASK: Final = "TomatoViewpoint-v1"
+"""The task whose observations and actions the loop has."""
+
+BOUND_SLACK: Final = 1e-4
+"""An action's entries may exceed 1 by this much: rounding."""
 
 WAIT_SLICE: Final = 0.1
 """While the arm moves, stops are looked for this often, in [s]."""
@@ -48,6 +52,35 @@ STOP_TIME: Final = 2.0
 """An arm that was told to stop stands after so long, in [s]."""
 
 _logger = logging.getLogger(__name__)
+
+
+def default_policy() -> str:
+    """The policy that ships with the package."""
+    return str(shipped_policy(TASK))
+
+
+def decide(policy: Policy, belief: Belief) -> NDArray[np.float64]:
+    """The policy's next move, checked.
+
+    Returns:
+        Right, up, forward in [-1, 1]. Shape (3,).
+
+    Raises:
+        PolicyError: It is not three finite numbers within the bounds.
+    """
+    action = np.asarray(policy.act(belief).detach().double())
+    if action.shape != (1, 3):
+        raise PolicyError(
+            f"the policy answered with shape {action.shape}, not (1, 3); is it for another task?"
+        )
+    if not np.isfinite(action).all():
+        raise PolicyError(
+            f"the policy answered {action[0].tolist()}, which is not finite; the arm does not move"
+        )
+    if np.abs(action).max() > 1.0 + BOUND_SLACK:
+        raise PolicyError(f"the policy answered {action[0].tolist()}, outside [-1, 1]; the arm does not move")
+    move: NDArray[np.float64] = action[0].clip(-1.0, 1.0)
+    return move
 
 
 class _End(Exception):
@@ -63,58 +96,42 @@ class Loop:
 
     def __init__(
         self,
-        *,
-        arm: GuardedArm,
-        camera: Camera,
-        capture: Capture,
-        perception: Perception,
+        workcell: Workcell,
         policy: Policy,
-        T_flange_camera: Float64,
-        clock: Clock,
-        config: LoopConfig,
         stops: Stops,
-        recorder: Recorder | None = None,
         mode: Mode = "dry_run",
+        recorders: Sequence[Recorder] = (),
         confirm: Callable[[Proposal], bool] = lambda proposal: False,
-        target_position: Float64 | None = None,
     ) -> None:
         """Puts the stages together.
 
         Args:
-            arm: The only way to the arm.
-            camera: Told when the arm stands at a new viewpoint.
-            capture: Takes the camera's pictures.
-            perception: Turns them into sightings of the target.
+            workcell: Its devices must be connected.
             policy: Decides.
-            T_flange_camera: The camera's optical frame in `link_ee`. Shape (4, 4).
-            clock: The devices' clock.
-            config: When to end.
             stops: Asked again and again.
-            recorder: Keeps every step, if given.
             mode: What happens before a move.
+            recorders: Keep every step.
             confirm: Asked in the mode `confirm`.
-            target_position: Where the target is, world frame, in [m]; None to take the largest ripe fruit of the first
-                picture. Shape (3,).
+
+        Raises:
+            ProfileError: The profile names a target that there is not.
         """
-        self._arm, self._camera, self._capture = arm, camera, capture
-        self._perception, self._policy = perception, policy
-        self._clock, self._config, self._stops = clock, config, stops
-        self._recorder, self._mode, self._confirm = recorder, mode, confirm
-        perception.begin(target_position)
-        self._robot_belief = RobotBelief(T_flange_camera, config.max_moves)
-        self._chooser = MoveChooser(arm.safety, T_flange_camera)
-        self._points = PlantPoints(T_flange_camera)
+        profile = workcell.profile
+        self._arm, self._camera, self._clock = workcell.guarded_arm, workcell.camera, workcell.clock
+        self._capture = Capture(workcell.camera, profile.capture, workcell.clock)
+        self._perception, self._policy, self._stops = workcell.perception, policy, stops
+        self._config, self._mode = profile.loop, mode
+        self._recorders, self._confirm = recorders, confirm
+        self._perception.begin(workcell.target_position())
+        self._robot_belief = RobotBelief(profile.T_flange_camera, profile.loop.max_moves)
+        self._chooser = MoveChooser(self._arm.safety, profile.T_flange_camera)
+        self._points = PlantPoints(profile.T_flange_camera)
         self._fractions: list[float] = []
         self._moves = self._refused = self._refused_in_a_row = self._lost_in_a_row = 0
-        self._settled_at = clock.now()
+        self._settled_at = self._clock.now()
         self._way_back: Float64 | None = None
         self._true_fraction: float | None = None
-        self._times = StageTimes()
-
-    @property
-    def points(self) -> PlantPoints:
-        """What the camera has seen of the plant."""
-        return self._points
+        self._times = _StageTimes()
 
     def run(self) -> RunResult:
         """Runs to an end; faults end it too, and are told in the result."""
@@ -134,7 +151,7 @@ class Loop:
         try:
             device_seconds = self._clock.now() - device_began
         except DeployError:
-            device_seconds = float("nan")
+            device_seconds = 0.0
         result = RunResult(
             success=reason == "success",
             reason=reason,
@@ -147,7 +164,7 @@ class Loop:
             true_visible_fraction=self._true_fraction,
             visible_fractions=tuple(round(v, 4) for v in self._fractions),
             seconds=time.perf_counter() - began,
-            device_seconds=0.0 if np.isnan(device_seconds) else device_seconds,
+            device_seconds=device_seconds,
             stage_ms=self._times.mean_ms,
             end_state=end_state,
         )
@@ -295,22 +312,19 @@ class Loop:
 
     def _ask(self, step: Step, move: JointMove, refusal: Refusal | None) -> None:
         """Shows the move; goes on only if a person wants it."""
-        state = self._arm.read()
-        after = self._robot_belief.camera_pose(move.joint_positions)
-        proposal = Proposal(
-            number=self._moves - 1,
-            visible_fraction=step.view.visible_fraction,
-            joint_positions=move.joint_positions,
-            turn=move.joint_positions - state.joint_positions,
-            camera_step=float(np.linalg.norm(after[:3, 3] - step.T_world_camera[:3, 3])),
-            refusal=None if refusal is None else str(refusal),
-        )
         if self._mode == "dry_run":
             told = "safety would let it through" if refusal is None else f"safety would refuse it: {refusal}"
             turns = ", ".join(f"{v:.1f}" for v in np.rad2deg(move.joint_positions))
             self._end(step, "dry_run", f"nothing was sent; the first move would go to ({turns}) deg; {told}")
         if refusal is not None:
             return
+        after = self._robot_belief.camera_pose(move.joint_positions)
+        proposal = Proposal(
+            number=self._moves - 1,
+            visible_fraction=step.view.visible_fraction,
+            turn=move.joint_positions - self._arm.read().joint_positions,
+            camera_step=float(np.linalg.norm(after[:3, 3] - step.T_world_camera[:3, 3])),
+        )
         with self._stops.waiting_for_a_person():
             confirmed = self._confirm(proposal)
         self._check_stops()
@@ -354,13 +368,46 @@ class Loop:
         return "a move may still be under way and goes on to its end; only the smartPAD or the emergency stop halts it"
 
     def _record(self, step: Step) -> None:
-        if self._recorder is not None:
-            self._recorder.step(replace(step, timing_ms=self._times.step_ms))
+        for recorder in self._recorders:
+            recorder.step(replace(step, timing_ms=self._times.step_ms))
 
     def _log(self, text: str) -> None:
         _logger.info("%s", text)
-        if self._recorder is not None:
+        for recorder in self._recorders:
             try:
-                self._recorder.event(self._clock.now(), text)
-            except (RecordingError, DeployError) as error:
+                recorder.event(self._clock.now(), text)
+            except DeployError as error:
                 _logger.warning("%s", error)
+
+
+class _StageTimes:
+    """Wall times by stage, of the step under way and of all."""
+
+    def __init__(self) -> None:
+        self._all: dict[str, list[float]] = defaultdict(list)
+        self._step: dict[str, float] = {}
+
+    def begin_step(self) -> None:
+        """A new step begins; `step_ms` is empty again."""
+        self._step = {}
+
+    @contextmanager
+    def timed(self, stage: str) -> Iterator[None]:
+        """Measures what is inside, also where it raises."""
+        began = time.perf_counter()
+        try:
+            yield
+        finally:
+            taken = 1e3 * (time.perf_counter() - began)
+            self._all[stage].append(taken)
+            self._step[stage] = round(taken, 3)
+
+    @property
+    def step_ms(self) -> dict[str, float]:
+        """Of the step under way, in [ms]."""
+        return dict(self._step)
+
+    @property
+    def mean_ms(self) -> dict[str, float]:
+        """Means over all steps, in [ms]."""
+        return {stage: round(float(np.mean(values)), 2) for stage, values in self._all.items()}

@@ -41,8 +41,8 @@ class PlantPoints:
         """
         self._T_flange_camera = T_flange_camera
         self._cell = cell
-        self._cells: dict[tuple[int, int, int], int] = {}
-        self._points: Float64 | None = np.zeros((0, 3))
+        self._cells: dict[tuple[int, int, int], None] = {}
+        self._points: Float64 | None = None
 
     def __len__(self) -> int:
         return len(self._cells)
@@ -51,7 +51,7 @@ class PlantPoints:
     def points_w(self) -> Float64:
         """Centres of the occupied cells, in [m]. Shape (N, 3)."""
         if self._points is None:
-            cells = np.array([c for c, seen in self._cells.items() if seen], dtype=np.float64).reshape(-1, 3)
+            cells = np.array(list(self._cells), dtype=np.float64).reshape(-1, 3)
             self._points = (cells + 0.5) * self._cell
         return self._points
 
@@ -71,9 +71,8 @@ class PlantPoints:
             distances = sphere_distances(joint_positions[None], points, self._T_flange_camera)
             points = points[distances[0] > SELF_MARGIN]
         before = len(self._cells)
-        for cell in np.unique(np.floor(points / self._cell).astype(np.int64), axis=0):
-            key = (int(cell[0]), int(cell[1]), int(cell[2]))
-            self._cells[key] = self._cells.get(key, 0) + 1
+        for x, y, z in np.unique(np.floor(points / self._cell).astype(np.int64), axis=0).tolist():
+            self._cells[x, y, z] = None
         self._points = None
         return len(self._cells) - before
 

@@ -1,24 +1,39 @@
-"""One run from a profile to its report."""
+"""One run from a profile to its report: `result.json`, `report.png` with every look, and `run.mcap`."""
 
+import json
 import logging
+import math
 from collections.abc import Callable
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
 
 from maniskill_tomato import __version__
 from maniskill_tomato.deploy.clock import Clock
 from maniskill_tomato.deploy.deploy_errors import ProfileError, RecordingError
-from maniskill_tomato.deploy.loop_config import Mode, Proposal
-from maniskill_tomato.deploy.policies import TASK, default_policy
+from maniskill_tomato.deploy.loop import TASK, Loop, default_policy
 from maniskill_tomato.deploy.profile import Profile
 from maniskill_tomato.deploy.recording import McapRecorder
-from maniskill_tomato.deploy.run_records import Recorder, RunResult, Step
-from maniskill_tomato.deploy.run_report import Contact, write_report
-from maniskill_tomato.deploy.stops import Stops
-from maniskill_tomato.deploy.workcell import make_workcell, prepare_folder
+from maniskill_tomato.deploy.run_records import Mode, Proposal, Recorder, RunResult, Step
+from maniskill_tomato.deploy.workcell import make_workcell
+from maniskill_tomato.errors import TomatoError
+from maniskill_tomato.files import write_atomically
 from maniskill_tomato.policies.opening import open_policy
+from maniskill_tomato.report_design import INK, rgb
+
+TILE: Final = (320, 240)
+"""Largest size of one look, in [px]."""
+BAR: Final = 34
+"""Height of the caption below it, in [px]."""
+COLUMNS: Final = 5
+MARK = (0, 230, 255)
+"""Outline of the target; RGB."""
+
 
 RECORDING = "run.mcap"
 """Name of the recording in the output folder."""
@@ -41,21 +56,6 @@ class RunConfig:
     """None: unattended on the twin, dry run on hardware."""
     record: bool = True
     """Whether to write an MCAP file."""
-
-
-class _Several:
-    """Passes steps on to several recorders."""
-
-    def __init__(self, recorders: list[Recorder]) -> None:
-        self._recorders = recorders
-
-    def step(self, step: Step) -> None:
-        for recorder in self._recorders:
-            recorder.step(step)
-
-    def event(self, stamp: float, text: str) -> None:
-        for recorder in self._recorders:
-            recorder.event(stamp, text)
 
 
 def run(
@@ -102,30 +102,113 @@ def run(
         "simulated": workcell.simulated,
         "version": __version__,
     }
-    stop_file = prepare_folder(profile, config.out)
-    contact = Contact()
+    stops = workcell.listen(config.out, keyboard)
+    sheet = ContactSheet()
     with ExitStack() as stack:
         arm = stack.enter_context(workcell.arm)
         camera = stack.enter_context(workcell.camera)
         devices = {"arm": arm.describe(), "camera": camera.describe()}
-        recorders: list[Recorder] = [contact]
+        recorders: list[Recorder] = [sheet]
         if config.record:
             mount = profile.T_flange_camera.tolist()
             info = {**facts, "profile_text": profile.text, "T_flange_camera": mount, "devices": devices}
             recorders.append(stack.enter_context(McapRecorder(config.out / RECORDING, info)))
-        stops = stack.enter_context(
-            Stops(
-                stop_file=stop_file,
-                keyboard=keyboard,
-                heartbeat_s=profile.stop.heartbeat,
-                on_lost_heartbeat=workcell.guarded_arm.stop,
-            )
-        )
-        result = workcell.loop(policy, stops, mode, _Several(recorders), confirm).run()
+        stack.enter_context(stops)
+        result = Loop(workcell, policy, stops, mode, recorders, confirm).run()
     try:
-        write_report(config.out, result, {**facts, "devices": devices}, contact)
+        write_report(config.out, result, {**facts, "devices": devices}, sheet)
     except RecordingError as error:
         _logger.error("%s", error)
         if not result.is_fault:
             result = replace(result, reason=error.reason, detail=str(error), is_fault=True)
     return result
+
+
+class ContactSheet:
+    """A recorder that keeps a small picture of every look."""
+
+    def __init__(self) -> None:
+        self.tiles: list[NDArray[np.uint8]] = []
+        self.steps: list[dict[str, Any]] = []
+
+    def step(self, step: Step) -> None:
+        self.tiles.append(_tile(step))
+        self.steps.append(
+            {
+                "number": step.number,
+                "visible_fraction": round(step.view.visible_fraction, 4),
+                "camera": np.round(step.T_world_camera[:3, 3], 4).tolist(),
+                "action": None if step.action is None else [round(v, 4) for v in step.action],
+                "outcome": step.outcome,
+                "detail": step.detail,
+                "timing_ms": step.timing_ms,
+            }
+        )
+
+    def event(self, stamp: float, text: str) -> None:
+        pass
+
+    def picture(self, title: str) -> NDArray[np.uint8]:
+        """All looks side by side under a title. Shape (H, W, 3)."""
+        if not self.tiles:
+            return np.full((60, 400, 3), 255, dtype=np.uint8)
+        height = max(tile.shape[0] for tile in self.tiles)
+        width = max(tile.shape[1] for tile in self.tiles)
+        columns = min(COLUMNS, len(self.tiles))
+        rows = math.ceil(len(self.tiles) / columns)
+        sheet = np.full((BAR + rows * (height + 8), columns * (width + 8) + 8, 3), 255, dtype=np.uint8)
+        _write(sheet, title, (10, 22), 0.55)
+        for k, tile in enumerate(self.tiles):
+            top, left = BAR + (k // columns) * (height + 8), 8 + (k % columns) * (width + 8)
+            sheet[top : top + tile.shape[0], left : left + tile.shape[1]] = tile
+        return sheet
+
+
+def write_report(out: Path, result: RunResult, facts: dict[str, Any], sheet: ContactSheet) -> None:
+    """Writes `result.json` and `report.png`.
+
+    Raises:
+        RecordingError: The disk does not take them.
+    """
+    content = {**result.to_json(), **facts, "steps": sheet.steps}
+    for name in ("seconds", "device_seconds", "visible_fraction", "best_visible_fraction"):
+        content[name] = round(content[name], 4)
+    if result.true_visible_fraction is not None:
+        content["true_visible_fraction"] = round(result.true_visible_fraction, 4)
+    title = (
+        f"{facts.get('profile')}, seed {facts.get('seed')}, {facts.get('policy_name')}: {result.reason}, "
+        f"V_f {result.visible_fraction:.2f} after {result.moves} moves"
+    )
+    ok, picture = cv2.imencode(".png", sheet.picture(title)[..., ::-1])
+    try:
+        write_atomically(out / "result.json", (json.dumps(content, indent=2) + "\n").encode())
+        if ok:
+            write_atomically(out / "report.png", picture.tobytes())
+    except TomatoError as error:
+        raise RecordingError(f"cannot write the report into {out}: {error.__cause__ or error}") from error
+
+
+def _tile(step: Step) -> NDArray[np.uint8]:
+    color = step.frame.color.copy()
+    scale = min(TILE[0] / color.shape[1], TILE[1] / color.shape[0])
+    size = (round(color.shape[1] * scale), round(color.shape[0] * scale))
+    small: Any = cv2.resize(color, size, interpolation=cv2.INTER_AREA)
+    mask: Any = cv2.resize(step.view.mask.astype(np.uint8), size, interpolation=cv2.INTER_NEAREST)
+    outlines, _ = cv2.findContours(mask, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
+    cv2.drawContours(small, outlines, -1, MARK, 2)
+    centre = step.T_world_camera[:3, :3].T @ (step.target_position - step.T_world_camera[:3, 3])
+    if centre[2] > 0.0:
+        i = step.frame.intrinsics
+        u = round((i.fx * centre[0] / centre[2] + i.cx) * scale)
+        v = round((i.fy * centre[1] / centre[2] + i.cy) * scale)
+        cv2.drawMarker(small, (u, v), MARK, cv2.MARKER_CROSS, 9, 1)
+    tile = np.full((small.shape[0] + BAR, small.shape[1], 3), 255, dtype=np.uint8)
+    tile[: small.shape[0]] = small
+    _write(tile, f"{step.number}: V_f {step.view.visible_fraction:.2f}", (4, small.shape[0] + 14), 0.42)
+    what = step.outcome if not step.detail else f"{step.outcome}: {step.detail}"
+    _write(tile, what[:48], (4, small.shape[0] + 29), 0.36)
+    return tile
+
+
+def _write(image: NDArray[np.uint8], text: str, at: tuple[int, int], size: float) -> None:
+    cv2.putText(image, text, at, cv2.FONT_HERSHEY_SIMPLEX, size, rgb(INK), 1, cv2.LINE_AA)

@@ -14,12 +14,12 @@ import numpy as np
 from maniskill_tomato.deploy.capture import CaptureConfig
 from maniskill_tomato.deploy.deploy_errors import ProfileError
 from maniskill_tomato.deploy.interface import Float64
-from maniskill_tomato.deploy.loop_config import LoopConfig
 from maniskill_tomato.deploy.profile_files import profile_names, profile_path
 from maniskill_tomato.deploy.robot_perception import TRUE_MASKS, Sight
-from maniskill_tomato.deploy.safety_config import SafetyConfig
+from maniskill_tomato.deploy.run_records import LoopConfig
+from maniskill_tomato.deploy.safety import SafetyConfig
 from maniskill_tomato.deploy.toml_tables import parse_table
-from maniskill_tomato.errors import InvalidInputError
+from maniskill_tomato.errors import InvalidInputError, check_ranges
 from maniskill_tomato.robot.d435 import T_flange_camera_color_optical
 
 TABLES: Final = (
@@ -88,8 +88,7 @@ class StopConfig:
     """The arm is stopped when the loop stands still for so long, in [s]."""
 
     def __post_init__(self) -> None:
-        if not 1.0 <= self.heartbeat <= 3600.0:
-            raise InvalidInputError(f"heartbeat must be from 1 to 3600 s, got {self.heartbeat}")
+        check_ranges(self, heartbeat=(1.0, 3600.0))
         if Path(self.file).name != self.file or not self.file:
             raise InvalidInputError(f"file must be a plain file name, got {self.file!r}")
 

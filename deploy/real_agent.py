@@ -4,15 +4,16 @@ import math
 from collections.abc import Sequence
 from typing import Any, Final
 
+import cv2
 import numpy as np
 import torch
 from mani_skill.agents.base_real_agent import BaseRealAgent
+from numpy.typing import NDArray
 from torch import Tensor
 
 from maniskill_tomato.deploy.capture import Capture
 from maniskill_tomato.deploy.deploy_errors import NotConnectedError, RefusedError
 from maniskill_tomato.deploy.interface import Float64, Frame, JointMove
-from maniskill_tomato.deploy.picture_fit import depth_in_mm, fit_color, fit_depth
 from maniskill_tomato.deploy.plant_points import PlantPoints
 from maniskill_tomato.deploy.workcell import Workcell
 from maniskill_tomato.errors import InvalidInputError
@@ -76,9 +77,8 @@ class IiwaRealAgent(BaseRealAgent):  # type: ignore[misc]
         """
         joints = _joints(qpos)
         state = self.workcell.guarded_arm.read()
-        if (
-            not np.abs(joints - state.joint_positions).max() <= 1e-4
-        ):  # NaN goes on to safety, which refuses it.
+        # NaN goes on to safety, which refuses it.
+        if not np.abs(joints - state.joint_positions).max() <= 1e-4:
             frame_stamp = None if self._frame is None else self._frame.stamp
             self._go(joints, frame_stamp)
 
@@ -206,9 +206,68 @@ class IiwaRealAgent(BaseRealAgent):  # type: ignore[misc]
 
 
 def _joints(qpos: Any) -> Float64:
-    values = np.asarray(qpos.detach().cpu() if isinstance(qpos, Tensor) else qpos, dtype=np.float64).reshape(
-        -1
-    )
+    on_cpu = qpos.detach().cpu() if isinstance(qpos, Tensor) else qpos
+    values = np.asarray(on_cpu, dtype=np.float64).reshape(-1)
     if values.shape != (NUM_JOINTS,):
         raise InvalidInputError(f"qpos must be {NUM_JOINTS} joint angles, got {values.size}")
     return values
+
+
+def fit_color(frame: Frame, wanted: CameraIntrinsics) -> NDArray[np.uint8]:
+    """The colour picture for other intrinsics, averaged where it shrinks; black outside the real picture.
+
+    Args:
+        frame: The real picture.
+        wanted: Of the simulated camera.
+
+    Returns:
+        RGB. Shape (H, W, 3) of `wanted`.
+    """
+    have = frame.intrinsics
+    if have == wanted:
+        return frame.color.copy()
+    # Sampled so finely that no pixel of the real picture is left out, then averaged.
+    finer = max(1, math.ceil(max(have.fx / wanted.fx, have.fy / wanted.fy)))
+    large = wanted.scaled(finer * wanted.width, finer * wanted.height)
+    picture = _warped(frame.color, have, large, cv2.INTER_LINEAR)
+    if finer > 1:
+        picture = cv2.resize(picture, (wanted.width, wanted.height), interpolation=cv2.INTER_AREA)
+    return np.asarray(picture, dtype=np.uint8)
+
+
+def fit_depth(frame: Frame, wanted: CameraIntrinsics) -> NDArray[np.float32]:
+    """The depth picture for other intrinsics by the nearest pixel; 0 outside the real picture.
+
+    Args:
+        frame: The real picture.
+        wanted: Of the simulated camera.
+
+    Returns:
+        In [m]. Shape (H, W) of `wanted`.
+    """
+    return np.asarray(_warped(frame.depth, frame.intrinsics, wanted, cv2.INTER_NEAREST), dtype=np.float32)
+
+
+def depth_in_mm(depth: NDArray[np.float32]) -> NDArray[np.int16]:
+    """Depth in whole [mm] as ManiSkill has it; what is beyond 32.767 m counts as no depth. Any shape."""
+    millimetres = np.rint(1000.0 * depth)
+    return np.where(millimetres <= np.iinfo(np.int16).max, millimetres, 0.0).astype(np.int16)
+
+
+def _warped(
+    picture: NDArray[Any], have: CameraIntrinsics, wanted: CameraIntrinsics, interpolation: int
+) -> NDArray[Any]:
+    # Both cameras look along the same axis, so that columns and rows are stretched and shifted. OpenCV counts from the
+    # centre of the first pixel.
+    sx, sy = have.fx / wanted.fx, have.fy / wanted.fy
+    matrix = np.array(
+        [
+            [sx, 0.0, have.cx - 0.5 - sx * (wanted.cx - 0.5)],
+            [0.0, sy, have.cy - 0.5 - sy * (wanted.cy - 0.5)],
+        ]
+    )
+    warped = cv2.warpAffine(
+        picture, matrix, (wanted.width, wanted.height), flags=interpolation | cv2.WARP_INVERSE_MAP
+    )
+    result: NDArray[Any] = warped
+    return result

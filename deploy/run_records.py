@@ -1,10 +1,52 @@
-"""Records of a run: one step for each picture, and the result."""
+"""A run in data: its settings, the question before a move, one step for each picture, the result."""
 
+import math
 from dataclasses import asdict, dataclass, field
-from typing import Any, Protocol
+from typing import Any, Literal, Protocol
 
 from maniskill_tomato.deploy.interface import Float64, Frame
 from maniskill_tomato.deploy.robot_perception import Sighting
+from maniskill_tomato.errors import InvalidInputError, check_ranges
+
+Mode = Literal["dry_run", "confirm", "unattended"]
+"""Show the first move and end; ask before every move; go on alone."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class LoopConfig:
+    """When a run ends."""
+
+    threshold: float = 0.8
+    """The target is fully visible when V_f is above this."""
+    max_moves: int = 20
+    """Moves in which it must be."""
+    lost_after: int = 12
+    """Looks without any of the target in a row after which it counts as lost."""
+    refused_after: int = 8
+    """Refused moves in a row after which the run ends."""
+    settle: float = 0.2
+    """Between the end of a move and the next picture, in [s]."""
+
+    def __post_init__(self) -> None:
+        if not 0.0 < self.threshold < 1.0:
+            raise InvalidInputError(f"threshold must be between 0 and 1, got {self.threshold}")
+        at_least_one = (1, math.inf)
+        check_ranges(self, max_moves=at_least_one, lost_after=at_least_one, refused_after=at_least_one)
+        check_ranges(self, settle=(0.0, 10.0))
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Proposal:
+    """A move that a person is asked about."""
+
+    number: int
+    """How many moves there were before."""
+    visible_fraction: float
+    """V_f now."""
+    turn: Float64
+    """How far each joint would turn, in [rad]. Shape (7,)."""
+    camera_step: float
+    """How far the camera would move, in [m]."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

@@ -12,19 +12,18 @@ from typing import Any, Final
 import numpy as np
 import torch
 
-from maniskill_tomato.deploy.capture import Capture
 from maniskill_tomato.deploy.clock import SimulatedClock
 from maniskill_tomato.deploy.deploy_errors import CutOffError, NotConnectedError, RecordingError
 from maniskill_tomato.deploy.guarded_arm import GuardedArm
 from maniskill_tomato.deploy.interface import Arm, ArmState, Camera, Float64, Frame, FrameTruth, JointMove
-from maniskill_tomato.deploy.loop import Loop
-from maniskill_tomato.deploy.policies import TASK
-from maniskill_tomato.deploy.profile import Profile, parse_profile
+from maniskill_tomato.deploy.loop import TASK, Loop
+from maniskill_tomato.deploy.profile import Profile, TargetConfig, parse_profile
 from maniskill_tomato.deploy.recording import FORMAT, decode_depth, decode_png, read_messages, unpack
 from maniskill_tomato.deploy.robot_perception import open_perception
 from maniskill_tomato.deploy.run_records import RunResult, Step
 from maniskill_tomato.deploy.safety import Safety
 from maniskill_tomato.deploy.stops import Stops
+from maniskill_tomato.deploy.workcell import Workcell
 from maniskill_tomato.policies.opening import open_policy
 from maniskill_tomato.raycast.view_rays import ViewRays
 from maniskill_tomato.robot.d435 import CameraIntrinsics
@@ -127,30 +126,11 @@ def replay(recorded: RecordedRun, policy: str | None = None) -> Replay:
     Raises:
         DeployError: The recording's profile or policy cannot be used today.
     """
-    profile = recorded.profile
-    # The arm arrives where it arrived then, whatever is commanded now.
-    safety = replace(profile.safety, arrival_tolerance=10.0)
     clock = SimulatedClock(recorded.steps[0].frame.stamp - BEFORE)
     playback = _Playback(recorded.steps, clock)
-    arm, camera = _PlayedArm(playback), _PlayedCamera(playback)
     comparison = _Comparison(recorded.steps)
-    loop = Loop(
-        arm=GuardedArm(arm, Safety(safety, profile.T_flange_camera), clock),
-        camera=camera,
-        # A look's other attempts were not recorded.
-        capture=Capture(camera, replace(profile.capture, attempts=1), clock),
-        perception=open_perception(profile.perception.sight, profile.perception.segmenter),
-        policy=open_policy(
-            policy or str(recorded.info["policy"]), env_id=TASK, seed=int(recorded.info["seed"])
-        ),
-        T_flange_camera=profile.T_flange_camera,
-        clock=clock,
-        config=replace(profile.loop, settle=0.0),
-        stops=Stops(),
-        recorder=comparison,
-        mode="unattended",
-        target_position=_given_target(recorded),
-    )
+    opened = open_policy(policy or str(recorded.info["policy"]), env_id=TASK, seed=int(recorded.info["seed"]))
+    loop = Loop(_played_workcell(recorded, playback), opened, Stops(), "unattended", [comparison])
     result = loop.run()
     differences = list(comparison.differences)
     last = recorded.steps[-1].facts["outcome"]
@@ -161,6 +141,33 @@ def replay(recorded: RecordedRun, policy: str | None = None) -> Replay:
     elif playback.exhausted and last not in ("moved", "refused", "broken off"):
         differences.append(Difference(step=comparison.count, what="end", recorded=last, now="goes on"))
     return Replay(steps=comparison.count, differences=tuple(differences), result=result)
+
+
+def _played_workcell(recorded: RecordedRun, playback: "_Playback") -> Workcell:
+    profile, clock = recorded.profile, playback.clock
+    target = profile.target
+    truth = recorded.steps[0].frame.truth
+    if target.source == "twin" and truth is not None:
+        x, y, z = (float(c) for c in truth.target_position)
+        target = TargetConfig(source="given", position=(x, y, z))
+    profile = replace(
+        profile,
+        target=target,
+        # The arm arrives where it arrived then, whatever is commanded now.
+        safety=replace(profile.safety, arrival_tolerance=10.0),
+        # A look's other attempts were not recorded.
+        capture=replace(profile.capture, attempts=1),
+        loop=replace(profile.loop, settle=0.0),
+    )
+    arm = _PlayedArm(playback)
+    return Workcell(
+        profile=profile,
+        clock=clock,
+        arm=arm,
+        camera=_PlayedCamera(playback),
+        guarded_arm=GuardedArm(arm, Safety(profile.safety, profile.T_flange_camera), clock),
+        perception=open_perception(profile.perception.sight, profile.perception.segmenter),
+    )
 
 
 class _Playback:
@@ -296,14 +303,6 @@ def _frame(parts: dict[str, dict[str, Any]], facts: dict[str, Any]) -> Frame:
         number=int(facts["frame_number"]),
         truth=_truth(parts["/truth"]) if "/truth" in parts else None,
     )
-
-
-def _given_target(recorded: RecordedRun) -> Float64 | None:
-    """What the run was told about its target; None if it chose one. Shape (3,)."""
-    target, truth = recorded.profile.target, recorded.steps[0].frame.truth
-    if target.source == "given":
-        return np.array(target.position)
-    return None if target.source == "seen" or truth is None else truth.target_position
 
 
 def _truth(message: dict[str, Any]) -> FrameTruth:

@@ -25,8 +25,7 @@ from torch import Tensor
 from maniskill_tomato.deploy.deploy_errors import PerceptionError, ProfileError, RefusedError
 from maniskill_tomato.deploy.interface import Float64
 from maniskill_tomato.deploy.real_agent import IiwaRealAgent
-from maniskill_tomato.deploy.robot_belief import RobotBelief
-from maniskill_tomato.deploy.robot_perception import Sighting
+from maniskill_tomato.deploy.robot_perception import RobotBelief, Sighting
 from maniskill_tomato.robot.inverse_kinematics import Reach
 from maniskill_tomato.robot.viewpoint_move import viewpoint_of
 from maniskill_tomato.tasks.arm_moves import ACTION_SIZES

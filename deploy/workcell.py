@@ -1,26 +1,20 @@
 """The devices of a profile, and what connects them to the policy."""
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from maniskill_tomato.deploy.capture import Capture
 from maniskill_tomato.deploy.clock import CheckedClock, Clock, MonotonicClock, SimulatedClock
 from maniskill_tomato.deploy.deploy_errors import ProfileError, RecordingError
 from maniskill_tomato.deploy.drivers import DriverContext, make_arm, make_camera
 from maniskill_tomato.deploy.guarded_arm import GuardedArm
 from maniskill_tomato.deploy.interface import Arm, Camera, Float64
-from maniskill_tomato.deploy.loop import Loop
-from maniskill_tomato.deploy.loop_config import Mode, Proposal
 from maniskill_tomato.deploy.profile import Profile
 from maniskill_tomato.deploy.robot_perception import Perception, open_perception
-from maniskill_tomato.deploy.run_records import Recorder
 from maniskill_tomato.deploy.safety import Safety
 from maniskill_tomato.deploy.stops import Stops
-from maniskill_tomato.policies.protocol import Policy
 
 TWIN_START = 1_000.0
 """What the twin's clock shows at first, in [s]."""
@@ -60,29 +54,29 @@ class Workcell:
             return position
         return None
 
-    def loop(
-        self,
-        policy: Policy,
-        stops: Stops,
-        mode: Mode,
-        recorder: Recorder | None = None,
-        confirm: Callable[[Proposal], bool] = lambda proposal: False,
-    ) -> Loop:
-        """The loop over the devices, which must be connected."""
-        return Loop(
-            arm=self.guarded_arm,
-            camera=self.camera,
-            capture=Capture(self.camera, self.profile.capture, self.clock),
-            perception=self.perception,
-            policy=policy,
-            T_flange_camera=self.profile.T_flange_camera,
-            clock=self.clock,
-            config=self.profile.loop,
-            stops=stops,
-            recorder=recorder,
-            mode=mode,
-            confirm=confirm,
-            target_position=self.target_position(),
+    def listen(self, out: Path, keyboard: bool) -> Stops:
+        """Makes an output folder and listens for everything that stops a run there, once it is entered.
+
+        Args:
+            out: The folder; the file that stopped an earlier run in it is taken away.
+            keyboard: Whether keys in a terminal stop the run.
+
+        Raises:
+            RecordingError: The folder cannot be made or written to.
+        """
+        stop_file = out / self.profile.stop.file
+        try:
+            out.mkdir(parents=True, exist_ok=True)
+            stop_file.unlink(missing_ok=True)
+        except OSError as error:
+            raise RecordingError(
+                f"cannot use the folder {out}: {error.strerror or error}; choose another --out"
+            ) from error
+        return Stops(
+            stop_file=stop_file,
+            keyboard=keyboard,
+            heartbeat_s=self.profile.stop.heartbeat,
+            on_lost_heartbeat=self.guarded_arm.stop,
         )
 
 
@@ -115,20 +109,3 @@ def make_workcell(profile: Profile, seed: int = 0, clock: Clock | None = None) -
         guarded_arm=GuardedArm(arm, Safety(profile.safety, profile.T_flange_camera), checked),
         perception=open_perception(profile.perception.sight, profile.perception.segmenter),
     )
-
-
-def prepare_folder(profile: Profile, out: Path) -> Path:
-    """Makes an output folder; the file in it whose appearance stops the run, which an earlier run may have left.
-
-    Raises:
-        RecordingError: It cannot be made or written to.
-    """
-    stop_file = out / profile.stop.file
-    try:
-        out.mkdir(parents=True, exist_ok=True)
-        stop_file.unlink(missing_ok=True)
-    except OSError as error:
-        raise RecordingError(
-            f"cannot use the folder {out}: {error.strerror or error}; choose another --out"
-        ) from error
-    return stop_file

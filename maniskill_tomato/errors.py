@@ -1,6 +1,7 @@
 """The exceptions of this package, one family under `TomatoError`."""
 
 import difflib
+import math
 from collections.abc import Iterable
 
 
@@ -23,6 +24,30 @@ class InvalidInputError(TomatoError, ValueError):
         allowed = tuple(allowed)
         listed = ", ".join(repr(a) for a in allowed)
         return cls(f"{name} must be one of {listed}; got {value!r}{did_you_mean(value, allowed)}")
+
+
+def check_ranges(config: object, **ranges: tuple[float, float]) -> None:
+    """Accepts a configuration whose numbers lie in their ranges, ends included; NaN lies in none.
+
+    Raises:
+        InvalidInputError: One does not; the message names it and its range.
+    """
+    for name, (low, high) in ranges.items():
+        value = getattr(config, name)
+        if not low <= value <= high:
+            allowed = f"{low:g} or more" if high == math.inf else f"from {low:g} to {high:g}"
+            raise InvalidInputError(f"{name} must be {allowed}, got {value}")
+
+
+def check_positive(config: object, *names: str) -> None:
+    """Accepts a configuration whose numbers of these names are above 0.
+
+    Raises:
+        InvalidInputError: One is not.
+    """
+    for name in names:
+        if not getattr(config, name) > 0.0:
+            raise InvalidInputError(f"{name} must be above 0, got {getattr(config, name)}")
 
 
 class PolicyError(TomatoError):

@@ -1,7 +1,8 @@
-"""Files that are written whole or not at all, and tensors read from them without running code."""
+"""Files that are written whole or not at all: JSON, and tensors, which are read without running code."""
 
 import contextlib
 import io
+import json
 import os
 import pickle
 import zipfile
@@ -38,8 +39,30 @@ def write_atomically(path: Path, content: bytes) -> None:
         ) from error
 
 
+def write_json(path: Path, content: Any) -> None:
+    """Replaces a file by JSON with numbers that any reader accepts (no NaN).
+
+    Raises:
+        NotWrittenError: The file cannot be written.
+    """
+    write_atomically(path, (json.dumps(content, indent=2, allow_nan=False) + "\n").encode())
+
+
+def write_tensors(path: Path, content: Any) -> None:
+    """Replaces a file by what `read_tensors` reads.
+
+    Raises:
+        NotWrittenError: The file cannot be written.
+    """
+    import torch
+
+    buffer = io.BytesIO()
+    torch.save(content, buffer)
+    write_atomically(path, buffer.getvalue())
+
+
 def read_tensors(path: Path | str, device: "torch.device | str" = "cpu") -> Any:
-    """What `torch.save` wrote into a file: tensors, numbers, strings and containers of them, never code.
+    """What `write_tensors` wrote into a file: tensors, numbers, strings and containers of them, never code.
 
     Raises:
         CheckpointError: The file is missing or damaged.

@@ -8,7 +8,8 @@ import signal
 import threading
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
-from typing import TypeVar
+from multiprocessing.process import BaseProcess
+from typing import Any, TypeVar
 
 from maniskill_tomato.errors import InvalidInputError
 
@@ -66,23 +67,51 @@ def run_jobs(
         pool.shutdown()
 
 
+def start_process(function: Callable[..., None], *arguments: Any) -> BaseProcess:
+    """Calls a function in a process of its own, which gets SIGTERM when this one ends, however that ends.
+
+    Args:
+        function: A function of a module, since the process must find it.
+        arguments: What it is called with.
+    """
+    process = multiprocessing.get_context("spawn").Process(target=_run_alone, args=(function, arguments))
+    # Until the process has a session of its own, Ctrl-C in the terminal would reach it too.
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        process.start()
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+    return process
+
+
+def _run_alone(function: Callable[..., None], arguments: tuple[Any, ...]) -> None:
+    os.setsid()
+    signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
+    _when_parent_ends(lambda: os.kill(os.getpid(), signal.SIGTERM))
+    function(*arguments)
+
+
 def _start_worker(warm_up: Callable[[], None] | None) -> None:
     import torch
 
     # Ctrl-C in a terminal reaches every process of it; the first one decides.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    threading.Thread(target=_end_with_parent, daemon=True).start()
+    _when_parent_ends(lambda: os._exit(1))
     torch.set_num_threads(1)
     if warm_up is not None:
         warm_up()
 
 
-def _end_with_parent() -> None:
-    """Waits for the other end of a pipe to close, which the system does even for a process that is killed."""
+def _when_parent_ends(act: Callable[[], None]) -> None:
+    """Waits beside the work for the other end of a pipe, which the system closes even for a process that is killed."""
     parent = multiprocessing.parent_process()
-    if parent is not None:
+    assert parent is not None
+
+    def wait() -> None:
         multiprocessing.connection.wait([parent.sentinel])
-        os._exit(1)
+        act()
+
+    threading.Thread(target=wait, daemon=True).start()
 
 
 @contextlib.contextmanager

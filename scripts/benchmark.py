@@ -33,7 +33,7 @@ from maniskill_tomato.robot.d435 import color_intrinsics
 from maniskill_tomato.robot.iiwa14 import JOINT_LOWER, JOINT_UPPER
 from maniskill_tomato.robot.inverse_kinematics import InverseKinematics
 from maniskill_tomato.robot.kinematics import forward_kinematics
-from maniskill_tomato.tasks.planting import GROWN_PLANTS
+from maniskill_tomato.tasks.plant_batch import GROWN_PLANTS
 
 GUIDED = "TomatoViewpointGuided-v1"
 EMPTY = "TomatoBenchmarkEmpty-v1"

@@ -8,26 +8,26 @@ from maniskill_tomato.raycast.scene import RayScene
 from maniskill_tomato.robot.inverse_kinematics import Reach
 from maniskill_tomato.robot.kinematics import link_transforms
 from maniskill_tomato.robot.look_at_move import LookAtMover
-from maniskill_tomato.tasks.planting import Planting
+from maniskill_tomato.tasks.plant_batch import PlantBatch
 from maniskill_tomato.tasks.world_state import WorldState
 
 
-class GroundTruth:
+class WorldTruth:
     """Asks the plants themselves: the `policies.protocol.GroundTruth` of a world."""
 
-    def __init__(self, scene: RayScene, planting: Planting, state: WorldState, threshold: float) -> None:
+    def __init__(self, scene: RayScene, plant_batch: PlantBatch, state: WorldState, threshold: float) -> None:
         """Follows a world's plants, targets and arms.
 
         Args:
             scene: Casts the rays and measures distances.
-            planting: The plants.
+            plant_batch: The plants.
             state: Of the world.
             threshold: V_f above which the task counts the target as fully visible.
         """
         self.threshold = threshold
         self._mover: LookAtMover | None = None
         self._scene = scene
-        self._planting = planting
+        self._plant_batch = plant_batch
         self._state = state
 
     def visible_fraction(
@@ -51,7 +51,7 @@ class GroundTruth:
         """
         links = None if qpos is None else link_transforms(qpos.float())
         target = int(self._state.target[env_index]) if fruit is None else fruit
-        T_w_plant = self._planting.T_world_plant[env_index]
+        T_w_plant = self._plant_batch.T_world_plant[env_index]
         return self._scene.visible_fraction_from(T_world_camera.float(), target, T_w_plant, links, env_index)
 
     def clearance(self, start_qpos: Tensor, end_qpos: Tensor, env_index: int = 0) -> Tensor:
@@ -66,7 +66,7 @@ class GroundTruth:
             In [m], negative in contact. Shape (K,).
         """
         count = len(start_qpos)
-        T_w_plant = self._planting.T_world_plant[env_index].expand(count, 4, 4)
+        T_w_plant = self._plant_batch.T_world_plant[env_index].expand(count, 4, 4)
         env_idx = torch.full((count,), env_index, device=start_qpos.device)
         return self._scene.clearance_along(start_qpos.float(), end_qpos.float(), T_w_plant, env_idx)
 

@@ -1,6 +1,7 @@
 """The four tasks as configurations of a world."""
 
-from collections.abc import Callable, Mapping, Sequence
+import math
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from typing import Any, get_args
 
@@ -14,13 +15,7 @@ from maniskill_tomato.robot.viewpoint_move import OutsideWorkspace
 from maniskill_tomato.sensing.observation import ObservationLayout
 from maniskill_tomato.sensing.sensor_noise import SensorNoise
 from maniskill_tomato.sensing.simulated_camera import RENDERED, Perception
-from maniskill_tomato.tasks import (
-    MAX_EPISODE_STEPS,
-    MAX_GENERAL_STEPS,
-    MAX_ROW_STEPS,
-    TASK_IDS,
-    option_checks,
-)
+from maniskill_tomato.tasks import MAX_EPISODE_STEPS, MAX_GENERAL_STEPS, MAX_ROW_STEPS, TASK_IDS
 from maniskill_tomato.tasks.arm_moves import ArmMoves, Control
 from maniskill_tomato.tasks.row.episode_selection import EpisodeChoice
 from maniskill_tomato.tasks.row.row_config import CameraConfig, GeneralTaskConfig
@@ -28,7 +23,7 @@ from maniskill_tomato.tasks.row.search_game import SearchGame
 from maniskill_tomato.tasks.row.target_sequence import Transits
 from maniskill_tomato.tasks.thesis.thesis_config import ViewpointTaskConfig, guided_task, sparse_task
 from maniskill_tomato.tasks.thesis.thesis_game import ThesisGame
-from maniskill_tomato.tasks.world import Game, Picture, TaskConfig, World
+from maniskill_tomato.tasks.world import Game, Pictures, TaskConfig, World
 
 IMAGE_SIZE = (160, 120)
 """Width and height of the wrist camera's picture unless somebody says otherwise, in [px]."""
@@ -99,7 +94,7 @@ class RowOptions(SearchOptions):
     def __post_init__(self) -> None:
         if self.episodes is not None:
             raise InvalidInputError("TomatoViewpointRow-v1 has no episode lists; choose plants with plant=")
-        option_checks.check_choice("transits", self.transits, get_args(Transits))
+        check_choice("transits", self.transits, get_args(Transits))
 
 
 def make_options(env_id: str, **options: Any) -> ThesisOptions | SearchOptions:
@@ -171,7 +166,7 @@ class TaskSetup:
         *,
         control: Control,
         intrinsics: CameraIntrinsics,
-        picture: Picture | None = None,
+        pictures: Pictures | None = None,
     ) -> World:
         """A world; see `make_world`."""
         moves = ArmMoves(
@@ -190,7 +185,7 @@ class TaskSetup:
             rays_per_side=self.rays_per_side,
             num_envs=num_envs,
             device=device,
-            picture=picture,
+            pictures=pictures,
         )
 
 
@@ -201,7 +196,7 @@ def make_world(
     *,
     control: Control | None = None,
     intrinsics: CameraIntrinsics | None = None,
-    picture: Picture | None = None,
+    pictures: Pictures | None = None,
     **options: Any,
 ) -> World:
     """N environments of a task without a simulator.
@@ -212,7 +207,7 @@ def make_world(
         device: Where all tensors live.
         control: What an action is; the task's own if None.
         intrinsics: Of the wrist's camera; the D435's colour camera at `IMAGE_SIZE` if None.
-        picture: A renderer, for perception that needs colours.
+        pictures: A renderer, for perception that needs colours.
         options: `ThesisOptions`, `SearchOptions` or `RowOptions`.
 
     Raises:
@@ -223,7 +218,7 @@ def make_world(
         device,
         control=control or default_control(env_id),
         intrinsics=intrinsics or wrist_intrinsics(),
-        picture=picture,
+        pictures=pictures,
     )
 
 
@@ -234,13 +229,13 @@ def make_setup(env_id: str, **options: Any) -> TaskSetup:
         InvalidInputError: The id or an option cannot be used.
     """
     checked = make_options(env_id, **options)
-    option_checks.check_rays_per_side(checked.rays_per_side)
+    _check_integer("rays_per_side", checked.rays_per_side, 4, 256)
     return _thesis_setup(checked) if isinstance(checked, ThesisOptions) else _search_setup(checked)
 
 
 def _thesis_setup(options: ThesisOptions) -> TaskSetup:
     task, others = options.task, options.other_targets
-    option_checks.check_other_targets(others)
+    _check_integer("other_targets", others, 0)
     return TaskSetup(
         make_game=lambda world: ThesisGame(world, task, others),
         neighbour_poses=task.neighbour_poses,
@@ -250,7 +245,7 @@ def _thesis_setup(options: ThesisOptions) -> TaskSetup:
 
 
 def _search_setup(options: SearchOptions) -> TaskSetup:
-    option_checks.check_choice("perception", options.perception, get_args(Perception))
+    check_choice("perception", options.perception, get_args(Perception))
     noise = SensorNoise.parse(options.sensor_noise)
     if options.perception != "ground_truth" and noise != SensorNoise():
         raise InvalidInputError(
@@ -260,8 +255,8 @@ def _search_setup(options: SearchOptions) -> TaskSetup:
     camera = _camera_config(options)
     task = options.task
     if options.start_visibility is not None:
-        start_visibility = option_checks.check_range("start_visibility", options.start_visibility)
-        task = replace(task, start_visibility=start_visibility)
+        low, high = _finite_numbers("start_visibility", options.start_visibility, 2)
+        task = replace(task, start_visibility=(low, high))
     if options.contact_penalty is not None:
         task = replace(task, contact_penalty=float(options.contact_penalty))
     episodes = EpisodeChoice(options.episodes)
@@ -318,11 +313,38 @@ def _standing(
 ) -> dict[str, Any]:
     """Which plants stand where, and how their fruits are judged."""
     given = options.plant_pose_noise
+    half_ranges = _finite_numbers("plant_pose_noise", noise if given is None else given, 3)
+    if min(half_ranges) < 0.0:
+        raise InvalidInputError(f"plant_pose_noise must be 3 finite numbers of 0 or more; got {given!r}")
     return {
         "plant": PlantSpec.parse(plant, task.plant),
         "plant_pose": PlantPose.parse(options.plant_pose, task.plant_pose),
-        "plant_pose_noise": option_checks.check_half_ranges(
-            "plant_pose_noise", noise if given is None else given, 3
-        ),
+        "plant_pose_noise": half_ranges,
         "rays_per_side": options.rays_per_side,
     }
+
+
+def check_choice(name: str, value: str | None, allowed: Iterable[str]) -> None:
+    """Accepts None and the `allowed` values of the option `name`.
+
+    Raises:
+        InvalidInputError: It is another; the message names those that are allowed.
+    """
+    if value is not None and value not in tuple(allowed):
+        raise InvalidInputError.choice(name, value, allowed)
+
+
+def _check_integer(name: str, value: object, least: int, most: float = math.inf) -> None:
+    if isinstance(value, bool) or not isinstance(value, int) or not least <= value <= most:
+        allowed = f"of {least} or more" if most == math.inf else f"from {least} to {most}"
+        raise InvalidInputError(f"{name} must be an integer {allowed}; got {value!r}")
+
+
+def _finite_numbers(name: str, values: Sequence[float], size: int) -> tuple[float, ...]:
+    try:
+        numbers = tuple(float(v) for v in values)
+    except (TypeError, ValueError):
+        numbers = ()
+    if len(numbers) != size or not all(math.isfinite(v) for v in numbers):
+        raise InvalidInputError(f"{name} must be {size} finite numbers; got {values!r}")
+    return numbers

@@ -22,13 +22,13 @@ from maniskill_tomato.robot.robot_description import link_meshes
 from maniskill_tomato.robot.viewpoint_move import viewpoint_of
 from maniskill_tomato.sensing.belief import Belief
 from maniskill_tomato.tasks.arm_moves import ACTION_SIZES, ArmMoves, Plan
-from maniskill_tomato.tasks.ground_truth import GroundTruth
+from maniskill_tomato.tasks.ground_truth import WorldTruth
 from maniskill_tomato.tasks.numpy_streams import (
     random_state,
     set_random_state,
     spread_seed,
 )
-from maniskill_tomato.tasks.planting import GROWN_PLANTS, Planting
+from maniskill_tomato.tasks.plant_batch import GROWN_PLANTS, PlantBatch
 from maniskill_tomato.tasks.world_state import WorldState
 
 FIRST_ORGAN_ID = 24
@@ -37,9 +37,9 @@ FIRST_ORGAN_ID = 24
 FIRST_SEED = 2022
 """Before it is seeded, environment i has the generator of this plus i, as in ManiSkill."""
 
-Picture = Callable[[int, Tensor], NDArray[np.uint8]]
-"""Renders the colours of an environment, by its index and its arm's joint positions of shape (7,), in [rad]; gives an
-array of shape (H, W, 3)."""
+Pictures = Callable[[Tensor], NDArray[np.uint8]]
+"""Renders the colours that all wrist cameras see, by the joint positions of shape (N, 7), in [rad]; gives an array
+of shape (N, H, W, 3)."""
 
 
 class TaskConfig(Protocol):
@@ -71,6 +71,8 @@ class Game(Protocol):
 
     task: Any
     """Its configuration, a `TaskConfig`."""
+    keeps_belief: bool
+    """Whether it has a `belief`, for policies that decide from it."""
     saved_columns: tuple[str, ...]
     """The columns of the state from which an episode can be taken up again."""
 
@@ -133,7 +135,7 @@ class World:
         rays_per_side: int = 16,
         num_envs: int = 1,
         device: str | torch.device = "cpu",
-        picture: Picture | None = None,
+        pictures: Pictures | None = None,
     ) -> None:
         """Grows the first plant; `reset` begins episodes.
 
@@ -147,23 +149,23 @@ class World:
             rays_per_side: A visible fraction is counted with the square of this number of rays.
             num_envs: N.
             device: Where all tensors live.
-            picture: The renderer, where there is one.
+            pictures: The renderer, where there is one.
         """
         if num_envs < 1:
             raise InvalidInputError(f"num_envs must be 1 or more; got {num_envs}")
         self.num_envs = num_envs
         self.device = torch.device(device)
         self.intrinsics = intrinsics
-        self.picture = picture
+        self.pictures = pictures
         self.moves = moves
         self.state = WorldState.zeros(num_envs, self.device)
-        self.planting = Planting(plant, self.state)
+        self.plant_batch = PlantBatch(plant, self.state)
         self.swaps_plants = True
         """Whether a reset shows the plants that it draws; a shell whose scene holds them as actors does so itself."""
         self.first_organ_id = torch.full((num_envs,), FIRST_ORGAN_ID, dtype=torch.int32, device=self.device)
         """Segmentation id of each plant's first organ. Shape (N,), int32."""
         self.scene = RayScene(
-            self.planting.plants,
+            self.plant_batch.plants,
             intrinsics,
             robot_meshes=link_meshes(),
             rays_per_side=rays_per_side,
@@ -186,8 +188,8 @@ class World:
         """Poses of the cameras' optical frames. Shape (N, 4, 4)."""
         self.place_arms()
         self.game = make_game(self)
-        self.ground_truth = GroundTruth(
-            self.scene, self.planting, self.state, float(self.task.full_visibility)
+        self.ground_truth = WorldTruth(
+            self.scene, self.plant_batch, self.state, float(self.task.full_visibility)
         )
         """What only a simulator knows; for policies that need the truth."""
 
@@ -243,7 +245,7 @@ class World:
         if not indices:
             return
         rngs = [self.rngs[i] for i in indices]
-        if self.planting.spec.changes:
+        if self.plant_batch.spec.changes:
             for i, rng in zip(indices, rngs, strict=True):
                 seed = self.game.draw_plant(i, rng, options)
                 if self.swaps_plants:
@@ -255,11 +257,11 @@ class World:
     def show_plant(self, env_index: int, seed: int) -> None:
         """Shows another plant in an environment."""
         if seed != int(self.state.plant_seed[env_index]):
-            self.scene.replace_plant(env_index, self.planting.show(env_index, seed))
+            self.scene.replace_plant(env_index, self.plant_batch.show(env_index, seed))
 
     def place_plants(self, env_idx: Tensor, poses: NDArray[np.float64]) -> None:
         """Puts plants at x, y [m] and yaw [rad]. Shape (b, 3)."""
-        self.planting.place(env_idx, torch.as_tensor(poses, dtype=torch.float32, device=self.device))
+        self.plant_batch.place(env_idx, torch.as_tensor(poses, dtype=torch.float32, device=self.device))
 
     def set_target(self, env_idx: Tensor, target: Sequence[int] | Tensor) -> None:
         """Chooses the targets of some environments, as indices in `Plant.fruits`. Shape (b,)."""
@@ -291,7 +293,7 @@ class World:
         Raises:
             InvalidInputError: It is no ripe fruit of the environment's plant.
         """
-        ripe = self.planting.ripe_fruits[env_index]
+        ripe = self.plant_batch.ripe_fruits[env_index]
         if isinstance(target, bool) or not isinstance(target, int) or target not in ripe:
             raise InvalidInputError(
                 f"reset option target must be a ripe fruit of the plant, one of {ripe}; got {target!r}"
@@ -401,12 +403,22 @@ class World:
 
     def _look_up_targets(self) -> None:
         """Works out where the targets are and what they are called in pictures."""
-        self.target_position_w = self.planting.fruit_position_w(self.state.target)
-        self._target_id = (self.first_organ_id + self.planting.fruit_organ(self.state.target)).int()
+        self.target_position_w = self.plant_batch.fruit_position_w(self.state.target)
+        self._target_id = (self.first_organ_id + self.plant_batch.fruit_organ(self.state.target)).int()
+
+    @property
+    def keeps_belief(self) -> bool:
+        """Whether there is a `belief`; the general tasks alone have one."""
+        return self.game.keeps_belief
 
     @property
     def belief(self) -> Belief:
-        """What is known after the last look, for policies; the general tasks alone have one."""
+        """What is known after the last look, for policies.
+
+        Raises:
+            AttributeError: The task keeps none.
+            InvalidInputError: No episode has begun.
+        """
         belief: Belief = self.game.belief  # type: ignore[attr-defined]
         return belief
 
@@ -422,7 +434,7 @@ class World:
 
     def fruit_position_w(self, env_index: int, fruit: int) -> Tensor:
         """Centre of a fruit in the world frame, in [m]. Shape (3,)."""
-        return self.planting.fruit_positions_w(env_index, [fruit])[0]
+        return self.plant_batch.fruit_positions_w(env_index, [fruit])[0]
 
     def observation(self) -> Tensor:
         """The observation of state vectors. Shape (N, D)."""
@@ -478,7 +490,7 @@ class World:
         self._recall(self.env_rows(None))
 
     def _recall(self, env_idx: Tensor) -> None:
-        self.planting.place(env_idx, self.state.plant_pose[env_idx])
+        self.plant_batch.place(env_idx, self.state.plant_pose[env_idx])
         self._look_up_targets()
         self.place_arms()
         self.game.recall(env_idx)

@@ -60,6 +60,27 @@ def keep_renderer_alive() -> object:
     return sapien.render.RenderSystem(sapien.Device("cuda" if torch.cuda.is_available() else "cpu"))
 
 
+LONG_FILES = (
+    "test_learning_seeds.py",
+    "test_learning_resume.py",
+    "test_cli.py",
+    "test_learning_training.py",
+    "test_examples.py",
+    "test_world.py",
+    "test_row_env.py",
+    "test_view_quality.py",
+    "test_tasks_options.py",
+    "test_planners_env.py",
+    "test_comparison.py",
+)
+"""Those that take longest come first, so that no process is left with one of them at the end."""
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    rank = {name: k for k, name in enumerate(LONG_FILES)}
+    items.sort(key=lambda item: rank.get(item.path.name, len(LONG_FILES)))
+
+
 def pytest_runtest_setup(item: pytest.Item) -> None:
     if item.get_closest_marker("gpu") is not None and (problem := cuda_problem()) is not None:
         pytest.skip(problem)

@@ -106,4 +106,11 @@ def test_names_of_modules_in_the_text_exist(page: Path) -> None:
         for name in files
         if not (ROOT / name).exists() and not (ROOT / "maniskill_tomato" / name).exists()
     }
+    sources = {f"/{path.relative_to(ROOT)}" for path in (*ROOT.glob("*/**/*.py"), *ROOT.glob("*.py"))}
+    modules = re.findall(r"`([\w/]+\.py)`", text)
+    gone |= {name for name in modules if not any(path.endswith(f"/{name}") for path in sources)}
+    folders = re.findall(r"`([a-z_]+/[a-z_/]+/)`", text)
+    gone |= {
+        name for name in folders if not any((ROOT / top / name).is_dir() for top in ("", "maniskill_tomato"))
+    }
     assert missing | gone == set()

@@ -186,11 +186,17 @@ def test_stable_baselines_bootstraps_an_episode_that_ran_out_of_time_and_no_othe
     "arguments",
     [
         ("sb3_td3.py", "--total-timesteps", "300", "--learning-starts", "150"),
-        ("sb3_ppo.py", "--total-timesteps", "400", "--n-steps", "100", "--num-envs", "2"),
-        (
-            "cleanrl_style.py",
-            *("--total-timesteps", "400", "--learning-starts", "256"),
-            *("--vectorization", "async", "--autoreset", "next-step", "--env-id", THESIS_IDS[1]),
+        pytest.param(
+            ("sb3_ppo.py", "--total-timesteps", "400", "--n-steps", "100", "--num-envs", "2"),
+            marks=pytest.mark.slow,
+        ),
+        pytest.param(
+            (
+                "cleanrl_style.py",
+                *("--total-timesteps", "400", "--learning-starts", "256"),
+                *("--vectorization", "async", "--autoreset", "next-step", "--env-id", THESIS_IDS[1]),
+            ),
+            marks=pytest.mark.slow,
         ),
     ],
     ids=lambda arguments: arguments[0],

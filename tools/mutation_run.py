@@ -9,6 +9,7 @@ start processes of their own do not see the mutant.
 
 import argparse
 import difflib
+import gc
 import importlib
 import os
 import random
@@ -22,6 +23,8 @@ import pytest
 
 ROOT = Path(__file__).resolve().parent.parent
 NO_IMPORT = 97
+WITHOUT = ("cacheprovider", "xdist", "logging", "unraisableexception", "threadexception")
+"""Plugins of pytest that take longer than the tests of a small module, most of it in collecting garbage."""
 VERDICTS = {0: "survived", NO_IMPORT: "not importable"}
 
 
@@ -56,11 +59,13 @@ def replace(module: ModuleType, text: str) -> None:
 
 def run_tests(tests: list[str]) -> int:
     """Exit status of pytest."""
-    return int(pytest.main(["-x", "-q", "-p", "no:cacheprovider", "-p", "no:xdist", *tests]))
+    without = [f"-pno:{name}" for name in WITHOUT]
+    return int(pytest.main(["-x", "-q", *without, *tests]))
 
 
 def try_mutant(module: ModuleType, text: str, tests: list[str], seconds: int) -> int:
     """Exit status of the tests with that text; negative if the processor time ran out."""
+    gc.freeze()  # A collection in the fork would copy all of the memory that it shares with this process.
     child = os.fork()
     if child:
         return os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])

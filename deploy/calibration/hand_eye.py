@@ -3,30 +3,28 @@
 With A the flange in the base, X the camera on the flange, B the board before the camera and Z the board in the base,
 every view has A X B = Z. A first X follows in closed form from pairs of views (Park and Martin, "Robot sensor
 calibration: solving AX = XB on the Euclidean group", IEEE Transactions on Robotics and Automation 10, 1994); then X
-and Z are moved until the board's corners are where the pictures show them (least squares, Levenberg-Marquardt),
-because errors are equal in pixels and not in poses. OpenCV has closed forms of this too, but its Python module lacks
+and Z are moved until the board's corners are where the pictures show them (least squares), because errors are equal in
+pixels and not in poses. OpenCV has closed forms of this too, but its Python module lacks
 them from 5.0.0 on.
 """
 
+import json
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Final
+from pathlib import Path
+from typing import Any, Final
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+from scipy.optimize import least_squares
+from scipy.spatial.transform import Rotation
 
 from maniskill_tomato.deploy.calibration.board import CharucoBoard
-from maniskill_tomato.deploy.calibration.rigid import (
-    difference,
-    inverse,
-    nearest_rotation,
-    rotation_from_vector,
-    transform,
-    vector_from_rotation,
-)
 from maniskill_tomato.deploy.deploy_errors import DeployError
 from maniskill_tomato.deploy.interface import Float64
+from maniskill_tomato.deploy.rigid import difference, transform
+from maniskill_tomato.files import write_atomically
 from maniskill_tomato.robot.d435 import CameraIntrinsics
 
 MIN_VIEWS: Final = 5
@@ -111,10 +109,7 @@ def board_pose(board: CharucoBoard, view: BoardView, intrinsics: CameraIntrinsic
         raise CalibrationError(f"{view.name}: no pose of the board fits its corners ({error.err})") from error
     if found < 1 or not np.all(np.isfinite(turns[0])) or not np.all(np.isfinite(shifts[0])):
         raise CalibrationError(f"{view.name}: no pose of the board fits its corners")
-    return transform(
-        rotation_from_vector(np.asarray(turns[0], np.float64).reshape(3)),
-        np.asarray(shifts[0], np.float64).reshape(3),
-    )
+    return transform(Rotation.from_rotvec(np.ravel(turns[0])), np.ravel(shifts[0]))
 
 
 def calibrate_hand_eye(
@@ -166,30 +161,23 @@ def calibrate_hand_eye(
 
 def _closed_form(flanges: Float64, boards: Float64) -> Float64:
     """X of A X = X B over all pairs of views, A and B the motions of flange and camera (Park and Martin, 1994)."""
-    alphas, betas, rows = [], [], []
-    pairs = [(i, j) for i in range(len(flanges)) for j in range(i + 1, len(flanges))]
-    for i, j in pairs:
-        a = inverse(flanges[j]) @ flanges[i]
-        b = boards[j] @ inverse(boards[i])
-        alphas.append(vector_from_rotation(a[:3, :3]))
-        betas.append(vector_from_rotation(b[:3, :3]))
-        rows.append((a[:3, :3], a[:3, 3], b[:3, 3]))
-    turns = np.array(alphas)
+    i, j = np.triu_indices(len(flanges), k=1)
+    a, b = np.linalg.inv(flanges[j]) @ flanges[i], boards[j] @ np.linalg.inv(boards[i])
+    turns = Rotation.from_matrix(a[:, :3, :3]).as_rotvec()
     spread = np.linalg.svd(turns / np.sqrt(len(turns)), compute_uv=False)
     if spread[1] < MIN_TURN:
         raise CalibrationError(
             f"the views hardly turn about a second axis ({np.degrees(spread[1]):.1f} degrees, "
             f"{np.degrees(MIN_TURN):.1f} are needed): tilt the camera and roll it between views"
         )
-    rotation = nearest_rotation(turns.T @ np.array(betas))
-    matrix = np.concatenate([r - np.eye(3) for r, _, _ in rows])
-    right = np.concatenate([rotation @ tb - ta for _, ta, tb in rows])
-    translation = np.linalg.lstsq(matrix, right, rcond=None)[0]
-    return transform(rotation, translation)
+    rotation = Rotation.align_vectors(turns, Rotation.from_matrix(b[:, :3, :3]).as_rotvec())[0]
+    matrix = np.concatenate(a[:, :3, :3] - np.eye(3))
+    right = np.concatenate(rotation.apply(b[:, :3, 3]) - a[:, :3, 3])
+    return transform(rotation, np.linalg.lstsq(matrix, right, rcond=None)[0])
 
 
 def _mean_pose(poses: Float64) -> Float64:
-    return transform(nearest_rotation(poses[:, :3, :3].mean(axis=0)), np.median(poses[:, :3, 3], axis=0))
+    return transform(Rotation.from_matrix(poses[:, :3, :3]).mean(), np.median(poses[:, :3, 3], axis=0))
 
 
 def _refine(
@@ -203,47 +191,59 @@ def _refine(
     corners = board.corners
     points = [corners[v.corner_ids] for v in views]
     seen = np.concatenate([v.corners_px for v in views])
-    to_flange = np.stack([inverse(v.T_base_flange) for v in views])
+    to_flange = np.linalg.inv(np.stack([v.T_base_flange for v in views]))
     of_view = np.repeat(np.arange(len(views)), [len(p) for p in points])
     stacked = np.concatenate(points)
 
     def moved(pose: Float64, step: Float64) -> Float64:
-        return pose @ transform(rotation_from_vector(step[:3]), step[3:])
+        return pose @ transform(Rotation.from_rotvec(step[:3]), step[3:])
 
-    def residual(pose: Float64, about: Float64) -> Float64:
-        chains = (inverse(pose) @ to_flange @ about)[of_view]
+    pose, about = T_flange_camera, T_base_board
+
+    def residual(steps: Float64) -> Float64:
+        chains = (np.linalg.inv(moved(pose, steps[:6])) @ to_flange @ moved(about, steps[6:]))[of_view]
         in_camera = (chains[:, :3, :3] @ stacked[:, :, None])[..., 0] + chains[:, :3, 3]
         return np.nan_to_num((seen - intrinsics.project(in_camera)).ravel(), nan=1e4)
 
-    pose, about = T_flange_camera, T_base_board
-    error = residual(pose, about)
-    damping, small = 1e-3, 1e-6
-    jacobian, normal = np.zeros((len(error), 12)), np.zeros((12, 12))
-    for _ in range(100):
-        for k in range(12):
-            step = np.zeros(12)
-            step[k] = small
-            ahead = residual(moved(pose, step[:6]), moved(about, step[6:]))
-            behind = residual(moved(pose, -step[:6]), moved(about, -step[6:]))
-            jacobian[:, k] = (ahead - behind) / (2.0 * small)
-        normal, slope = jacobian.T @ jacobian, -(jacobian.T @ error)
-        for _ in range(20):
-            lifted = normal + damping * np.diag(np.diag(normal) + 1e-12)
-            change = np.asarray(np.linalg.solve(lifted, slope), np.float64)
-            trial = moved(pose, change[:6]), moved(about, change[6:])
-            trial_error = residual(*trial)
-            if trial_error @ trial_error <= error @ error:
-                damping = max(damping / 10.0, 1e-12)
-                break
-            damping *= 10.0
-        else:
-            break
-        pose, about = trial
-        gain = error @ error - trial_error @ trial_error
-        error = trial_error
-        if np.linalg.norm(change) < 1e-10 or gain < 1e-12 * (error @ error):
-            break
+    def fit() -> Any:
+        return least_squares(residual, np.zeros(12), "3-point", x_scale="jac", ftol=1e-12, xtol=1e-12)
+
+    found = fit()
+    # Once more from the solution, where the Jacobian is wanted for the covariance.
+    pose, about = moved(pose, found.x[:6]), moved(about, found.x[6:])
+    found = fit()
+    pose, about = moved(pose, found.x[:6]), moved(about, found.x[6:])
+    error = found.fun
     variance = float(error @ error) / max(1, len(error) - 12)
-    covariance = np.asarray(variance * np.linalg.pinv(normal), np.float64)
+    covariance = np.asarray(variance * np.linalg.pinv(found.jac.T @ found.jac), np.float64)
     ends = np.cumsum([len(p) for p in points])[:-1]
     return pose, about, covariance, [np.asarray(r) for r in np.split(error.reshape(-1, 2), ends)]
+
+
+def write_calibration(
+    path: Path, result: HandEyeResult, intrinsics: CameraIntrinsics, serial: str = ""
+) -> None:
+    """Writes a calibration file, whole or not at all.
+
+    Args:
+        path: The file; one that is there is replaced.
+        result: What the views gave.
+        intrinsics: Of the pictures.
+        serial: Of the camera, empty if unknown.
+
+    Raises:
+        CheckpointError: It cannot be written.
+    """
+    content = {
+        "T_flange_camera": result.T_flange_camera.tolist(),
+        "color_size": (intrinsics.width, intrinsics.height),
+        "color_focal": (intrinsics.fx, intrinsics.fy),
+        "serial": serial,
+        "rms_px": result.rms_px,
+        "position_std": result.position_std,
+        "rotation_std": result.rotation_std,
+        "view_count": len(result.views),
+        "about": "T_flange_camera: the colour camera's optical frame (z forward, x right, y down) in the flange's "
+        "frame link_ee (the plain flange face); metres, radians",
+    }
+    write_atomically(path, (json.dumps(content, indent=1) + "\n").encode())

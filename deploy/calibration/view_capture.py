@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
+from scipy.spatial.transform import Rotation
 
 from maniskill_tomato.deploy.calibration.board import CharucoBoard
 from maniskill_tomato.deploy.calibration.hand_eye import (
@@ -16,14 +17,14 @@ from maniskill_tomato.deploy.calibration.hand_eye import (
     CalibrationError,
     board_pose,
 )
-from maniskill_tomato.deploy.calibration.rigid import inverse, rotation_from_vector, transform
 from maniskill_tomato.deploy.calibration.view_folder import RecordedView, board_view, flange_pose, write_views
 from maniskill_tomato.deploy.clock import Clock
 from maniskill_tomato.deploy.deploy_errors import StoppedError
 from maniskill_tomato.deploy.guarded_arm import GuardedArm
 from maniskill_tomato.deploy.interface import ArmState, Camera, Float64, JointMove
+from maniskill_tomato.deploy.rigid import transform
 from maniskill_tomato.deploy.stops import Stops
-from maniskill_tomato.errors import InvalidInputError
+from maniskill_tomato.errors import InvalidInputError, check_ranges
 from maniskill_tomato.robot.d435 import T_flange_camera_color_optical
 from maniskill_tomato.robot.inverse_kinematics import InverseKinematics, Reach
 
@@ -49,13 +50,11 @@ class CapturePlan:
     """Wait after a move until the arm no longer swings, in [s]."""
 
     def __post_init__(self) -> None:
-        if not 5 <= self.views <= 100:
-            raise InvalidInputError(f"views must be from 5 to 100, got {self.views}")
+        check_ranges(
+            self, views=(5, 100), largest_tilt=(0.0, 1.0), largest_roll=(0.0, 3.2), settle_s=(0.0, 10.0)
+        )
         if not 0.1 <= self.distances[0] <= self.distances[1] <= 2.0:
             raise InvalidInputError(f"distances must rise from 0.1 to 2 m, got {self.distances}")
-        for name, most in (("largest_tilt", 1.0), ("largest_roll", 3.2), ("settle_s", 10.0)):
-            if not 0.0 <= getattr(self, name) <= most:
-                raise InvalidInputError(f"{name} must be from 0 to {most}, got {getattr(self, name)}")
 
 
 def camera_poses(
@@ -77,6 +76,7 @@ def camera_poses(
     # The board's z axis goes into the print.
     x, y, normal = T_base_board[:3, 0], T_base_board[:3, 1], -T_base_board[:3, 2]
     count = 2 * plan.views
+    first = Rotation.from_matrix(T_base_camera[:3, :3])
     poses = []
     for k in range(count):
         tilt = plan.largest_tilt * math.sqrt((k + 0.5) / count)
@@ -86,19 +86,10 @@ def camera_poses(
         sideways = math.cos(azimuth) * x + math.sin(azimuth) * y
         away = math.cos(tilt) * normal + math.sin(tilt) * sideways
         # Turned from the first view by the shortest way: "upright" means little for a camera that looks down.
-        aimed = _shortest_turn(T_base_camera[:3, 2], -away) @ T_base_camera[:3, :3]
-        rotation = aimed @ rotation_from_vector(np.array([0.0, 0.0, roll]))
+        turn = Rotation.align_vectors(-away, T_base_camera[:3, 2])[0]
+        rotation = turn * first * Rotation.from_rotvec([0.0, 0.0, roll])
         poses.append(transform(rotation, middle[:3] + distance * away))
     return np.asarray(poses, dtype=np.float64)
-
-
-def _shortest_turn(start: Float64, end: Float64) -> Float64:
-    """The rotation that takes one unit vector to another about the axis at right angles to both. Shape (3, 3)."""
-    axis = np.cross(start, end)
-    length = float(np.linalg.norm(axis))
-    if length < 1e-9:
-        return np.eye(3)
-    return rotation_from_vector(axis / length * math.atan2(length, float(start @ end)))
 
 
 def capture_views(
@@ -168,7 +159,7 @@ def capture_views(
         )
     T_base_camera = first.T_base_flange @ T_flange_camera
     T_base_board = T_base_camera @ board_pose(board, first, camera.intrinsics)
-    left = list(camera_poses(board, T_base_board, T_base_camera, plan) @ inverse(T_flange_camera))
+    left = list(camera_poses(board, T_base_board, T_base_camera, plan) @ np.linalg.inv(T_flange_camera))
     start, at_start = views[0].joint_positions, True
     while left and len(views) < plan.views:
         k, move = _next_move(arm, kinematics, left)

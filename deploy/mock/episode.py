@@ -11,7 +11,7 @@ from torch import Tensor
 from maniskill_tomato.deploy.collision import CollisionChecker
 from maniskill_tomato.deploy.deploy_errors import ProfileError
 from maniskill_tomato.deploy.interface import Float64
-from maniskill_tomato.deploy.postures import Postures
+from maniskill_tomato.deploy.move_choice import Postures
 from maniskill_tomato.plants.episode_list import Episode, load_episodes
 from maniskill_tomato.plants.organs import Plant
 from maniskill_tomato.plants.spec import ROW_PLANT

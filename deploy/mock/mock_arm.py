@@ -14,9 +14,7 @@ from maniskill_tomato.deploy.deploy_errors import (
 )
 from maniskill_tomato.deploy.drivers import DriverContext
 from maniskill_tomato.deploy.interface import Arm, ArmState, JointMove
-from maniskill_tomato.deploy.mock.faults import ArmFault, Faults
-from maniskill_tomato.deploy.mock.twin_options import twin_options, twin_world
-from maniskill_tomato.deploy.mock.twin_world import TwinWorld
+from maniskill_tomato.deploy.mock.twin_world import ArmFault, Faults, TwinWorld, twin_options, twin_world
 
 TICK: Final = 0.02
 """How often `wait` looks at the arm, in [s]."""

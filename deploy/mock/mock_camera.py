@@ -1,21 +1,31 @@
-"""The twin's camera behind the `Camera` interface, with optional faults."""
+"""The twin's camera behind the `Camera` interface, in flat colours or SAPIEN's, with optional faults."""
 
+import logging
 from collections.abc import Mapping
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from maniskill_tomato.deploy.deploy_errors import DeviceTimeoutError, NotConnectedError
+from maniskill_tomato.deploy.deploy_errors import DeviceTimeoutError, NotConnectedError, ProfileError
 from maniskill_tomato.deploy.drivers import DriverContext
 from maniskill_tomato.deploy.interface import Camera, Frame
-from maniskill_tomato.deploy.mock.faults import CameraFault
-from maniskill_tomato.deploy.mock.painter import Painter, make_painter
-from maniskill_tomato.deploy.mock.twin_options import TwinOptions, twin_options, twin_world
-from maniskill_tomato.deploy.mock.twin_world import TwinWorld
+from maniskill_tomato.deploy.mock.twin_world import (
+    CameraFault,
+    Renderer,
+    TwinOptions,
+    TwinWorld,
+    twin_options,
+    twin_world,
+)
+from maniskill_tomato.raycast.images import ROBOT_LABEL, Picture
 from maniskill_tomato.raycast.view_rays import DEPTH_MODE
 from maniskill_tomato.robot.d435 import CameraIntrinsics, min_depth
 from maniskill_tomato.robot.depth_noise import DepthNoise, measure_depth
+
+_logger = logging.getLogger(__name__)
+
 
 EXPOSURE = 1.0 / 30.0
 """Between two pictures, in [s]."""
@@ -30,11 +40,11 @@ class MockCamera(Camera):
     name = "mock"
     simulated = True
 
-    def __init__(self, world: TwinWorld, options: TwinOptions, seed: int, painter: Painter) -> None:
+    def __init__(self, world: TwinWorld, options: TwinOptions, seed: int) -> None:
         self._world = world
         self._options = options
         self._seed = seed
-        self._painter = painter
+        self._rendered = None if options.renderer == "rays" else _rendered_view(world, options.renderer)
         self._connected = False
         self._number = 0
         self._last: Frame | None = None
@@ -56,7 +66,12 @@ class MockCamera(Camera):
 
     def describe(self) -> dict[str, Any]:
         i = self._world.intrinsics
-        return {"driver": self.name, "width": i.width, "height": i.height, "colours": self._painter.name}
+        return {
+            "driver": self.name,
+            "width": i.width,
+            "height": i.height,
+            "colours": "flat" if self._rendered is None else "sapien",
+        }
 
     def read(self, max_age_s: float = 0.5, after: float | None = None) -> Frame:
         self._check()
@@ -81,13 +96,21 @@ class MockCamera(Camera):
         rng = np.random.default_rng((self._seed, number))
         exact = np.where(picture.labels == 0, np.float32(BACKGROUND), picture.depth)
         return Frame(
-            color=self._painter.paint(self._world, picture),
+            color=self._color(picture),
             depth=self._measured(exact, rng),
             intrinsics=self._world.intrinsics,
             stamp=stamp,
             number=number,
             truth=self._world.truth(picture),
         )
+
+    def _color(self, picture: Picture) -> NDArray[np.uint8]:
+        """Flat colours; with a renderer the plant is SAPIEN's, and the robot, which one seldom sees, is flat."""
+        flat = self._world.color(picture)
+        if self._rendered is None:
+            return flat
+        rendered: NDArray[np.uint8] = self._rendered.color(self._world.camera_pose())
+        return np.where((picture.labels == ROBOT_LABEL)[..., None], flat, rendered)
 
     def _measured(self, exact: NDArray[np.float32], rng: np.random.Generator) -> NDArray[np.float32]:
         """What the D435's 424 x 240 mode makes of true depths [m]; without noise what it could make. Shape (H, W)."""
@@ -110,31 +133,43 @@ class MockCamera(Camera):
 
 def _spoilt(frame: Frame, fault: CameraFault) -> Frame:
     """A picture as a broken camera gives it."""
-    color, depth, intrinsics, stamp, truth = (
-        frame.color,
-        frame.depth,
-        frame.intrinsics,
-        frame.stamp,
-        frame.truth,
-    )
     if fault == "late":
-        stamp -= 30.0
+        return replace(frame, stamp=frame.stamp - 30.0)
     if fault == "black":
-        color = np.zeros_like(color)
+        return replace(frame, color=np.zeros_like(frame.color))
     if fault == "zero_depth":
-        depth = np.zeros_like(depth)
+        return replace(frame, depth=np.zeros_like(frame.depth))
     if fault == "wrong_size":
-        intrinsics = intrinsics.scaled(intrinsics.width // 2, intrinsics.height // 2)
-        color = np.ascontiguousarray(color[::2, ::2][: intrinsics.height, : intrinsics.width])
-        depth = np.ascontiguousarray(depth[::2, ::2][: intrinsics.height, : intrinsics.width])
-        truth = None
-    return Frame(
-        color=color, depth=depth, intrinsics=intrinsics, stamp=stamp, number=frame.number, truth=truth
-    )
+        half = frame.intrinsics.scaled(frame.intrinsics.width // 2, frame.intrinsics.height // 2)
+        every_second = slice(None, 2 * half.height, 2), slice(None, 2 * half.width, 2)
+        color, depth = frame.color[every_second], frame.depth[every_second]
+        return replace(frame, color=color, depth=depth, intrinsics=half, truth=None)
+    return frame
 
 
 def make_camera(options: Mapping[str, Any], context: DriverContext) -> MockCamera:
     """The twin's camera; `options` are those of `[twin]`."""
     twin = twin_options(options)
     world = twin_world(twin, context)
-    return MockCamera(world, twin, context.seed, make_painter(twin.renderer, world))
+    return MockCamera(world, twin, context.seed)
+
+
+def _rendered_view(world: TwinWorld, renderer: Renderer) -> Any:
+    """The plant as SAPIEN renders it for the simulated tasks, which needs Vulkan and ManiSkill; None without them.
+
+    Raises:
+        ProfileError: The renderer is `sapien`, and it cannot render here.
+    """
+    try:
+        from maniskill_tomato.deploy.mock.sapien_view import SapienView
+
+        episode = world.episode
+        return SapienView(episode.plant, episode.T_world_plant.double().numpy(), world.intrinsics)
+    except (ImportError, RuntimeError) as error:
+        if renderer == "sapien":
+            raise ProfileError(
+                f"twin.renderer is 'sapien', which cannot render here ({error}); use 'rays' or 'auto', or install "
+                "Vulkan with `make vulkan`"
+            ) from error
+        _logger.info("no SAPIEN renderer here (%s); the twin's pictures have flat colours", error)
+        return None

@@ -1,6 +1,9 @@
-"""The twin's world: one arm in front of one plant, and what its camera sees."""
+"""The twin's world: one arm in front of one plant, what its camera sees, and the options of a profile."""
 
-from typing import Final
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, Final, Literal
 
 import numpy as np
 import torch
@@ -8,15 +11,72 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from maniskill_tomato.deploy.clock import Clock
+from maniskill_tomato.deploy.drivers import DriverContext
 from maniskill_tomato.deploy.interface import Float64, FrameTruth
 from maniskill_tomato.deploy.mock.dynamics import ArmDynamics
-from maniskill_tomato.deploy.mock.episode import TwinEpisode
+from maniskill_tomato.deploy.mock.episode import EpisodeListName, TwinEpisode, load_episode
+from maniskill_tomato.deploy.toml_tables import parse_table
+from maniskill_tomato.errors import check_ranges
 from maniskill_tomato.plants.organs import SemanticClass
 from maniskill_tomato.raycast.images import FIRST_ORGAN_LABEL, Picture
 from maniskill_tomato.raycast.scene import RayScene
-from maniskill_tomato.robot.d435 import CameraIntrinsics, T_flange_camera_color_optical
+from maniskill_tomato.robot.d435 import CameraIntrinsics, T_flange_camera_color_optical, color_intrinsics
 from maniskill_tomato.robot.kinematics import link_transforms
 from maniskill_tomato.robot.robot_description import link_meshes
+
+ArmFault = Literal["silent", "slow", "nan", "jump", "drop", "stuck", "refuse"]
+"""No answers; moves 20 times too slow; NaN positions; positions that jump; gone in the middle of a move; does not move;
+commands refused."""
+
+CameraFault = Literal["unplugged", "frozen", "late", "black", "zero_depth", "wrong_size", "silent"]
+"""Gone; the same picture again; pictures 30 s old; black; no depth; another size than announced; no answers."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Faults:
+    """What goes wrong, and when."""
+
+    arm: ArmFault | None = None
+    """The arm's fault."""
+    arm_from_move: int = 0
+    """From which command on, counted from 0."""
+    camera: CameraFault | None = None
+    """The camera's fault."""
+    camera_from_read: int = 0
+    """From which picture on, counted from 0."""
+    camera_reads: int = 1_000_000
+    """For how many pictures."""
+
+    def __post_init__(self) -> None:
+        check_ranges(self, arm_from_move=(0, math.inf), camera_from_read=(0, math.inf))
+        check_ranges(self, camera_reads=(1, math.inf))
+
+
+Renderer = Literal["rays", "sapien", "auto"]
+
+
+@dataclass(frozen=True, kw_only=True)
+class TwinOptions:
+    """The `[twin]` table of a profile; the run's seed is the number of the episode."""
+
+    episodes: EpisodeListName = "held_out"
+    """Which list the plants come from."""
+    width: int = 640
+    """Of the colour picture, in [px]."""
+    height: int = 480
+    """Of the colour picture, in [px]."""
+    depth_noise: float = 1.0
+    """Standard deviation of depths in multiples of the D435's; 0 for exact depths."""
+    renderer: Renderer = "rays"
+    """Where colours come from: flat ones by ray casting, SAPIEN's, or SAPIEN's where Vulkan is there (`auto`)."""
+    real_time: bool = False
+    """Whether the arm takes the time that it really would."""
+    faults: Faults = Faults()
+    """What goes wrong."""
+
+    def __post_init__(self) -> None:
+        check_ranges(self, depth_noise=(0.0, math.inf), width=(16, 1920), height=(16, 1080))
+
 
 COLORS: Final = {
     SemanticClass.BACKGROUND: (178, 196, 204),
@@ -101,3 +161,22 @@ class TwinWorld:
         """Poses of the optical frame and of the links, in single precision as in the simulated task."""
         links = link_transforms(torch.tensor(joints[None], dtype=torch.float32))
         return links[:, -1] @ self._mount, links
+
+
+def twin_options(options: Mapping[str, Any]) -> TwinOptions:
+    """Checks the table.
+
+    Raises:
+        ProfileError: A key or a value is wrong.
+    """
+    return parse_table(TwinOptions, options, "twin")
+
+
+def twin_world(options: TwinOptions, context: DriverContext) -> TwinWorld:
+    """The world of a run, made when arm or camera asks first."""
+
+    def make() -> TwinWorld:
+        intrinsics = color_intrinsics(options.width, options.height)
+        return TwinWorld(load_episode(options.episodes, context.seed), intrinsics, context.clock)
+
+    return context.shared("twin", make)

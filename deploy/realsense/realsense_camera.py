@@ -5,6 +5,7 @@ from collections.abc import Mapping
 from typing import Any, Final, TypeVar
 
 import numpy as np
+from numpy.typing import NDArray
 
 from maniskill_tomato.deploy.clock import Clock
 from maniskill_tomato.deploy.deploy_errors import (
@@ -16,11 +17,8 @@ from maniskill_tomato.deploy.deploy_errors import (
 )
 from maniskill_tomato.deploy.drivers import DriverContext
 from maniskill_tomato.deploy.interface import Camera, Float64, Frame
-from maniskill_tomato.deploy.realsense.depth_filters import DepthFilters
-from maniskill_tomato.deploy.realsense.depth_map import DepthMap
 from maniskill_tomato.deploy.realsense.realsense_config import RealSenseConfig
-from maniskill_tomato.deploy.realsense.sdk import load_sdk
-from maniskill_tomato.deploy.realsense.source import FrameSource
+from maniskill_tomato.deploy.realsense.source import FrameSource, load_sdk
 from maniskill_tomato.deploy.toml_tables import parse_table
 from maniskill_tomato.robot.d435 import CameraIntrinsics, min_depth
 
@@ -240,6 +238,79 @@ def _pinhole(sdk: Any, raw: Any, name: str) -> CameraIntrinsics:
     return CameraIntrinsics.from_realsense(
         width=raw.width, height=raw.height, fx=raw.fx, fy=raw.fy, ppx=raw.ppx, ppy=raw.ppy
     )
+
+
+class DepthMap:
+    """The SDK's alignment moves pixels but leaves their values, which are distances along the depth camera's axis."""
+
+    def __init__(self, color: CameraIntrinsics, T_color_depth: Float64, depth_units: float) -> None:
+        """Computes each pixel's scale once.
+
+        Args:
+            color: Of the colour camera, to which depth is aligned.
+            T_color_depth: From the depth camera's optical frame to the colour camera's. Shape (4, 4).
+            depth_units: Metres that one count stands for.
+        """
+        ones = np.ones((color.height, color.width, 1))
+        focal, centre = np.array([color.fx, color.fy]), np.array([color.cx, color.cy])
+        rays = np.concatenate([(color.pixel_centres() - centre) / focal, ones], axis=-1)
+        depth_axis = T_color_depth[:3, 2]
+        # A point z ray lies at z (ray . axis) - t . axis along the depth camera's axis.
+        self._scale = (1.0 / (rays @ depth_axis)).astype(np.float32)
+        self._offset = np.float32(T_color_depth[:3, 3] @ depth_axis)
+        self._units = np.float32(depth_units)
+
+    def __call__(self, aligned: NDArray[np.uint16]) -> NDArray[np.float32]:
+        """Depth seen from the colour camera, in [m], 0 where there is none.
+
+        Args:
+            aligned: Counts, as the SDK aligned them. Shape (H, W).
+
+        Returns:
+            Shape (H, W).
+        """
+        depth = (aligned * self._units + self._offset) * self._scale
+        return np.where(aligned > 0, depth, np.float32(0.0)).astype(np.float32)
+
+
+class DepthFilters:
+    """Decimation, then in disparity spatial and temporal smoothing, then back in depth the filling of holes."""
+
+    def __init__(self, sdk: Any, config: RealSenseConfig) -> None:
+        """Makes the filters that the configuration asks for.
+
+        Args:
+            sdk: The module `pyrealsense2`.
+            config: Which ones.
+        """
+        self._sdk = sdk
+        self._config = config
+        self._chain: list[Any] = []
+        self.restart()
+
+    def restart(self) -> None:
+        """Forgets earlier pictures: the temporal filter takes for granted that nothing moves."""
+        sdk, config = self._sdk, self._config
+        in_disparity = []
+        if config.spatial:
+            in_disparity.append(sdk.spatial_filter())
+        if config.temporal:
+            in_disparity.append(sdk.temporal_filter())
+        self._chain = []
+        if config.decimation > 1:
+            decimation = sdk.decimation_filter()
+            decimation.set_option(sdk.option.filter_magnitude, config.decimation)
+            self._chain.append(decimation)
+        if in_disparity:
+            self._chain += [sdk.disparity_transform(True), *in_disparity, sdk.disparity_transform(False)]
+        if config.hole_filling:
+            self._chain.append(sdk.hole_filling_filter())
+
+    def process(self, frames: Any) -> Any:
+        """The frameset with its depth filtered; colour is left alone."""
+        for block in self._chain:
+            frames = block.process(frames).as_frameset()
+        return frames
 
 
 def make_camera(options: Mapping[str, Any], context: DriverContext) -> RealSenseCamera:

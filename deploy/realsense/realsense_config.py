@@ -4,7 +4,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Final, Literal
 
-from maniskill_tomato.errors import InvalidInputError
+from maniskill_tomato.errors import InvalidInputError, check_ranges
 
 Preset = Literal["default", "hand", "high_accuracy", "high_density", "medium_density"]
 """Settings of the depth processor that the SDK knows by name."""
@@ -56,17 +56,15 @@ class RealSenseConfig:
         for name, allowed in (("color_size", COLOR_SIZES), ("depth_size", DEPTH_SIZES)):
             if tuple(getattr(self, name)) not in allowed and self.recording is None:
                 raise InvalidInputError.choice(name, list(getattr(self, name)), [list(s) for s in allowed])
-        for name, low, high in (
-            ("fps", 6, 90),
-            ("decimation", 1, 8),
-            ("temporal_frames", 1, 30),
-            ("warm_up_frames", 0, 300),
-            ("frame_timeout_s", 0.05, 10.0),
-            ("latency_s", 0.0, 1.0),
-        ):
-            value = getattr(self, name)
-            if not low <= value <= high:
-                raise InvalidInputError(f"{name} must be between {low} and {high}, got {value}")
+        check_ranges(
+            self,
+            fps=(6, 90),
+            decimation=(1, 8),
+            temporal_frames=(1, 30),
+            warm_up_frames=(0, 300),
+            frame_timeout_s=(0.05, 10.0),
+            latency_s=(0.0, 1.0),
+        )
         if self.recording is not None and self.serial is not None:
             raise InvalidInputError("serial and recording exclude each other; leave one out")
         if self.recording is not None and Path(self.recording).suffix not in (".db3", ".bag"):

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from maniskill_tomato.deploy.deploy_errors import RecordingError
 from maniskill_tomato.deploy.interface import Float64
-from maniskill_tomato.deploy.realsense.sdk import load_sdk
+from maniskill_tomato.deploy.realsense.source import load_sdk
 from maniskill_tomato.robot.d435 import STEREO_BASELINE, CameraIntrinsics
 
 

@@ -12,8 +12,7 @@ from typing import Annotated
 
 import tyro
 
-from maniskill_tomato.deploy.sunrise.loopback import LoopbackController
-from maniskill_tomato.deploy.sunrise.loopback_faults import Fault
+from maniskill_tomato.deploy.sunrise.loopback import Fault, LoopbackController
 from maniskill_tomato.errors import TomatoError
 
 

@@ -7,6 +7,7 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 import numpy.typing as npt
+from scipy.spatial.transform import Rotation
 
 from maniskill_tomato.robot import iiwa14
 
@@ -40,25 +41,16 @@ def flange_pose(qpos: Sequence[float], media_flange_m: float = 0.0) -> FloatArra
 
 def transform_from_xyzabc(values: Sequence[float]) -> FloatArray:
     """The transform of x, y, z [mm] and A, B, C [rad], R = Rz(A) Ry(B) Rx(C). Shape (4, 4), in [m]."""
-    x, y, z, a, b, c = values
-    turn_z = np.array([[math.cos(a), -math.sin(a), 0], [math.sin(a), math.cos(a), 0], [0, 0, 1]])
-    turn_y = np.array([[math.cos(b), 0, math.sin(b)], [0, 1, 0], [-math.sin(b), 0, math.cos(b)]])
-    turn_x = np.array([[1, 0, 0], [0, math.cos(c), -math.sin(c)], [0, math.sin(c), math.cos(c)]])
     pose = np.eye(4)
-    pose[:3, :3] = turn_z @ turn_y @ turn_x
-    pose[:3, 3] = np.array([x, y, z]) / 1000.0
+    pose[:3, :3] = Rotation.from_euler("ZYX", values[3:]).as_matrix()
+    pose[:3, 3] = np.array(values[:3]) / 1000.0
     return pose
 
 
 def xyzabc_from_transform(pose: FloatArray) -> list[float]:
     """x, y, z [mm] and A, B, C [rad] of a transform in [m]. Shape (6,)."""
-    r = pose[:3, :3]
-    b = math.atan2(-r[2, 0], math.hypot(r[0, 0], r[1, 0]))
-    if math.cos(b) > 1e-9:
-        a, c = math.atan2(r[1, 0], r[0, 0]), math.atan2(r[2, 1], r[2, 2])
-    else:
-        a, c = math.atan2(-r[0, 1], r[1, 1]), 0.0
-    return [*(1000.0 * float(v) for v in pose[:3, 3]), a, b, c]
+    turns = Rotation.from_matrix(pose[:3, :3]).as_euler("ZYX")
+    return [*(1000.0 * pose[:3, 3]).tolist(), *turns.tolist()]
 
 
 class SimulatedArm:

@@ -1,15 +1,18 @@
-"""Plausibility checks of the joint angles that the controller reports."""
+"""Checks of what the controller reports: joint angles that can be true, a flange where our kinematics put it."""
 
 import math
 from typing import Final, NamedTuple
 
 import numpy as np
+import torch
+from scipy.spatial.transform import Rotation
 
-from maniskill_tomato.deploy.interface import Float64
+from maniskill_tomato.deploy.deploy_errors import FaultError
+from maniskill_tomato.deploy.interface import LIMIT_SLACK, Float64
+from maniskill_tomato.deploy.rigid import difference, transform
+from maniskill_tomato.deploy.sunrise.sunrise_config import SunriseConfig
 from maniskill_tomato.robot import iiwa14
-
-LIMIT_SLACK: Final = math.radians(1.0)
-"""How far beyond a joint limit a reading may be, in [rad]."""
+from maniskill_tomato.robot.kinematics import forward_kinematics
 
 SPEED_SLACK: Final = 1.2
 """Joints may seem this much faster than they can be: time stamps are not exact."""
@@ -55,3 +58,38 @@ def why_impossible(reading: Reading, last: Reading | None, moving: bool, rest_to
     joint = int(np.argmax(change - allowed))
     how = "faster than it can" if moving else "without a move"
     return f"that joint {joint + 1} turned by {math.degrees(change[joint]):.2f} degrees {how}"
+
+
+def pose_difference(told: Float64, joint_positions: Float64, config: SunriseConfig) -> tuple[float, float]:
+    """How far the controller's tool, or flange, is from ours.
+
+    Args:
+        told: What the controller says: x, y, z, in [m], A, B, C, in [rad], base frame. Shape (6,).
+        joint_positions: At the same time, in [rad]. Shape (7,).
+        config: Flange, tool and tolerances.
+
+    Returns:
+        In [m] and [rad].
+
+    Raises:
+        FaultError: Farther than the tolerances.
+    """
+    flange = forward_kinematics(torch.from_numpy(np.array(joint_positions))).numpy()
+    expected = flange @ _transform(config.flange_xyz, config.flange_rpy)
+    if config.tool_xyzabc is not None:
+        x, y, z, a, b, c = config.tool_xyzabc
+        expected = expected @ _transform((x, y, z), (c, b, a))
+    actual = _transform((told[0], told[1], told[2]), (told[5], told[4], told[3]))
+    distance, angle = difference(expected, actual)
+    if distance <= config.pose_tolerance_m and angle <= config.pose_tolerance_rad:
+        return distance, angle
+    apart = [round(1000.0 * float(v), 1) for v in (np.linalg.inv(expected) @ actual)[:3, 3]]
+    raise FaultError(
+        f"the controller's flange is {1000 * distance:.1f} mm and {math.degrees(angle):.2f} degrees from where our "
+        f"kinematics put it (off by {apart} mm in its frame); set arm.flange_xyz and arm.flange_rpy to the mounted "
+        "flange, and arm.tool_xyzabc to the tool"
+    )
+
+
+def _transform(xyz: tuple[float, float, float], rpy: tuple[float, float, float]) -> Float64:
+    return transform(Rotation.from_euler("xyz", rpy), xyz)

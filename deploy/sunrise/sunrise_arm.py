@@ -26,8 +26,7 @@ from maniskill_tomato.deploy.drivers import DriverContext
 from maniskill_tomato.deploy.interface import Arm, ArmState, Float64, JointMove
 from maniskill_tomato.deploy.sunrise.client import SunriseClient
 from maniskill_tomato.deploy.sunrise.line_connection import LineConnection
-from maniskill_tomato.deploy.sunrise.pose_agreement import pose_difference
-from maniskill_tomato.deploy.sunrise.readings import Reading, why_impossible
+from maniskill_tomato.deploy.sunrise.readings import Reading, pose_difference, why_impossible
 from maniskill_tomato.deploy.sunrise.sunrise_config import SunriseConfig
 from maniskill_tomato.deploy.toml_tables import parse_table
 from maniskill_tomato.robot import iiwa14

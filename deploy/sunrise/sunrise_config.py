@@ -1,10 +1,9 @@
 """The `arm` table of a profile: how to reach an iiwa through the Sunrise Toolbox, and what is mounted on it."""
 
-import math
 from dataclasses import dataclass
 
 from maniskill_tomato.deploy.sunrise.client import TorqueKind
-from maniskill_tomato.errors import InvalidInputError
+from maniskill_tomato.errors import InvalidInputError, check_ranges
 from maniskill_tomato.robot.iiwa14 import NUM_JOINTS
 
 
@@ -52,23 +51,20 @@ class SunriseConfig:
     def __post_init__(self) -> None:
         if not self.host or any(c.isspace() for c in self.host):
             raise InvalidInputError(f"host must be an address, got {self.host!r}")
-        if not 1 <= self.port <= 65535:
-            raise InvalidInputError(f"port must be between 1 and 65535, got {self.port}")
         if len(self.torque_margin) != NUM_JOINTS or not all(0.0 < t <= 400.0 for t in self.torque_margin):
             raise InvalidInputError(
                 f"torque_margin must be {NUM_JOINTS} torques above 0 and up to 400 N m, got {self.torque_margin}"
             )
-        for name, low, high in (
-            ("largest_segment", 0.005, 6.2),
-            ("connect_timeout_s", 0.01, 60.0),
-            ("connect_pause_s", 0.0, 10.0),
-            ("reply_timeout_s", 0.01, 60.0),
-            ("move_margin_s", 0.01, 60.0),
-            ("pose_tolerance_m", 1e-5, 0.05),
-            ("pose_tolerance_rad", 1e-5, 0.1),
-            ("arrival_tolerance", 1e-5, 0.1),
-            ("rest_tolerance", 1e-5, 0.1),
-        ):
-            value = getattr(self, name)
-            if not (math.isfinite(value) and low <= value <= high):
-                raise InvalidInputError(f"{name} must be between {low} and {high}, got {value}")
+        check_ranges(
+            self,
+            port=(1, 65535),
+            largest_segment=(0.005, 6.2),
+            connect_timeout_s=(0.01, 60.0),
+            connect_pause_s=(0.0, 10.0),
+            reply_timeout_s=(0.01, 60.0),
+            move_margin_s=(0.01, 60.0),
+            pose_tolerance_m=(1e-5, 0.05),
+            pose_tolerance_rad=(1e-5, 0.1),
+            arrival_tolerance=(1e-5, 0.1),
+            rest_tolerance=(1e-5, 0.1),
+        )

@@ -34,29 +34,27 @@ COMMANDS: Final[dict[str, CommandEntry]] = {
     "demo": CommandEntry("demo_command:Demo", "Train, evaluate and report in one go"),
     "train": CommandEntry("train_command:Train", "Train a policy by reinforcement learning"),
     "train-imitation": CommandEntry(
-        "imitation_command:TrainImitation", "Imitate a teacher that knows the truth"
+        "learn_commands:TrainImitation", "Imitate a teacher that knows the truth"
     ),
     "train-view-quality": CommandEntry(
-        "view_quality_command:TrainViewQuality", "Learn how much candidate views would show"
+        "learn_commands:TrainViewQuality", "Learn how much candidate views would show"
     ),
-    "train-ppo": CommandEntry("ppo_command:TrainPpo", "Train PPO (Stable-Baselines3), to compare with"),
+    "train-ppo": CommandEntry("learn_commands:TrainPpo", "Train PPO (Stable-Baselines3), to compare with"),
     "train-deep-3dmts": CommandEntry(
-        "move_to_see_command:TrainDeepMoveToSee", "Train the network of the planner deep_3dmts"
+        "learn_commands:TrainDeepMoveToSee", "Train the network of the planner deep_3dmts"
     ),
     "demonstrations": CommandEntry(
-        "demonstrations_command:Demonstrations", "Record a planner's episodes for other learners"
+        "learn_commands:RecordDemonstrations", "Record a planner's episodes for other learners"
     ),
-    "export": CommandEntry("export_command:Export", "Write a policy as ONNX, which runs without PyTorch"),
+    "export": CommandEntry("learn_commands:Export", "Write a policy as ONNX, which runs without PyTorch"),
     "eval": CommandEntry("eval_command:Eval", "Evaluate a policy and write a report"),
-    "benchmark": CommandEntry(
-        "benchmark_command:Benchmark", "Compare policies on the same held-out episodes"
-    ),
-    "benchmark-rows": CommandEntry("benchmark_command:BenchmarkRows", "Compare policies on whole rows"),
-    "compare": CommandEntry("compare_command:Compare", "Compare training runs over their seeds"),
-    "reproduce": CommandEntry("study_commands:Reproduce", "Reproduce the thesis's experiments"),
-    "ablate": CommandEntry("study_commands:Ablate", "Measure what each option of the learner is worth"),
-    "dataset": CommandEntry("dataset_command:Dataset", "Render annotated images of tomato rows"),
-    "detect": CommandEntry("detect_command:Detect", "Find the tomatoes in images"),
+    "benchmark": CommandEntry("measure_commands:Benchmark", "Compare policies on the same held-out episodes"),
+    "benchmark-rows": CommandEntry("measure_commands:BenchmarkRows", "Compare policies on whole rows"),
+    "compare": CommandEntry("measure_commands:Compare", "Compare training runs over their seeds"),
+    "reproduce": CommandEntry("measure_commands:Reproduce", "Reproduce the thesis's experiments"),
+    "ablate": CommandEntry("measure_commands:Ablate", "Measure what each option of the learner is worth"),
+    "dataset": CommandEntry("image_commands:Dataset", "Render annotated images of tomato rows"),
+    "detect": CommandEntry("image_commands:Detect", "Find the tomatoes in images"),
     "train-segmenter light": CommandEntry("segmenter_commands:TrainLight", "The light segmenter, on a CPU"),
     "train-segmenter mask-rcnn": CommandEntry("segmenter_commands:TrainMaskRcnn", "Mask R-CNN"),
     "train-segmenter yolo": CommandEntry("segmenter_commands:TrainYolo", "YOLO, through Ultralytics"),
@@ -73,7 +71,7 @@ COMMANDS: Final[dict[str, CommandEntry]] = {
     "deploy run": CommandEntry("deploy_commands:DeployRun", "Look at a tomato until it is fully visible"),
     "deploy check": CommandEntry("deploy_commands:DeployCheck", "Check everything; nothing moves"),
     "deploy calibrate": CommandEntry(
-        "calibrate_command:DeployCalibrate", "Measure the camera's place on the flange"
+        "deploy_commands:DeployCalibrate", "Measure the camera's place on the flange"
     ),
     "deploy replay": CommandEntry("deploy_commands:DeployReplay", "Run a recording through today's code"),
     "deploy profiles": CommandEntry("deploy_commands:DeployProfiles", "List the profiles, or print one"),

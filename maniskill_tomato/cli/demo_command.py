@@ -4,9 +4,8 @@ import dataclasses
 from dataclasses import dataclass
 from pathlib import Path
 
-from maniskill_tomato.cli.early_checks import check_count
+from maniskill_tomato.cli.early_checks import check_counts
 from maniskill_tomato.cli.eval_command import summary
-from maniskill_tomato.cli.train_command import train
 from maniskill_tomato.errors import InvalidInputError
 from maniskill_tomato.learning.rl.presets import PRESETS
 
@@ -28,12 +27,13 @@ class Demo:
 
     def run(self) -> None:
         """Runs both parts and names the results."""
-        check_count("--episodes", self.episodes)
+        check_counts(episodes=self.episodes)
         if not self.minutes > 0:
             raise InvalidInputError(f"--minutes must be above 0, got {self.minutes:g}")
 
         from maniskill_tomato.experiments.configs import EvaluationConfig
         from maniskill_tomato.experiments.evaluation import evaluate
+        from maniskill_tomato.learning.rl.trainer import train
 
         env_id = "TomatoViewpointGuided-v1"
         print(f"1/2 training on {env_id}, at most {self.minutes:g} minutes")

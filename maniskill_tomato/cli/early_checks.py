@@ -20,10 +20,11 @@ def check_env_id(env_id: str, allowed: Sequence[str] = TASK_IDS) -> None:
     check_choice("ENV_ID", env_id, allowed)
 
 
-def check_count(flag: str, value: int | None, least: int = 1) -> None:
-    """Accepts a whole number of `least` or more, or none."""
-    if value is not None and value < least:
-        raise InvalidInputError(f"{flag} must be {least} or more, got {value}")
+def check_counts(least: int = 1, **values: int | None) -> None:
+    """Accepts whole numbers of `least` or more, or none; their flags are called like the arguments."""
+    for name, value in values.items():
+        if value is not None and value < least:
+            raise InvalidInputError(f"--{name.replace('_', '-')} must be {least} or more, got {value}")
 
 
 def check_file(flag: str, path: Path | None) -> None:

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Literal
 
 from maniskill_tomato.cli.early_checks import (
-    check_count,
+    check_counts,
     check_folder,
     check_place,
     check_policies,
@@ -15,7 +15,8 @@ from maniskill_tomato.cli.early_checks import (
     check_profile,
     check_segmenter,
 )
-from maniskill_tomato.experiments.configs import PerceptionConfig, TwinConfig
+from maniskill_tomato.cli.shared_options import say
+from maniskill_tomato.experiments.configs import PerceptionComparisonConfig, TwinConfig
 
 OcclusionModelName = Literal["thesis", "improved", "sphere", "amodal"]
 
@@ -47,7 +48,7 @@ class JudgeOcclusion:
     def run(self) -> None:
         """Runs the models and prints the tables."""
         check_folder("--data", self.data)
-        check_count("--count", self.count)
+        check_counts(count=self.count)
 
         from tqdm import tqdm
 
@@ -99,7 +100,7 @@ class JudgeSegmenter:
         """Evaluates and prints the figures."""
         check_place("--data", self.data)
         check_segmenter("--segmenter", self.segmenter)
-        check_count("--limit", self.limit)
+        check_counts(limit=self.limit)
 
         from maniskill_tomato.files import write_atomically
         from maniskill_tomato.segmentation.datasets.annotations import SMALLEST_SHARE
@@ -120,7 +121,7 @@ class JudgeSegmenter:
 
 
 @dataclass(frozen=True, kw_only=True)
-class JudgePerception(PerceptionConfig):
+class JudgePerception(PerceptionComparisonConfig):
     """Measure what a policy loses when it sees through the camera instead of the simulator, on the same episodes.
 
     An episode ends when the robot believes that the target is fully visible, or after the last move. It is a success
@@ -152,4 +153,4 @@ class JudgeTwin(TwinConfig):
 
         from maniskill_tomato.experiments.twin_comparison import compare_twin
 
-        print(json.dumps(compare_twin(self, lambda line: print(line, flush=True)), indent=1))
+        print(json.dumps(compare_twin(self, say), indent=1))

@@ -5,17 +5,18 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from maniskill_tomato.cli.arguments import Flat
-from maniskill_tomato.cli.early_checks import check_count, check_file, check_place
+from maniskill_tomato.cli.early_checks import check_counts, check_file, check_place
+from maniskill_tomato.cli.shared_options import say
 from maniskill_tomato.errors import InvalidInputError
-from maniskill_tomato.segmentation.training.detector_presets import MASK_RCNN_PRESETS, YOLO_PRESET
-from maniskill_tomato.segmentation.training.light_config import LightTrainConfig
+from maniskill_tomato.segmentation.detector_configs import MASK_RCNN_PRESETS, LightTrainConfig
 
 if TYPE_CHECKING:
-    from maniskill_tomato.segmentation.training.resumable_training import ResumableTraining
-    from maniskill_tomato.segmentation.training.training_run import TrainingImages
+    from maniskill_tomato.segmentation.datasets.annotations import AnnotatedImage
+    from maniskill_tomato.segmentation.training.detector_training import DetectorTraining
+    from maniskill_tomato.segmentation.training.training_pictures import TrainingImages
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -48,14 +49,23 @@ class ImageOptions:
             check_place("--validation", self.validation)
         if self.shares and len(self.shares) != len(self.data):
             raise InvalidInputError(f"--shares must be one for each folder of --data, got {len(self.shares)}")
-        check_count("--limit", self.limit)
+        check_counts(limit=self.limit)
 
     def read(self) -> "TrainingImages":
         """The images; what is left out is named on standard error."""
-        from maniskill_tomato.segmentation.training.training_run import TrainingImages
+        from maniskill_tomato.segmentation.datasets.reading import read_place
+        from maniskill_tomato.segmentation.training.training_pictures import TrainingImages
 
-        return TrainingImages.read(
-            self.data, self.shares, self.validation, self.limit, lambda line: print(line, file=sys.stderr)
+        def images(place: str) -> "tuple[AnnotatedImage, ...]":
+            found = read_place(place)
+            if found.skipped:
+                print(f"{place}: {found.skipped_text()}", file=sys.stderr)
+            return found.images
+
+        return TrainingImages(
+            sets=tuple(images(place)[: self.limit] for place in self.data),
+            shares=self.shares,
+            validation=images(self.validation) if self.validation else (),
         )
 
 
@@ -75,11 +85,7 @@ class TrainLight(ImageOptions):
 
         from maniskill_tomato.segmentation.training.light_training import LightTraining
 
-        def prepare() -> "ResumableTraining":
-            images = self.read()
-            return LightTraining(self.config, images.sets, images.shares, images.validation, self.start_from)
-
-        _tell_weights(lambda: _train(prepare(), self.out))
+        _tell_weights(lambda: _train(LightTraining(self.config, self.read(), self.start_from), self.out))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -101,8 +107,7 @@ class TrainMaskRcnn(ImageOptions):
     def run(self) -> None:
         """Trains and says where the weights are."""
         self.check()
-        check_count("--epochs", self.epochs)
-        check_count("--steps-per-epoch", self.steps_per_epoch)
+        check_counts(epochs=self.epochs, steps_per_epoch=self.steps_per_epoch)
         preset = MASK_RCNN_PRESETS[self.preset]
         config = replace(
             preset,
@@ -112,13 +117,9 @@ class TrainMaskRcnn(ImageOptions):
 
         from maniskill_tomato.segmentation.training.mask_rcnn_training import MaskRcnnTraining
 
-        def prepare() -> "ResumableTraining":
-            images = self.read()
-            return MaskRcnnTraining(
-                config, images.sets, images.shares, images.validation, self.pretrained, self.seed
-            )
-
-        _tell_weights(lambda: _train(prepare(), self.out))
+        _tell_weights(
+            lambda: _train(MaskRcnnTraining(config, self.read(), self.pretrained, self.seed), self.out)
+        )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -137,28 +138,25 @@ class TrainYolo(ImageOptions):
     def run(self) -> None:
         """Trains and says where the weights are."""
         self.check()
-        check_count("--epochs", self.epochs)
+        check_counts(epochs=self.epochs)
 
-        from maniskill_tomato.segmentation.training.training_run import run_yolo_training
-        from maniskill_tomato.segmentation.yolo import stock_settings, thesis_settings
+        from maniskill_tomato.segmentation.training.yolo_training import YOLO_SETTINGS, train_yolo
 
-        epochs = YOLO_PRESET.epochs if self.epochs is None else self.epochs
-        settings = (
-            stock_settings(epochs)
-            if self.preset == "stock"
-            else thesis_settings(replace(YOLO_PRESET, epochs=epochs))
-        )
-        _tell_weights(lambda: run_yolo_training(self.read(), self.out, settings, self.model, self.seed))
+        settings = YOLO_SETTINGS[self.preset]
+        if self.epochs is not None:
+            settings = settings | {"epochs": self.epochs}
+        _tell_weights(lambda: train_yolo(self.read(), self.out, settings, self.model, self.seed))
 
 
-def _train(training: "ResumableTraining", out: Path) -> Path | None:
+def _train(training: "DetectorTraining[Any]", out: Path) -> Path | None:
     from maniskill_tomato.learning.interrupt import stop_on_signals
-    from maniskill_tomato.segmentation.training.training_run import run_training
+    from maniskill_tomato.segmentation.metrics.detection_plots import plot_losses
 
     with stop_on_signals() as request:
-        return run_training(
-            training, out, lambda line: print(line, flush=True), lambda: request.reason is not None
-        )
+        path = training.run(out, say, lambda: request.reason is not None)
+    if training.history:
+        plot_losses({out.name: training.history}, out / "losses.png")
+    return path
 
 
 def _tell_weights(train: Callable[[], Path | None]) -> None:

@@ -85,6 +85,11 @@ def parse_env_options(options: Mapping[str, str]) -> dict[str, Any]:
     return parsed
 
 
+def say(line: str) -> None:
+    """Prints a line of progress at once, also into a pipe."""
+    print(line, flush=True)
+
+
 def tell_policy(train: Callable[[Callable[[str], None]], Path]) -> None:
     """Trains and says where the policy is and how long it took.
 
@@ -92,5 +97,5 @@ def tell_policy(train: Callable[[Callable[[str], None]], Path]) -> None:
         train: Given whom to tell a line, it returns the policy's file.
     """
     start = time.perf_counter()
-    path = train(lambda line: print(line, flush=True))
+    path = train(say)
     print(f"policy {path} after {time.perf_counter() - start:.0f} s")

@@ -9,7 +9,7 @@ from typing import Annotated, Any
 import tyro
 
 from maniskill_tomato.cli.arguments import Flat
-from maniskill_tomato.cli.early_checks import check_count, check_env_id, check_file
+from maniskill_tomato.cli.early_checks import check_counts, check_env_id, check_file
 from maniskill_tomato.cli.shared_options import PlantOptions, merge_options
 from maniskill_tomato.errors import InvalidInputError, SeedsFailedError
 from maniskill_tomato.learning.rl.config_file import RunFile, parse_seeds, read_run_config, read_run_file
@@ -73,7 +73,7 @@ class Train:
                 f"give the task to train on, one of {', '.join(TASK_IDS)}, or --config FILE or --resume DIR"
             )
         check_env_id(env_id)
-        check_count("--jobs", self.jobs)
+        check_counts(jobs=self.jobs)
         if self.config.initial_policy is not None:
             check_file("--initial-policy", Path(self.config.initial_policy))
         if self.resume is not None:
@@ -88,8 +88,16 @@ class Train:
         if seeds:
             self._run_seeds(env_id, out, seeds, env_options)
             return
+        from maniskill_tomato.learning.rl.trainer import train
+
         result = train(
-            env_id, self.config, out, self.seed, env_options, self.overwrite, self.resume is not None
+            env_id,
+            self.config,
+            out,
+            self.seed,
+            env_options,
+            overwrite=self.overwrite,
+            resume=self.resume is not None,
         )
         print(f"trained {result.steps} steps in {result.seconds:.0f} s ({result.stop_reason})")
         print(f"policy  {result.policy_path}")
@@ -153,21 +161,6 @@ class Train:
         if failed:
             listed = ", ".join(str(r.seed) for r in failed)
             raise SeedsFailedError(f"{len(failed)} of {len(results)} seeds failed: {listed}")
-
-
-def train(
-    env_id: str,
-    config: TrainConfig,
-    out: Path,
-    seed: int,
-    env_options: dict[str, Any],
-    overwrite: bool = False,
-    resume: bool = False,
-) -> Any:
-    """Trains in `out`; returns the `TrainResult`."""
-    from maniskill_tomato.learning.rl.run import train as train_run
-
-    return train_run(env_id, config, out, seed, env_options, overwrite=overwrite, resume=resume)
 
 
 def _default(argv: Sequence[str]) -> Train:

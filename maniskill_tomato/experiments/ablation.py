@@ -10,11 +10,10 @@ import numpy as np
 import maniskill_tomato
 from maniskill_tomato.errors import InvalidInputError
 from maniskill_tomato.experiments.configs import AblationConfig
-from maniskill_tomato.experiments.metrics import write_json
 from maniskill_tomato.experiments.statistics import Interval, interquartile_interval, interval_text
 from maniskill_tomato.experiments.training_study import SOLVED, WINDOW, Trial, run_trials
 from maniskill_tomato.experiments.variants import Evaluation, Variant, choose_variants
-from maniskill_tomato.files import write_atomically
+from maniskill_tomato.files import write_atomically, write_json
 from maniskill_tomato.learning.rl.presets import get_preset
 from maniskill_tomato.report_design import markdown_table
 from maniskill_tomato.tasks import THESIS_IDS

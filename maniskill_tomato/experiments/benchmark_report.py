@@ -12,9 +12,9 @@ from matplotlib.ticker import MaxNLocator
 
 import maniskill_tomato
 from maniskill_tomato.experiments.episode_record import EpisodeRecord
-from maniskill_tomato.experiments.metrics import THRESHOLDS, compare_policies, summarise_policy, write_json
+from maniskill_tomato.experiments.metrics import THRESHOLDS, compare_policies, summarise_policy
 from maniskill_tomato.experiments.policy_runs import Condition
-from maniskill_tomato.files import write_atomically
+from maniskill_tomato.files import write_atomically, write_json
 from maniskill_tomato.report_design import INK, PLOT_STYLE, TEN, markdown_table, number, percent
 
 HEAD = (

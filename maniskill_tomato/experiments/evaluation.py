@@ -15,10 +15,11 @@ from maniskill_tomato.errors import InvalidInputError
 from maniskill_tomato.experiments import plots
 from maniskill_tomato.experiments.configs import EvaluationConfig
 from maniskill_tomato.experiments.episode_record import EpisodeRecord
-from maniskill_tomato.experiments.evaluation_report import Picture, ReportInput, write_report
-from maniskill_tomato.experiments.metrics import make_metrics, write_json
-from maniskill_tomato.experiments.rollout import run_episodes
+from maniskill_tomato.experiments.evaluation_report import ReportInput, ReportPicture, write_report
+from maniskill_tomato.experiments.metrics import make_metrics
+from maniskill_tomato.experiments.rollout import open_widest, run_episodes
 from maniskill_tomato.experiments.training_runs import Run
+from maniskill_tomato.files import write_json
 from maniskill_tomato.learning.rl.envs import make_env
 from maniskill_tomato.learning.rl.history import load_history
 from maniskill_tomato.policies.adapters import origin
@@ -74,7 +75,7 @@ def evaluate(config: EvaluationConfig) -> EvaluationResult:
     )
     write_json(config.out / "metrics.json", metrics)
     write_trajectories(config.out / "trajectories.npz", episodes)
-    views: list[Picture] = []
+    views: list[ReportPicture] = []
     video = left_out = None
     if config.video:
         if vulkan_probe.rendering_available():
@@ -171,19 +172,26 @@ def _run(
     config: EvaluationConfig, found: str | Path
 ) -> tuple[list[EpisodeRecord], list[EpisodeRecord] | None, float, Policy]:
     """The policy's episodes, the baseline's if wanted, the task's threshold of V_f, and the policy."""
-    env = make_env(config.env_id, **config.env_options)
+    episodes, threshold, policy = _run_policy(config, found)
+    baseline = None
+    if config.baseline:
+        logger.info("the same episodes with random actions, to compare")
+        baseline = _run_policy(config, RANDOM)[0]
+    return episodes, baseline, threshold, policy
+
+
+def _run_policy(config: EvaluationConfig, found: str | Path) -> tuple[list[EpisodeRecord], float, Policy]:
+    def make(num_envs: int) -> tuple[gym.Env[Any, Any], Policy]:
+        env = make_env(config.env_id, num_envs, **config.env_options)
+        return env, _open(config, found, env)
+
+    env, policy = open_widest(make, min(config.num_envs, config.episodes))
     try:
         threshold = float(cast(Any, env.unwrapped).task.full_visibility)
-        policy = _open(config, found, env)
         episodes = run_episodes(env, policy, config.episodes, config.seed, config.show_progress)
-        baseline = None
-        if config.baseline:
-            logger.info("the same episodes with random actions, to compare")
-            random = _open(config, RANDOM, env)
-            baseline = run_episodes(env, random, config.episodes, config.seed, config.show_progress)
     finally:
         env.close()
-    return episodes, baseline, threshold, policy
+    return episodes, threshold, policy
 
 
 def _with_true_association(config: EvaluationConfig, found: str | Path) -> list[EpisodeRecord] | None:
@@ -203,26 +211,26 @@ def _with_true_association(config: EvaluationConfig, found: str | Path) -> list[
 
 def _plot_episodes(
     config: EvaluationConfig, episodes: Sequence[EpisodeRecord], threshold: float
-) -> list[Picture]:
+) -> list[ReportPicture]:
     out = config.out
     plots.plot_steps(episodes, out / "steps.png")
     plots.plot_visible_fraction(episodes, threshold, out / "visible_fraction.png")
-    plots.plot_trajectories(episodes, out / "trajectories.png")
+    plots.plot_trajectories(episodes, "the first episodes", out / "trajectories.png")
     return [
-        Picture(path=out / "steps.png", caption="Steps that each episode took (thesis Fig. 5-6)."),
-        Picture(
+        ReportPicture(path=out / "steps.png", caption="Steps that each episode took (thesis Fig. 5-6)."),
+        ReportPicture(
             path=out / "visible_fraction.png",
             caption="Visible fraction of the target at the start and at its best in each episode (thesis Fig. 5-7).",
         ),
-        Picture(
+        ReportPicture(
             path=out / "trajectories.png",
-            caption="Way of the end-effector in the first episodes, with the viewing direction at the first, "
-            "middle and last pose (thesis Fig. 5-8).",
+            caption="Way of the end-effector in the first episodes, with the camera at the first, middle and last pose "
+            "(thesis Fig. 5-8).",
         ),
     ]
 
 
-def _plot_training(config: EvaluationConfig, policy: Path | None) -> list[Picture]:
+def _plot_training(config: EvaluationConfig, policy: Path | None) -> list[ReportPicture]:
     """Curves of the training that the configuration names, or of the one beside the policy."""
     run = config.training_run
     if run is None and policy is not None and (policy.parent / "history.npz").is_file():
@@ -232,7 +240,7 @@ def _plot_training(config: EvaluationConfig, policy: Path | None) -> list[Pictur
     path = config.out / "training_curves.png"
     plots.plot_training_curves(load_history(run), path)
     return [
-        Picture(
+        ReportPicture(
             path=path,
             caption="Loss and reward of each episode, reward and visible fraction of each step (thesis Fig. 5-1 to "
             "5-4).",
@@ -240,7 +248,7 @@ def _plot_training(config: EvaluationConfig, policy: Path | None) -> list[Pictur
     ]
 
 
-def _film(config: EvaluationConfig, found: str | Path) -> tuple[Path, list[Picture]]:
+def _film(config: EvaluationConfig, found: str | Path) -> tuple[Path, list[ReportPicture]]:
     """Films the first episodes; returns the film and the first and last view of the first one."""
     from maniskill_tomato.experiments.film import film_episodes, make_film_options
 
@@ -255,7 +263,7 @@ def _film(config: EvaluationConfig, found: str | Path) -> tuple[Path, list[Pictu
         env.close()
     first = films[0]
     steps = "1 step" if first.steps == 1 else f"{first.steps} steps"
-    pictures: list[Picture] = []
+    pictures: list[ReportPicture] = []
     for name, image, caption in (
         (
             "first_view",
@@ -272,5 +280,5 @@ def _film(config: EvaluationConfig, found: str | Path) -> tuple[Path, list[Pictu
     ):
         picture = config.out / f"{name}.png"
         imageio.imwrite(picture, image)
-        pictures.append(Picture(path=picture, caption=caption))
+        pictures.append(ReportPicture(path=picture, caption=caption))
     return path, pictures

@@ -11,7 +11,7 @@ from maniskill_tomato.report_design import figure, notice, page, paragraph, sect
 
 
 @dataclass(frozen=True, kw_only=True)
-class Picture:
+class ReportPicture:
     """A picture of the report."""
 
     path: Path
@@ -28,9 +28,9 @@ class ReportInput:
     """The content of `metrics.json`."""
     facts: Mapping[str, str] = field(default_factory=dict)
     """Name and value of what the reader should know about the run, in order."""
-    training: Sequence[Picture] = ()
-    evaluation: Sequence[Picture] = ()
-    views: Sequence[Picture] = ()
+    training: Sequence[ReportPicture] = ()
+    evaluation: Sequence[ReportPicture] = ()
+    views: Sequence[ReportPicture] = ()
     """First and last views; two by two."""
     video: Path | None = None
     policy: Path | None = None
@@ -104,7 +104,7 @@ def _views(content: ReportInput, folder: Path) -> str:
     return section("What the camera sees", f'<div class="pairs">{figures}</div>' if figures else "", film)
 
 
-def _gallery(title: str, pictures: Sequence[Picture], text: str) -> str:
+def _gallery(title: str, pictures: Sequence[ReportPicture], text: str) -> str:
     if not pictures:
         return ""
     return section(title, paragraph(text), *(figure(picture.path, picture.caption) for picture in pictures))

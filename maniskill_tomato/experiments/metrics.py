@@ -1,9 +1,7 @@
 """What episodes amount to, ready for JSON: of an evaluation, and of a policy in a benchmark."""
 
-import json
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -14,7 +12,6 @@ from maniskill_tomato.errors import InvalidInputError
 from maniskill_tomato.experiments.camera_metrics import summarise_camera
 from maniskill_tomato.experiments.episode_record import EpisodeRecord, Float64
 from maniskill_tomato.experiments.statistics import mean_interval, paired_test, wilson_interval
-from maniskill_tomato.files import write_atomically
 
 WITHIN_STEPS = (1, 3, 5, 10)
 """Step counts at which an evaluation reports the share of solved episodes."""
@@ -202,11 +199,6 @@ def compare_policies(runs: Mapping[str, Sequence[EpisodeRecord]], horizon: int) 
 def counted_moves(episodes: Sequence[EpisodeRecord], horizon: int) -> Float64:
     """Moves of each episode, a failed one with the whole horizon. Shape (N,)."""
     return np.array([e.steps if e.success else horizon for e in episodes], dtype=np.float64)
-
-
-def write_json(path: Path, content: Any) -> None:
-    """Writes a file of JSON whole or not at all, with numbers that any reader accepts (no NaN)."""
-    write_atomically(path, (json.dumps(content, indent=2, allow_nan=False) + "\n").encode())
 
 
 def _against_oracle(episodes: Sequence[EpisodeRecord], moves: Any, success: Any) -> dict[str, Any]:

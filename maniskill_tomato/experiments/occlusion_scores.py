@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from maniskill_tomato.report_design import markdown_table
 from maniskill_tomato.robot.d435 import CameraIntrinsics
 from maniskill_tomato.segmentation.datasets.annotations import AnnotatedImage, Instance
 from maniskill_tomato.sensing.visible_fraction.estimate import OcclusionModel, SegmentedImage
@@ -137,21 +138,21 @@ def by_band(judged: list[Judged]) -> list[tuple[tuple[float, float], Score]]:
 
 def markdown(judged: list[Judged], milliseconds: Mapping[str, float]) -> str:
     """The judgements as two tables."""
-    lines = [
-        "| model | tomatoes | MAE | bias | RMSE | failures | CPU ms an image |",
-        "|---|---|---|---|---|---|---|",
-    ]
-    for name in milliseconds:
-        s = score([j for j in judged if j.model == name])
-        lines.append(
-            f"| {name} | {s.count} | {s.mae:.3f} | {s.bias:+.3f} | {s.rmse:.3f} | {s.failures} "
-            f"| {milliseconds[name]:.0f} |"
+    head = ("model", "tomatoes", "MAE", "bias", "RMSE", "failures", "CPU ms an image")
+    of_model = {name: [j for j in judged if j.model == name] for name in milliseconds}
+    rows = []
+    for name, own in of_model.items():
+        s = score(own)
+        errors = f"{s.mae:.3f}", f"{s.bias:+.3f}", f"{s.rmse:.3f}"
+        rows.append((name, str(s.count), *errors, str(s.failures), f"{milliseconds[name]:.0f}"))
+    bands = [by_band(own) for own in of_model.values()]
+    by_truth = [
+        (
+            f"{low:g} to {min(high, 1):g}",
+            *(f"{band[k][1].mae:.3f} ({band[k][1].bias:+.3f})" for band in bands),
+            str(bands[0][k][1].count),
         )
-    lines += ["", "| true V_f | " + " | ".join(f"{n}: MAE (bias)" for n in milliseconds) + " | tomatoes |"]
-    lines.append("|---" * (len(milliseconds) + 2) + "|")
-    tables = {name: by_band([j for j in judged if j.model == name]) for name in milliseconds}
-    for k, (low, high) in enumerate(BANDS):
-        cells = [f"{t[k][1].mae:.3f} ({t[k][1].bias:+.3f})" for t in tables.values()]
-        count = next(iter(tables.values()))[k][1].count
-        lines.append(f"| {low:g} to {min(high, 1):g} | " + " | ".join(cells) + f" | {count} |")
-    return "\n".join(lines) + "\n"
+        for k, (low, high) in enumerate(BANDS)
+    ]
+    truth_head = ("true V_f", *(f"{name}: MAE (bias)" for name in milliseconds), "tomatoes")
+    return f"{markdown_table(head, rows)}\n\n{markdown_table(truth_head, by_truth)}\n"

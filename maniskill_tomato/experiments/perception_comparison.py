@@ -1,19 +1,17 @@
 """What a policy loses when it sees through the camera instead of the simulator, on the same held-out episodes."""
 
-from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from collections.abc import Mapping, Sequence
 from typing import Any, cast, get_args
 
 import numpy as np
 
 import maniskill_tomato
 from maniskill_tomato.errors import InvalidInputError
-from maniskill_tomato.experiments.configs import PerceptionConfig
+from maniskill_tomato.experiments.configs import PerceptionComparisonConfig
 from maniskill_tomato.experiments.episode_record import EpisodeRecord
-from maniskill_tomato.experiments.metrics import write_json
 from maniskill_tomato.experiments.policy_runs import Condition, parse_policies, run_policies
 from maniskill_tomato.experiments.result_store import ResultStore
-from maniskill_tomato.files import write_atomically
+from maniskill_tomato.files import write_atomically, write_json
 from maniskill_tomato.report_design import markdown_table
 from maniskill_tomato.sensing.simulated_camera import RENDERED, Perception
 from maniskill_tomato.tasks.row.row_config import GeneralTaskConfig
@@ -32,45 +30,32 @@ HEAD = (
 )
 
 
-@dataclass(frozen=True, kw_only=True)
-class PerceivedEpisode:
-    """How an episode ended, as believed and in truth."""
+def judge_episode(record: EpisodeRecord, policy: str, perception: str, threshold: float) -> dict[str, Any]:
+    """How an episode ended, as believed and in truth; what measures nothing is the truth itself.
 
-    policy: str
-    perception: str
-    episode: int
-    declared: bool
-    """Whether the robot took the target for fully visible at the end."""
-    true_fraction: float
-    """True V_f of the last view."""
-    success: bool
-    """Whether that is above the task's threshold."""
-    moves: int
-    fraction_error: float
-    """Mean absolute error of V_f over the episode's views after a move."""
-    position_error_m: float
-    """Distance between where the target is and where it was believed to be at the end, in [m]."""
-
-    @classmethod
-    def of(cls, record: EpisodeRecord, policy: str, perception: str, threshold: float) -> "PerceivedEpisode":
-        """Judges an episode by the true V_f; what measures nothing is the truth itself."""
-        measured = record.visible_fraction
-        true = measured if record.true_visible_fraction is None else record.true_visible_fraction
-        target = record.target if record.true_target is None else record.true_target
-        return cls(
-            policy=policy,
-            perception=perception,
-            episode=record.seed,
-            declared=record.success,
-            true_fraction=float(true[-1]),
-            success=record.success and bool(true[-1] > threshold),
-            moves=record.steps,
-            fraction_error=float(np.abs(measured - true)[1:].mean()),
-            position_error_m=float(np.linalg.norm(record.target[-1] - target[-1])),
-        )
+    Returns:
+        `declared`: whether the robot took the target for fully visible at the end; `true_fraction`: true V_f of the
+        last view; `success`: whether that is above the threshold as well; `moves`; `fraction_error`: mean absolute
+        error of V_f over the views after a move; `position_error_m`: how far the target is at the end from where it
+        was believed to be, in [m].
+    """
+    measured = record.visible_fraction
+    true = measured if record.true_visible_fraction is None else record.true_visible_fraction
+    target = record.target if record.true_target is None else record.true_target
+    return {
+        "policy": policy,
+        "perception": perception,
+        "episode": record.seed,
+        "declared": record.success,
+        "true_fraction": float(true[-1]),
+        "success": record.success and bool(true[-1] > threshold),
+        "moves": record.steps,
+        "fraction_error": float(np.abs(measured - true)[1:].mean()),
+        "position_error_m": float(np.linalg.norm(record.target[-1] - target[-1])),
+    }
 
 
-def compare_perceptions(config: PerceptionConfig) -> str:
+def compare_perceptions(config: PerceptionComparisonConfig) -> str:
     """Runs the episodes that are not in the folder yet; writes perception.json and perception.md.
 
     Returns:
@@ -90,25 +75,25 @@ def compare_perceptions(config: PerceptionConfig) -> str:
     run_policies(store, [(condition, specs, numbers) for condition in conditions], config.jobs)
     threshold = GeneralTaskConfig().full_visibility
     results = [
-        PerceivedEpisode.of(record, spec.label, condition.name, threshold)
+        judge_episode(record, spec.label, condition.name, threshold)
         for condition in conditions
         for spec in specs
         for record in store.episodes(condition.name, spec.label, numbers)
     ]
-    write_json(config.out / "perception.json", [asdict(result) for result in results])
+    write_json(config.out / "perception.json", results)
     table = perception_table(results)
     write_atomically(config.out / "perception.md", table.encode())
     return table
 
 
-def perception_table(results: Sequence[PerceivedEpisode]) -> str:
+def perception_table(results: Sequence[Mapping[str, Any]]) -> str:
     """The results as Markdown."""
     lines = []
-    for policy, perception in dict.fromkeys((r.policy, r.perception) for r in results):
-        rows = [r for r in results if (r.policy, r.perception) == (policy, perception)]
+    for policy, perception in dict.fromkeys((r["policy"], r["perception"]) for r in results):
+        rows = [r for r in results if (r["policy"], r["perception"]) == (policy, perception)]
 
-        def mean(name: str, rows: Sequence[PerceivedEpisode] = rows) -> float:
-            return float(np.mean([getattr(r, name) for r in rows]))
+        def mean(name: str, rows: Sequence[Mapping[str, Any]] = rows) -> float:
+            return float(np.mean([r[name] for r in rows]))
 
         lines.append(
             (

@@ -6,20 +6,26 @@ from typing import Any
 
 import matplotlib as mpl
 import numpy as np
+import torch
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
+from mpl_toolkits.mplot3d.art3d import Poly3DCollection  # type: ignore[import-untyped]
 from numpy.typing import ArrayLike, NDArray
 
+from maniskill_tomato.errors import InvalidInputError
 from maniskill_tomato.experiments.episode_record import EpisodeRecord
 from maniskill_tomato.learning.rl.history import TrainingCurves
 from maniskill_tomato.report_design import INK, LEAF, MUTED, PLOT_STYLE, PLUM, SKY, STRAW, TOMATO
+from maniskill_tomato.robot.d435 import T_flange_camera_color_optical, color_intrinsics
+from maniskill_tomato.robot.kinematics import viewpoint_transform
 
 _SEED_COLOURS = (SKY, STRAW, LEAF, PLUM, TOMATO, "#4aa3a2", "#7a5230", "#5b6770")
-SHOWN_TRAJECTORIES = 4
 
-ARROW_LENGTH = 0.12
-"""Length of a viewing arrow, in [m]."""
+FRUSTUM_DEPTH = 0.11
+"""Length of a drawn camera, in [m]."""
+
+SHOWN_TRAJECTORIES = 3
 
 
 def seed_colour(index: int) -> str:
@@ -149,85 +155,107 @@ def plot_visible_fraction(episodes: Sequence[EpisodeRecord], threshold: float, p
         figure.savefig(path)
 
 
-def plot_trajectories(episodes: Sequence[EpisodeRecord], path: Path, most: int = SHOWN_TRAJECTORIES) -> None:
-    """Ways of the end-effector in space, with viewing arrows at the first, middle and last pose (Fig. 5-8).
+def plot_trajectories(episodes: Sequence[EpisodeRecord], title: str, path: Path) -> None:
+    """Ways of the end-effector with the camera at the first, middle and last pose (Fig. 5-8).
+
+    As in the thesis the first camera is opaque, the middle one transparent and the last one between.
 
     Args:
-        episodes: The first `most` of them are drawn.
+        episodes: The first three of them are drawn.
+        title: What they are.
         path: The picture to write.
-        most: How many to draw.
     """
-    shown = list(episodes[:most])
+    shown = list(episodes[:SHOWN_TRAJECTORIES])
+    if not shown:
+        raise InvalidInputError("a figure of trajectories needs at least one episode")
+    frusta = [[frustum_points(v, FRUSTUM_DEPTH) for v in e.viewpoints[marked_views(e)]] for e in shown]
     targets = np.stack([e.target[0] for e in shown])
-    points = np.concatenate([targets, np.zeros((1, 3)), *(e.viewpoints[:, :3] for e in shown)])
-    low, high = points.min(axis=0) - 0.08, points.max(axis=0) + 0.08
+    points = np.concatenate(
+        [targets, *(e.viewpoints[:, :3] for e in shown), *(f for cameras in frusta for f in cameras)]
+    )
+    low, high = points.min(axis=0) - 0.05, points.max(axis=0) + 0.05
     with mpl.rc_context(PLOT_STYLE):
-        figure = Figure(figsize=(9.0, 4.9))
-        space: Any = figure.add_subplot(1, 2, 1, projection="3d")
-        above = figure.add_subplot(1, 2, 2)
-        for colour, episode in zip(_SEED_COLOURS, shown, strict=False):
-            _draw_trajectory(space, above, episode, colour)
-        space.scatter(*targets.T, s=90, color=TOMATO, label="target")
-        space.scatter(0.0, 0.0, 0.0, s=60, marker="s", color=INK, label="robot base")
-        above.scatter(targets[:, 0], targets[:, 1], s=90, color=TOMATO, zorder=4)
-        above.scatter(0.0, 0.0, s=60, marker="s", color=INK, zorder=4)
-        space.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), zlim=(low[2], high[2]))
-        space.set_box_aspect(high - low, zoom=0.92)
-        space.view_init(24, -125)
-        space.set(xlabel="x [m]", ylabel="y [m]", zlabel="z [m]", title="In space")
-        space.tick_params(labelsize=7)
-        above.set(xlabel="x [m]", ylabel="y [m]", title="From above")
-        above.set_aspect("equal", adjustable="datalim")
-        figure.legend(loc="outside lower center", ncols=3 + len(shown))
+        figure = Figure(figsize=(9.0, 5.0))
+        for column, (elevation, azimuth) in enumerate(((22, -128), (62, -100)), start=1):
+            space: Any = figure.add_subplot(1, 2, column, projection="3d")
+            for index, (episode, cameras) in enumerate(zip(shown, frusta, strict=True)):
+                x, y, z = episode.viewpoints[:, :3].T
+                label = f"episode {index + 1}: {episode.steps} steps, " + (
+                    "solved" if episode.success else "not solved"
+                )
+                space.plot(
+                    x,
+                    y,
+                    z,
+                    color=seed_colour(index),
+                    linewidth=1.4,
+                    marker="o",
+                    markersize=2.5,
+                    label=label,
+                )
+                for camera, opacity in zip(cameras, camera_opacities(len(cameras)), strict=True):
+                    space.add_collection3d(
+                        Poly3DCollection(
+                            frustum_faces(camera),
+                            facecolors=seed_colour(index),
+                            edgecolors=seed_colour(index),
+                            linewidths=0.7,
+                            alpha=opacity,
+                        )
+                    )
+            space.scatter(*targets.T, s=70, color=TOMATO, label="target")
+            space.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), zlim=(low[2], high[2]))
+            space.set_box_aspect(high - low, zoom=0.9)
+            space.view_init(elevation, azimuth)
+            space.set(xlabel="x [m]", ylabel="y [m]", zlabel="z [m]")
+            space.tick_params(labelsize=7)
+        handles, labels = figure.axes[0].get_legend_handles_labels()
+        plot_title(figure, title)
+        figure.legend(handles, labels, loc="outside lower center", ncols=len(labels))
         figure.savefig(path)
 
 
-def viewing_direction(viewpoints: NDArray[np.float64]) -> NDArray[np.float64]:
-    """The tool's z axis in the world frame: the third column of Rz(yaw) Ry(pitch) Rx(roll).
+def marked_views(episode: EpisodeRecord) -> list[int]:
+    """The first, the middle and the last view of an episode, each once."""
+    return sorted({0, episode.steps // 2, episode.steps})
+
+
+def camera_opacities(count: int) -> list[float]:
+    """Opacities of the cameras of `marked_views`: opaque first, transparent middle, half-transparent last."""
+    return [0.75, 0.12, 0.4] if count == 3 else [0.75, 0.4][:count]
+
+
+def frustum_points(viewpoint: NDArray[np.float64], depth: float) -> NDArray[np.float64]:
+    """Apex and base of the colour camera's viewing pyramid in the world frame, in [m].
 
     Args:
-        viewpoints: x, y, z [m], roll, pitch, yaw [rad]. Shape (N, 6).
+        viewpoint: End-effector x, y, z [m], roll, pitch, yaw [rad], world frame. Shape (6,).
+        depth: Distance of the base from the camera, in [m].
 
     Returns:
-        Unit vectors. Shape (N, 3).
+        The optical centre, then the corners of the 640 x 480 picture: top left, top right, bottom right,
+        bottom left. Shape (5, 3).
     """
-    roll, pitch, yaw = viewpoints[:, 3:].T
-    return np.stack(
-        (
-            np.cos(yaw) * np.sin(pitch) * np.cos(roll) + np.sin(yaw) * np.sin(roll),
-            np.sin(yaw) * np.sin(pitch) * np.cos(roll) - np.cos(yaw) * np.sin(roll),
-            np.cos(pitch) * np.cos(roll),
-        ),
-        axis=-1,
-    )
+    camera = color_intrinsics()
+    w, h = float(camera.width), float(camera.height)
+    corners = camera.ray_directions([(0.0, 0.0), (w, 0.0), (w, h), (0.0, h)]) * depth
+    points = np.concatenate([np.zeros((1, 3)), corners])
+    T_world_ee = viewpoint_transform(torch.as_tensor(viewpoint, dtype=torch.float64)[None])[0].numpy()
+    T_world_optical = T_world_ee @ np.asarray(T_flange_camera_color_optical)
+    world: NDArray[np.float64] = points @ T_world_optical[:3, :3].T + T_world_optical[:3, 3]
+    return world
 
 
-def _draw_trajectory(space: Any, above: Axes, episode: EpisodeRecord, colour: str) -> None:
-    """One way in both pictures; the first, middle and last pose get arrows, later ones stronger."""
-    positions = episode.viewpoints[:, :3]
-    x, y, z = positions.T
-    space.plot(x, y, z, color=colour, linewidth=1.5, label=f"seed {episode.seed}")
-    space.scatter(x, y, z, s=9, color=colour)
-    above.plot(x, y, color=colour, linewidth=1.5, marker="o", markersize=3)
-    marked = sorted({0, episode.steps // 2, episode.steps})
-    directions = viewing_direction(episode.viewpoints)
-    for pose, opacity in zip(marked, np.linspace(0.45, 1.0, len(marked)), strict=True):
-        looks = {"color": colour, "alpha": float(opacity)}
-        space.quiver(
-            *positions[pose],
-            *directions[pose],
-            length=ARROW_LENGTH,
-            linewidth=2.0,
-            arrow_length_ratio=0.35,
-            **looks,
-        )
-        tip = positions[pose] + ARROW_LENGTH * directions[pose]
-        above.annotate(
-            "",
-            (tip[0], tip[1]),
-            (x[pose], y[pose]),
-            arrowprops={"arrowstyle": "-|>", "linewidth": 1.8, "shrinkA": 0, "shrinkB": 0, **looks},
-        )
+def frustum_faces(points: NDArray[np.float64]) -> list[NDArray[np.float64]]:
+    """The four sides and the base of `frustum_points` as polygons, each of shape (3 or 4, 3)."""
+    apex, corners = points[0], points[1:]
+    sides = [np.stack((apex, corners[i], corners[(i + 1) % 4])) for i in range(4)]
+    return [*sides, corners]
+
+
+def plot_title(figure: Figure, title: str) -> None:
+    """What all panels of a figure show, above them."""
+    figure.suptitle(title[0].upper() + title[1:], fontsize=11, color=INK, x=0.01, ha="left")
 
 
 def _outcome_legend(axes: Axes) -> None:

@@ -12,7 +12,7 @@ import gymnasium as gym
 from maniskill_tomato.errors import InvalidInputError
 from maniskill_tomato.experiments.episode_record import EpisodeRecord
 from maniskill_tomato.experiments.result_store import ResultStore, fingerprint
-from maniskill_tomato.experiments.rollout import run_episode
+from maniskill_tomato.experiments.rollout import open_widest, run_listed
 from maniskill_tomato.learning.rl.envs import make_env
 from maniskill_tomato.policies.opening import find_policy, open_policy
 from maniskill_tomato.policies.protocol import Policy
@@ -96,12 +96,14 @@ class Condition:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Block:
+class EpisodeBlock:
     """Some episodes under one condition, for a process to run by itself."""
 
     condition: Condition
     missing: tuple[tuple[PolicySpec, tuple[int, ...]], ...]
     """The episodes that each policy still has to run."""
+    num_envs: int = 1
+    """Environments stepped at once."""
 
     @property
     def episodes(self) -> int:
@@ -112,17 +114,19 @@ def run_policies(
     store: ResultStore,
     plan: Sequence[tuple[Condition, Sequence[PolicySpec], range]],
     processes: int,
+    num_envs: int = 1,
 ) -> None:
     """Runs all episodes that the store does not have yet.
 
-    Stopped at any time, a second call goes on; at most `BLOCK` episodes of each process are run again.
+    Stopped at any time, a second call goes on; at most one block of each process is run again.
 
     Args:
         store: Where the episodes go: the condition's name is the part, the policy's label the name.
         plan: Policies and numbers of episodes under each condition.
         processes: How many at a time.
+        num_envs: Environments that each steps at once.
     """
-    blocks = [block for part in plan for block in _missing_blocks(store, *part)]
+    blocks = [block for part in plan for block in _missing_blocks(store, *part, num_envs)]
     total = sum(block.episodes for block in blocks)
     if not total:
         return
@@ -138,15 +142,11 @@ def run_policies(
             logger.info("%d of %d episodes, about %.0f minutes left", done, total, left / 60.0)
 
 
-def run_block(block: Block) -> dict[str, list[EpisodeRecord]]:
+def run_block(block: EpisodeBlock) -> dict[str, list[EpisodeRecord]]:
     """Runs some episodes with some policies, in whatever process this is; the episodes by policy."""
-    env = _environment(block.condition)
     oracle = known_moves(block.condition.episode_list)
     return {
-        spec.label: [
-            run_episode(env, _policy(spec, env, block.condition), number, oracle_moves=oracle(number))
-            for number in numbers
-        ]
+        spec.label: run_listed(*_opened(spec, block.condition, block.num_envs), numbers, oracle)
         for spec, numbers in block.missing
     }
 
@@ -178,36 +178,39 @@ def known_moves(episode_list: str | None) -> Callable[[int], int | None]:
 
 
 def _missing_blocks(
-    store: ResultStore, condition: Condition, specs: Sequence[PolicySpec], numbers: range
-) -> list[Block]:
+    store: ResultStore, condition: Condition, specs: Sequence[PolicySpec], numbers: range, num_envs: int
+) -> list[EpisodeBlock]:
     missing = {spec: set(store.missing(condition.name, spec.label, numbers)) for spec in specs}
-    blocks = []
-    for first in range(numbers.start, numbers.stop, BLOCK):
-        some = range(first, min(first + BLOCK, numbers.stop))
+    blocks, size = [], max(BLOCK, num_envs)
+    for first in range(numbers.start, numbers.stop, size):
+        some = range(first, min(first + size, numbers.stop))
         wanted = tuple((spec, tuple(n for n in some if n in missing[spec])) for spec in specs)
-        if any(left for _, left in wanted):
-            blocks.append(Block(condition=condition, missing=tuple(part for part in wanted if part[1])))
+        if any(missing_here for _, missing_here in wanted):
+            left = tuple(part for part in wanted if part[1])
+            blocks.append(EpisodeBlock(condition=condition, missing=left, num_envs=num_envs))
     return blocks
 
 
 _kept: dict[str, Any] = {}
-"""The environment of this process and its policies; a new condition replaces them."""
+"""The environments of this process and its policies; a new condition replaces them."""
 
 
-def _environment(condition: Condition) -> gym.Env[Any, Any]:
+def _opened(spec: PolicySpec, condition: Condition, num_envs: int) -> tuple[gym.Env[Any, Any], Policy]:
+    """A policy with environments for it."""
     key = repr((condition.env_id, sorted(condition.env_options.items(), key=str)))
     if _kept.get("key") != key:
-        if "env" in _kept:
-            _kept["env"].close()
-        _kept.clear()
-        _kept.update(key=key, env=make_env(condition.env_id, **condition.env_options), policies={})
-    env: gym.Env[Any, Any] = _kept["env"]
-    return env
+        for env in _kept.get("envs", {}).values():
+            env.close()
+        _kept.update(key=key, envs={}, policies={})
+    envs: dict[int, gym.Env[Any, Any]] = _kept["envs"]
+    policies: dict[Any, tuple[gym.Env[Any, Any], Policy]] = _kept["policies"]
 
+    def make(count: int) -> tuple[gym.Env[Any, Any], Policy]:
+        if count not in envs:
+            envs[count] = make_env(condition.env_id, count, **condition.env_options)
+        return envs[count], open_for(spec, envs[count], condition.contact_free)
 
-def _policy(spec: PolicySpec, env: gym.Env[Any, Any], condition: Condition) -> Policy:
-    policies: dict[Any, Policy] = _kept["policies"]
-    key = (spec, condition.contact_free)
-    if key not in policies:
-        policies[key] = open_for(spec, env, condition.contact_free)
-    return policies[key]
+    which = (spec, condition.contact_free, num_envs)
+    if which not in policies:
+        policies[which] = open_widest(make, num_envs)
+    return policies[which]

@@ -12,11 +12,10 @@ from torch import Tensor
 
 from maniskill_tomato.experiments import thesis_figures
 from maniskill_tomato.experiments.configs import ReproductionConfig
-from maniskill_tomato.experiments.metrics import write_json
 from maniskill_tomato.experiments.statistics import mean_interval
 from maniskill_tomato.experiments.training_study import SATURATED, Trial, run_trials
 from maniskill_tomato.experiments.variants import Experiment, Variant, experiments, find_variant, variants_of
-from maniskill_tomato.files import write_atomically
+from maniskill_tomato.files import write_atomically, write_json
 from maniskill_tomato.learning.rl.agent import make_actor, make_normalizer
 from maniskill_tomato.learning.rl.envs import make_env
 from maniskill_tomato.learning.rl.presets import TrainConfig

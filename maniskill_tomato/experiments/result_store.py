@@ -15,7 +15,7 @@ from typing import Any
 
 from maniskill_tomato.errors import InvalidInputError
 from maniskill_tomato.experiments.episode_record import EpisodeRecord
-from maniskill_tomato.files import write_atomically
+from maniskill_tomato.files import write_json
 
 logger = logging.getLogger(__name__)
 
@@ -55,7 +55,7 @@ class ResultStore:
                     "--out, or delete it"
                 )
         content = {"settings": wanted, "members": {**known, **(members or {})}}
-        write_atomically(path, (json.dumps(content, indent=2) + "\n").encode())
+        write_json(path, content)
 
     def read(self, part: str, name: str) -> dict[int, dict[str, Any]]:
         """The results by their numbers, in order."""

@@ -2,7 +2,7 @@
 
 import sys
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any, Protocol
 
 import gymnasium as gym
@@ -13,7 +13,8 @@ from tqdm import tqdm
 from maniskill_tomato.errors import InvalidInputError
 from maniskill_tomato.experiments.episode_record import EpisodeRecord, Float64, RowSearch
 from maniskill_tomato.policies.adapters import as_state_policy
-from maniskill_tomato.policies.protocol import Policy, StatePolicy
+from maniskill_tomato.policies.opening import RANDOM
+from maniskill_tomato.policies.protocol import Policy, RandomPlanner, StatePolicy, reseed
 
 
 class Watcher(Protocol):
@@ -70,6 +71,41 @@ def run_episodes(
     return done
 
 
+def open_widest(
+    make: Callable[[int], tuple[gym.Env[Any, Any], Policy]], num_envs: int
+) -> tuple[gym.Env[Any, Any], Policy]:
+    """Environments with their policy: `num_envs` of them, or one for a policy that draws random numbers.
+
+    Such a policy draws in the order of its decisions, so that other episodes would come of several environments.
+
+    Args:
+        make: Makes a number of environments and opens the policy for them.
+        num_envs: How many are wanted.
+    """
+    env, policy = make(num_envs)
+    draws = isinstance(policy, RandomPlanner) or policy.name == RANDOM
+    return make(1) if draws and num_envs > 1 else (env, policy)
+
+
+def run_listed(
+    env: gym.Env[Any, Any],
+    policy: Policy | StatePolicy,
+    seeds: Sequence[int],
+    oracle_moves: Callable[[int], int | None] = lambda seed: None,
+) -> list[EpisodeRecord]:
+    """Runs episodes of any seeds, as many at once as there are environments; see `run_episode`."""
+    num_envs = int(getattr(env.unwrapped, "num_envs", 1))
+    if num_envs == 1:
+        return [run_episode(env, policy, seed, oracle_moves=oracle_moves(seed)) for seed in seeds]
+    done: list[EpisodeRecord] = []
+    for first in range(0, len(seeds), num_envs):
+        batch = list(seeds[first : first + num_envs])
+        filled = batch + batch[-1:] * (num_envs - len(batch))
+        moves = [oracle_moves(seed) for seed in filled]
+        done += run_batch(env, policy, filled, oracle_moves=moves)[: len(batch)]
+    return done
+
+
 def run_episode(
     env: gym.Env[Any, Any],
     policy: Policy | StatePolicy,
@@ -95,9 +131,7 @@ def run_episode(
         raise InvalidInputError(
             f"episodes are run one at a time; make the environment with num_envs=1, not {num_envs}"
         )
-    reseed = getattr(policy, "reseed", None)
-    if reseed is not None:
-        reseed(seed)
+    reseed(policy, seed)
     (record,) = run_batch(env, policy, [seed], oracle_moves=[oracle_moves], watcher=watcher)
     return record
 

@@ -11,11 +11,10 @@ import maniskill_tomato
 from maniskill_tomato.errors import InvalidInputError
 from maniskill_tomato.experiments.configs import RowBenchmarkConfig
 from maniskill_tomato.experiments.episode_record import EpisodeRecord, RowSearch
-from maniskill_tomato.experiments.metrics import write_json
 from maniskill_tomato.experiments.policy_runs import Condition, parse_policies, run_policies
 from maniskill_tomato.experiments.result_store import ResultStore
 from maniskill_tomato.experiments.statistics import mean_interval, sign_flip_p
-from maniskill_tomato.files import write_atomically
+from maniskill_tomato.files import write_atomically, write_json
 from maniskill_tomato.learning.rl.envs import make_env
 from maniskill_tomato.policies.oracle import FARTHEST, SHOULDER, shell_points
 from maniskill_tomato.report_design import markdown_table

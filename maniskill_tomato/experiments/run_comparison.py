@@ -18,7 +18,6 @@ import maniskill_tomato
 from maniskill_tomato.errors import InvalidInputError
 from maniskill_tomato.experiments.configs import RunComparisonConfig
 from maniskill_tomato.experiments.evaluation import evaluate_run
-from maniskill_tomato.experiments.metrics import write_json
 from maniskill_tomato.experiments.statistics import (
     Interval,
     interquartile_band,
@@ -27,7 +26,7 @@ from maniskill_tomato.experiments.statistics import (
     interval_text,
 )
 from maniskill_tomato.experiments.training_runs import Float64, Run, find_runs, load_run
-from maniskill_tomato.files import write_atomically
+from maniskill_tomato.files import write_atomically, write_json
 from maniskill_tomato.learning.rl.presets import PRESETS, TrainConfig, modernise
 from maniskill_tomato.report_design import (
     MUTED,

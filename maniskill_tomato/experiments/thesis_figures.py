@@ -2,23 +2,25 @@
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
 
 import imageio.v2 as imageio
 import matplotlib as mpl
 import numpy as np
-import torch
 from matplotlib.axes import Axes
 from matplotlib.collections import PolyCollection
 from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 from matplotlib.ticker import MaxNLocator
-from mpl_toolkits.mplot3d.art3d import Poly3DCollection  # type: ignore[import-untyped]
 from numpy.typing import NDArray
 
 from maniskill_tomato.errors import InvalidInputError
 from maniskill_tomato.experiments.episode_record import EpisodeRecord
-from maniskill_tomato.experiments.plots import plot_training_curves, seed_colour
+from maniskill_tomato.experiments.plots import (
+    plot_title,
+    plot_training_curves,
+    plot_trajectories,
+    seed_colour,
+)
 from maniskill_tomato.experiments.training_study import Trial
 from maniskill_tomato.experiments.variants import Experiment
 from maniskill_tomato.learning.rl.envs import make_env
@@ -27,9 +29,7 @@ from maniskill_tomato.plants.organs import SemanticClass
 from maniskill_tomato.plants.spec import PlantPose, PlantSpec
 from maniskill_tomato.rendering import vulkan_probe
 from maniskill_tomato.report_design import INK, MUTED, PLOT_STYLE, TOMATO
-from maniskill_tomato.robot.d435 import T_flange_camera_color_optical, color_intrinsics
-from maniskill_tomato.robot.kinematics import viewpoint_transform
-from maniskill_tomato.tasks.planting import grow
+from maniskill_tomato.tasks.plant_batch import grow
 from maniskill_tomato.tasks.thesis.thesis_config import ViewpointTaskConfig, guided_task, sparse_task
 
 THESIS_EPISODES = 6
@@ -42,11 +42,6 @@ PLANT_COLOURS = {
     SemanticClass.LEAF: "#5f9a62",
     SemanticClass.FRUIT_RIPE: TOMATO,
 }
-
-FRUSTUM_DEPTH = 0.11
-"""Length of a drawn camera, in [m]."""
-
-SHOWN_TRAJECTORIES = 3
 
 
 def draw_all(experiment: Experiment, trials: Sequence[Trial], folder: Path) -> list[Path]:
@@ -72,7 +67,7 @@ def draw_all(experiment: Experiment, trials: Sequence[Trial], folder: Path) -> l
         plot_evaluation(runs, _task(experiment).full_visibility, evaluation.title, files[-1])
         best = most_successful(runs)
         files.append(folder / f"trajectories_{evaluation.name}.png")
-        plot_camera_ways(runs[best], f"{evaluation.title}, training seed {best}", files[-1])
+        plot_trajectories(runs[best], f"{evaluation.title}, training seed {best}", files[-1])
     return files
 
 
@@ -161,79 +156,9 @@ def plot_evaluation(
         grid[0][0].set_title(f"First {THESIS_EPISODES} episodes (filled: solved)")
         grid[0][1].set_title(f"All {count} episodes")
         handles, labels = grid[0][1].get_legend_handles_labels()
-        figure.suptitle(title[0].upper() + title[1:], fontsize=11, color=INK, x=0.01, ha="left")
+        plot_title(figure, title)
         figure.legend(handles, labels, loc="outside lower center", ncols=min(len(labels), 3))
         figure.savefig(path)
-
-
-def plot_camera_ways(episodes: Sequence[EpisodeRecord], title: str, path: Path) -> None:
-    """Ways of the end-effector with the camera at the first, middle and last pose (Fig. 5-8).
-
-    As in the thesis the first camera is opaque, the middle one transparent and the last one between.
-
-    Args:
-        episodes: The first three of them are drawn.
-        title: What they are.
-        path: The picture to write.
-    """
-    shown = list(episodes[:SHOWN_TRAJECTORIES])
-    if not shown:
-        raise InvalidInputError("a figure of trajectories needs at least one episode")
-    frusta = [[frustum_points(v, FRUSTUM_DEPTH) for v in e.viewpoints[marked_views(e)]] for e in shown]
-    targets = np.stack([e.target[0] for e in shown])
-    points = np.concatenate(
-        [targets, *(e.viewpoints[:, :3] for e in shown), *(f for cameras in frusta for f in cameras)]
-    )
-    low, high = points.min(axis=0) - 0.05, points.max(axis=0) + 0.05
-    with mpl.rc_context(PLOT_STYLE):
-        figure = Figure(figsize=(9.0, 5.0))
-        for column, (elevation, azimuth) in enumerate(((22, -128), (62, -100)), start=1):
-            space: Any = figure.add_subplot(1, 2, column, projection="3d")
-            for index, (episode, cameras) in enumerate(zip(shown, frusta, strict=True)):
-                x, y, z = episode.viewpoints[:, :3].T
-                label = f"episode {index + 1}: {episode.steps} steps, " + (
-                    "solved" if episode.success else "not solved"
-                )
-                space.plot(
-                    x,
-                    y,
-                    z,
-                    color=seed_colour(index),
-                    linewidth=1.4,
-                    marker="o",
-                    markersize=2.5,
-                    label=label,
-                )
-                for camera, opacity in zip(cameras, camera_opacities(len(cameras)), strict=True):
-                    space.add_collection3d(
-                        Poly3DCollection(
-                            frustum_faces(camera),
-                            facecolors=seed_colour(index),
-                            edgecolors=seed_colour(index),
-                            linewidths=0.7,
-                            alpha=opacity,
-                        )
-                    )
-            space.scatter(*targets.T, s=70, color=TOMATO, label="target")
-            space.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), zlim=(low[2], high[2]))
-            space.set_box_aspect(high - low, zoom=0.9)
-            space.view_init(elevation, azimuth)
-            space.set(xlabel="x [m]", ylabel="y [m]", zlabel="z [m]")
-            space.tick_params(labelsize=7)
-        handles, labels = figure.axes[0].get_legend_handles_labels()
-        figure.suptitle(title[0].upper() + title[1:], fontsize=11, color=INK, x=0.01, ha="left")
-        figure.legend(handles, labels, loc="outside lower center", ncols=len(labels))
-        figure.savefig(path)
-
-
-def marked_views(episode: EpisodeRecord) -> list[int]:
-    """The first, the middle and the last view of an episode, each once."""
-    return sorted({0, episode.steps // 2, episode.steps})
-
-
-def camera_opacities(count: int) -> list[float]:
-    """Opacities of the cameras of `marked_views`: opaque first, transparent middle, half-transparent last."""
-    return [0.75, 0.12, 0.4] if count == 3 else [0.75, 0.4][:count]
 
 
 def plot_plant_positions(experiment: Experiment, path: Path) -> None:
@@ -302,34 +227,6 @@ def _thesis_marks(experiment: Experiment, unit: str) -> dict[str, float]:
     if experiment.exploration_ends is not None:
         marks["thesis:\nexploration over"] = experiment.exploration_ends[0 if unit == "episode" else 1]
     return marks
-
-
-def frustum_points(viewpoint: NDArray[np.float64], depth: float) -> NDArray[np.float64]:
-    """Apex and base of the colour camera's viewing pyramid in the world frame, in [m].
-
-    Args:
-        viewpoint: End-effector x, y, z [m], roll, pitch, yaw [rad], world frame. Shape (6,).
-        depth: Distance of the base from the camera, in [m].
-
-    Returns:
-        The optical centre, then the corners of the 640 x 480 picture: top left, top right, bottom right,
-        bottom left. Shape (5, 3).
-    """
-    camera = color_intrinsics()
-    w, h = float(camera.width), float(camera.height)
-    corners = camera.ray_directions([(0.0, 0.0), (w, 0.0), (w, h), (0.0, h)]) * depth
-    points = np.concatenate([np.zeros((1, 3)), corners])
-    T_world_ee = viewpoint_transform(torch.as_tensor(viewpoint, dtype=torch.float64)[None])[0].numpy()
-    T_world_optical = T_world_ee @ np.asarray(T_flange_camera_color_optical)
-    world: NDArray[np.float64] = points @ T_world_optical[:3, :3].T + T_world_optical[:3, 3]
-    return world
-
-
-def frustum_faces(points: NDArray[np.float64]) -> list[NDArray[np.float64]]:
-    """The four sides and the base of `frustum_points` as polygons, each of shape (3 or 4, 3)."""
-    apex, corners = points[0], points[1:]
-    sides = [np.stack((apex, corners[i], corners[(i + 1) % 4])) for i in range(4)]
-    return [*sides, corners]
 
 
 def _task(experiment: Experiment) -> ViewpointTaskConfig:

@@ -5,25 +5,25 @@ import time
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
-import gymnasium as gym
 import numpy as np
 import torch
 from torch import Tensor
 
 from maniskill_tomato.errors import SeedsFailedError, TomatoError
 from maniskill_tomato.experiments.episode_record import EpisodeRecord
-from maniskill_tomato.experiments.metrics import make_metrics, summarise, totals, write_json
+from maniskill_tomato.experiments.metrics import make_metrics, summarise, totals
+from maniskill_tomato.experiments.plots import moving_average
 from maniskill_tomato.experiments.result_store import ResultStore
 from maniskill_tomato.experiments.rollout import run_episode
 from maniskill_tomato.experiments.variants import Evaluation, Variant
+from maniskill_tomato.files import write_json
 from maniskill_tomato.learning.rl.envs import LearnerEnv, make_env
 from maniskill_tomato.learning.rl.history import TrainingCurves, load_history
 from maniskill_tomato.learning.rl.presets import TrainConfig
-from maniskill_tomato.learning.rl.run import make_training_env
 from maniskill_tomato.learning.rl.run_folder import clear_run
-from maniskill_tomato.learning.rl.trainer import Trainer
+from maniskill_tomato.learning.rl.trainer import Trainer, make_training_env
 from maniskill_tomato.policies.trained_actor import TrainedActor, load_actor
 from maniskill_tomato.robot.inverse_kinematics import Reach
 from maniskill_tomato.tasks import THESIS_IDS
@@ -57,20 +57,11 @@ class ReachCounter:
 
     def __init__(self, env: LearnerEnv) -> None:
         self._env = env
-        self.num_envs = env.num_envs
         self.counts = np.zeros(len(Reach), dtype=np.int64)
         """Steps per value of `Reach`. Shape (3,)."""
 
-    @property
-    def single_observation_space(self) -> gym.Space[Any]:
-        return self._env.single_observation_space
-
-    @property
-    def single_action_space(self) -> gym.Space[Any]:
-        return self._env.single_action_space
-
-    def reset(self, *, seed: int | list[int] | None = None) -> tuple[Tensor, dict[str, Any]]:
-        return self._env.reset(seed=seed)
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._env, name)
 
     def step(self, actions: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor, dict[str, Any]]:
         outcome = self._env.step(actions)
@@ -78,9 +69,6 @@ class ReachCounter:
         reached = info.get("final_info", info)["reachability"]
         self.counts += np.bincount(reached.cpu().numpy(), minlength=len(Reach))
         return outcome
-
-    def close(self) -> None:
-        self._env.close()
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -185,7 +173,8 @@ class Trial:
         """Trains, and gives the figures of the training."""
         clear_run(self.folder)
         logger.info("training %s on %s, seed %d", self.variant.name, self.env_id, self.seed)
-        env = ReachCounter(make_training_env(self.env_id, self.config, {}))
+        counter = ReachCounter(make_training_env(self.env_id, self.config, {}))
+        env = cast(LearnerEnv, counter)
         try:
             trainer = Trainer(env, self.env_id, self.config, self.folder, self.seed, self.show_progress)
             before = time.process_time()
@@ -205,7 +194,7 @@ class Trial:
             "cpu_seconds": round(cpu_seconds, 2),
             "success_rate": float(success.mean()),
             "success_rate_last": float(success[-LAST_EPISODES:].mean()),
-            "unreachable_step_share": float(env.counts[Reach.UNREACHABLE] / env.counts.sum()),
+            "unreachable_step_share": float(counter.counts[Reach.UNREACHABLE] / counter.counts.sum()),
             "steps_to_solved": steps_to_solved(history, self.config.learning_starts),
         }
 
@@ -252,9 +241,7 @@ def steps_to_solved(history: TrainingCurves, learning_starts: int) -> int | None
     success, ends = history.episodes["success"][learned], history.episodes["end_step"][learned]
     if len(success) < WINDOW:
         return None
-    sums = np.concatenate(([0.0], np.cumsum(success)))
-    shares = (sums[WINDOW:] - sums[:-WINDOW]) / WINDOW
-    solved = np.flatnonzero(shares >= SOLVED - 1e-9)
+    solved = np.flatnonzero(moving_average(success, WINDOW) >= SOLVED - 1e-9)
     return int(ends[solved[0] + WINDOW - 1]) if len(solved) else None
 
 

@@ -9,16 +9,16 @@ from typing import Any
 import numpy as np
 
 import maniskill_tomato
-from maniskill_tomato.deploy.policies import TASK, default_policy
+from maniskill_tomato.deploy.loop import TASK, default_policy
 from maniskill_tomato.deploy.policy_run import RunConfig, run
 from maniskill_tomato.deploy.profile import Profile, load_profile
 from maniskill_tomato.errors import TomatoError
 from maniskill_tomato.experiments.configs import TwinConfig
-from maniskill_tomato.experiments.metrics import write_json
 from maniskill_tomato.experiments.result_store import ResultStore
 from maniskill_tomato.experiments.rollout import run_episode
 from maniskill_tomato.experiments.statistics import mcnemar_p, wilson_interval
 from maniskill_tomato.experiments.viewpoint_benchmark import MAIN
+from maniskill_tomato.files import write_json
 from maniskill_tomato.learning.rl.envs import make_env
 from maniskill_tomato.policies.opening import open_policy
 

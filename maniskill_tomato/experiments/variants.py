@@ -10,6 +10,7 @@ from typing import Any
 from maniskill_tomato.errors import InvalidInputError
 from maniskill_tomato.experiments.configs import ExperimentName
 from maniskill_tomato.learning.rl.presets import PRESETS, TrainConfig, get_preset
+from maniskill_tomato.tables import read_table
 from maniskill_tomato.tasks import THESIS_IDS
 
 TOGETHER = "+"
@@ -96,8 +97,7 @@ def experiments() -> dict[ExperimentName, Experiment]:
     """The thesis's two."""
     found: dict[ExperimentName, Experiment] = {}
     for name, values in _read("thesis_variants.toml")["experiment"].items():
-        evaluations = tuple(Evaluation(**one) for one in values.pop("evaluation"))
-        found[name] = Experiment(name=name, evaluations=evaluations, **_tuples(values))
+        found[name] = read_table(Experiment, {"name": name, **values}, f"experiment.{name}")
     return found
 
 
@@ -158,16 +158,8 @@ def _read(name: str) -> dict[str, Any]:
 
 def _variants(content: dict[str, Any]) -> tuple[Variant, ...]:
     td3 = PRESETS["td3"]
-    return tuple(
-        Variant(
-            **{
-                "changes": {name: getattr(td3, name) for name in values.pop("of_td3", ())},
-                **_tuples(values),
-            }
-        )
-        for values in content["variant"]
-    )
-
-
-def _tuples(values: dict[str, Any]) -> dict[str, Any]:
-    return {name: tuple(value) if isinstance(value, list) else value for name, value in values.items()}
+    found = []
+    for values in content["variant"]:
+        of_td3 = {"changes": {name: getattr(td3, name) for name in values.pop("of_td3", ())}}
+        found.append(read_table(Variant, {**of_td3, **values}, f"variant {values['name']!r}"))
+    return tuple(found)

@@ -75,7 +75,7 @@ def run_benchmark(config: BenchmarkConfig) -> BenchmarkResult:
     few = range(config.seed, config.seed + config.sweep_episodes)
     plan = [(main, specs, numbers), *((condition, sweep_specs, few) for condition in swept)]
     processes = config.jobs or len(os.sched_getaffinity(0))
-    run_policies(store, plan, processes)
+    run_policies(store, plan, processes, config.num_envs)
     runs = {
         condition.name: {spec.label: store.episodes(condition.name, spec.label, n) for spec in some}
         for condition, some, n in plan

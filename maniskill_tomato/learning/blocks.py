@@ -1,18 +1,16 @@
 """A training's folder: its settings, and data made in blocks by several processes, each block in a file of its own,
 so that what is there is not made again."""
 
-import io
 import json
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import torch
 from torch import Tensor
 
 from maniskill_tomato.errors import InvalidInputError
-from maniskill_tomato.files import read_tensors, write_atomically
+from maniskill_tomato.files import read_tensors, write_json, write_tensors
 from maniskill_tomato.worker_pool import run_jobs
 
 
@@ -53,9 +51,7 @@ def run_blocks(blocks: Sequence[Block], jobs: int, report: Callable[[str], None]
 
 def _make(block: Block) -> int:
     data = block.make(*block.arguments)
-    buffer = io.BytesIO()
-    torch.save(data, buffer)
-    write_atomically(block.path, buffer.getvalue())
+    write_tensors(block.path, data)
     return max(len(rows) for rows in data.values())
 
 
@@ -69,4 +65,4 @@ def begin_training(out: Path, settings: dict[str, Any]) -> None:
     described = out / "config.json"
     if described.is_file() and json.loads(described.read_text()) != settings:
         raise InvalidInputError(f"{out} holds a training with other settings; choose another folder")
-    write_atomically(described, json.dumps(settings, indent=2).encode())
+    write_json(described, settings)

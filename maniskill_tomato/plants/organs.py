@@ -4,6 +4,7 @@ Plant frame: origin where the stem leaves the ground, z up, metres, right-handed
 robot stands at -x.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import IntEnum
 from functools import cached_property
@@ -64,10 +65,13 @@ class Organ:
     @cached_property
     def faces(self) -> Int32:
         """All triangles, indices into `vertices`. Shape (F, 3)."""
-        offsets = np.cumsum([0] + [len(part.vertices) for part in self.parts[:-1]])
-        return np.concatenate([part.faces + o for part, o in zip(self.parts, offsets, strict=True)]).astype(
-            np.int32
-        )
+        return joined_faces(self.parts)
+
+
+def joined_faces(meshes: Sequence[MeshPart | Organ]) -> Int32:
+    """The triangles of meshes whose vertices are put one after another. Shape (F, 3)."""
+    offsets = np.cumsum([0] + [len(mesh.vertices) for mesh in meshes[:-1]])
+    return np.concatenate([m.faces + k for m, k in zip(meshes, offsets, strict=True)]).astype(np.int32)
 
 
 @dataclass(frozen=True, eq=False)
@@ -101,10 +105,7 @@ class Plant:
     @cached_property
     def faces(self) -> Int32:
         """All triangles, indices into `vertices`. Shape (F, 3)."""
-        offsets = np.cumsum([0] + [len(organ.vertices) for organ in self.organs[:-1]])
-        return np.concatenate([o.faces + k for o, k in zip(self.organs, offsets, strict=True)]).astype(
-            np.int32
-        )
+        return joined_faces(self.organs)
 
     @cached_property
     def organ_of_face(self) -> Int32:

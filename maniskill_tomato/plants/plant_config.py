@@ -9,13 +9,30 @@ comparing renders with photos.
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from math import isfinite
 
 from maniskill_tomato.errors import InvalidInputError
-from maniskill_tomato.plants.checks import check_positive, check_ranges
 
 MAX_LEAF_DENSITY = 2.0
+
+
+def check_positive(config: object, *names: str) -> None:
+    """Refuses a config whose named numbers are not positive and finite."""
+    for name in names:
+        value = getattr(config, name)
+        if not (isfinite(value) and value > 0):
+            raise InvalidInputError(f"{type(config).__name__}.{name} must be positive, got {value}")
+
+
+def check_ranges(config: object) -> None:
+    """Refuses every (low, high) pair of a config that is not ascending."""
+    for item in fields(config):  # type: ignore[arg-type]
+        value = getattr(config, item.name)
+        if item.name.endswith("_range") and not (len(value) == 2 and value[0] <= value[1]):
+            raise InvalidInputError(
+                f"{type(config).__name__}.{item.name} must be (low, high) with low <= high, got {value}"
+            )
 
 
 @dataclass(frozen=True, kw_only=True)

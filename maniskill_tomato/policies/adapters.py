@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any
 import torch
 from torch import Tensor
 
-from maniskill_tomato.errors import InvalidInputError, PolicyError
+from maniskill_tomato.errors import PolicyError
 from maniskill_tomato.policies.protocol import Planner, Policy, StatePolicy
 from maniskill_tomato.sensing.belief import Belief
 
@@ -86,23 +86,20 @@ def as_policy(policy: Policy | StatePolicy) -> Policy:
 def as_state_policy(policy: Policy | StatePolicy, env: Any) -> StatePolicy:
     """What a loop that knows observations only can ask in an environment.
 
+    Args:
+        policy: Decides.
+        env: Its `unwrapped` has a `belief` after a reset if it says so by an attribute `keeps_belief`.
+
     Raises:
         PolicyError: The policy needs a belief, which the environment has not.
     """
     if not isinstance(policy, Policy):
         return policy
-    if _tells_belief(env.unwrapped):
+    if getattr(env.unwrapped, "keeps_belief", False):
         return BeliefFollower(policy, env)
     if isinstance(policy, ObservationPolicy):
         return policy.policy
     raise PolicyError(f"{policy.name} decides from beliefs, which this environment does not have")
-
-
-def _tells_belief(world: Any) -> bool:
-    try:
-        return getattr(world, "belief", None) is not None
-    except InvalidInputError:
-        return True  # There will be one after the first reset.
 
 
 def describe(policy: Policy) -> dict[str, Any]:

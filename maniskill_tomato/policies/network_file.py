@@ -1,6 +1,5 @@
 """Files of planners that carry a network: its sizes and weights with settings, as tensors, numbers and text."""
 
-import io
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, TypeVar
@@ -9,7 +8,7 @@ import torch
 from torch import Tensor, nn
 
 from maniskill_tomato.errors import CheckpointError
-from maniskill_tomato.files import read_tensors, write_atomically
+from maniskill_tomato.files import read_tensors, write_tensors
 
 P = TypeVar("P")
 
@@ -29,9 +28,7 @@ def save_network(
     Raises:
         CheckpointError: It cannot be written.
     """
-    buffer = io.BytesIO()
-    torch.save({"format": kind, "sizes": sizes, "weights": weights, **content}, buffer)
-    write_atomically(path, buffer.getvalue())
+    write_tensors(path, {"format": kind, "sizes": sizes, "weights": weights, **content})
 
 
 def load_network(

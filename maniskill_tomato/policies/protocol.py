@@ -121,7 +121,7 @@ class Planner(ABC):
         return {"kind": self.name}
 
 
-def reseed(policy: Policy, seed: int) -> None:
+def reseed(policy: Policy | StatePolicy, seed: int) -> None:
     """Begins the random numbers of a policy anew, if it draws any and says so by a method `reseed`."""
     if (begin_anew := getattr(policy, "reseed", None)) is not None:
         begin_anew(seed)

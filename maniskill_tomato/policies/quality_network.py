@@ -7,7 +7,7 @@ from torch.nn import functional
 from maniskill_tomato.errors import InvalidInputError
 
 
-class _Block(nn.Module):
+class _DirectionBlock(nn.Module):
     """Two convolutions with a residual; the second one also hears the mean over all directions.
 
     The mean carries what one direction says about all others, e.g. how dense the plant is, over any distance
@@ -62,7 +62,7 @@ class ViewQualityNetwork(nn.Module):
         self.sizes = sizes
         self.entry = nn.Conv2d(map_channels, width, 3, padding=1)
         self.entry_scalars = nn.Linear(scalars, width)
-        self.blocks = nn.ModuleList(_Block(width) for _ in range(blocks))
+        self.blocks = nn.ModuleList(_DirectionBlock(width) for _ in range(blocks))
         self.exit = nn.Conv2d(width, 2 * distances, 1)
 
     def forward(self, maps: Tensor, scalars: Tensor) -> tuple[Tensor, Tensor]:

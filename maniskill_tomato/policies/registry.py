@@ -32,7 +32,7 @@ class PolicyContext:
 
 
 @dataclass(frozen=True)
-class Planner:
+class PolicyEntry:
     """A policy of this package that no file is needed for."""
 
     made_by: str
@@ -41,20 +41,20 @@ class Planner:
     """What it is called with."""
 
 
-_PLANNERS: Mapping[str, Planner] = {
-    "stay": Planner("baselines:Stay"),
-    "random_step": Planner("baselines:RandomStep", ("seed",)),
-    "random_viewpoint": Planner("baselines:RandomViewpoint", ("seed",)),
-    "fixed_sweep": Planner("baselines:FixedSweep"),
-    "look_at": Planner("baselines:LookAtServoing"),
-    "3dmts_memory": Planner("move_to_see:MoveToSeeOnMemory", ("device",)),
-    "gradient_nbv": Planner("gradient_view:GradientView", ("device",)),
-    "nbv_direction": Planner("next_best_view:NextBestDirection"),
-    "nbv": Planner("next_best_view:NextBestView"),
-    "3dmts": Planner("move_to_see:MoveToSee", ("ground_truth", "device")),
-    "greedy_truth": Planner("greedy_truth:GreedyTruth", ("ground_truth", "device")),
-    "lattice_oracle": Planner("lattice_oracle:LatticeOracle", ("ground_truth",)),
-    "oracle": Planner("oracle:Oracle.of", ("ground_truth", "device", "contact_free")),
+_PLANNERS: Mapping[str, PolicyEntry] = {
+    "stay": PolicyEntry("baselines:Stay"),
+    "random_step": PolicyEntry("baselines:RandomStep", ("seed",)),
+    "random_viewpoint": PolicyEntry("baselines:RandomViewpoint", ("seed",)),
+    "fixed_sweep": PolicyEntry("baselines:FixedSweep"),
+    "look_at": PolicyEntry("baselines:LookAtServoing"),
+    "3dmts_memory": PolicyEntry("move_to_see:MoveToSeeOnMemory", ("device",)),
+    "gradient_nbv": PolicyEntry("gradient_view:GradientView", ("device",)),
+    "nbv_direction": PolicyEntry("next_best_view:NextBestDirection"),
+    "nbv": PolicyEntry("next_best_view:NextBestView"),
+    "3dmts": PolicyEntry("move_to_see:MoveToSee", ("ground_truth", "device")),
+    "greedy_truth": PolicyEntry("greedy_truth:GreedyTruth", ("ground_truth", "device")),
+    "lattice_oracle": PolicyEntry("lattice_oracle:LatticeOracle", ("ground_truth",)),
+    "oracle": PolicyEntry("oracle:Oracle.of", ("ground_truth", "device", "contact_free")),
 }
 
 SHIPPED_FILES: Final[Mapping[str, str]] = {

@@ -84,7 +84,7 @@ class Views:
 
 
 @wp.struct
-class Camera:
+class FieldOfView:
     """An undistorted pinhole camera by what its image covers, in tangents (x / z, y / z)."""
 
     left: wp.float32

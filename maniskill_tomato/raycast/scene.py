@@ -15,9 +15,9 @@ from torch import Tensor
 from maniskill_tomato.errors import InvalidInputError
 from maniskill_tomato.plants.organs import Plant
 from maniskill_tomato.raycast.images import CastImages, Picture
-from maniskill_tomato.raycast.ray_library import LinkMeshes, RayLibrary
 from maniskill_tomato.raycast.view_rays import ViewRays
 from maniskill_tomato.raycast.visibility import Visibility
+from maniskill_tomato.raycast.warp_meshes import LinkTriangles
 from maniskill_tomato.raycast.warp_scene import WarpScene
 from maniskill_tomato.robot.d435 import CameraIntrinsics
 from maniskill_tomato.robot.iiwa14 import LINK_NAMES, NUM_JOINTS
@@ -38,7 +38,7 @@ class RayScene:
         plants: Sequence[Plant],
         intrinsics: CameraIntrinsics,
         *,
-        robot_meshes: LinkMeshes | None = None,
+        robot_meshes: LinkTriangles | None = None,
         rays_per_side: int = 16,
         cached_plants: int = 64,
         device: str | torch.device = "cpu",
@@ -68,7 +68,7 @@ class RayScene:
         self._intrinsics = intrinsics
         self._device = torch.device(device)
         self._plants = list(plants)
-        self._rays: RayLibrary = WarpScene(
+        self._rays = WarpScene(
             plants, intrinsics, robot_meshes or {}, rays_per_side, cached_plants, self._device
         )
         n = len(plants)

@@ -11,7 +11,7 @@ from maniskill_tomato.raycast.kernels import (
     LINK,
     NEAR,
     NOTHING,
-    Camera,
+    FieldOfView,
     Scene,
     Views,
     first_hit,
@@ -61,7 +61,7 @@ def look_axes(position: wp.vec3, target: wp.vec3) -> wp.mat33:
 def trace_view_rays(
     scene: Scene,
     views: Views,
-    camera: Camera,
+    camera: FieldOfView,
     limits: Limits,
     pattern: wp.array[wp.vec2],
     target_positions: wp.array[wp.vec3],

@@ -14,7 +14,7 @@ import warp as wp
 from maniskill_tomato.raycast.kernels import (
     NEAR,
     SURFACE_GAP,
-    Camera,
+    FieldOfView,
     Scene,
     Views,
     bounding_rectangle,
@@ -47,7 +47,7 @@ class Counts:
 
 
 @wp.kernel
-def trace_target(scene: Scene, views: Views, camera: Camera, pattern: wp.array[wp.vec2], counts: Counts):
+def trace_target(scene: Scene, views: Views, camera: FieldOfView, pattern: wp.array[wp.vec2], counts: Counts):
     """One ray through the target's rectangle: whether it belongs to the silhouette, and whether it is visible."""
     view, ray = wp.tid()
     box = views.rectangles[view]
@@ -68,7 +68,7 @@ def trace_target(scene: Scene, views: Views, camera: Camera, pattern: wp.array[w
 
 
 @wp.kernel
-def trace_others(scene: Scene, views: Views, camera: Camera, pattern: wp.array[wp.vec2], counts: Counts):
+def trace_others(scene: Scene, views: Views, camera: FieldOfView, pattern: wp.array[wp.vec2], counts: Counts):
     """Whether another ripe fruit is seen, asked only where nothing of the target is."""
     view, fruit = wp.tid()
     env = views.environments[view]
@@ -100,7 +100,7 @@ def trace_others(scene: Scene, views: Views, camera: Camera, pattern: wp.array[w
 def summarise(
     scene: Scene,
     views: Views,
-    camera: Camera,
+    camera: FieldOfView,
     rays: float,
     counts: Counts,
     results: wp.array2d[wp.float32],

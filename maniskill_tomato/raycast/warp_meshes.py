@@ -1,14 +1,20 @@
-"""Triangle meshes on a Warp device: one set per plant, shared by every environment that shows it."""
+"""Triangle meshes on a Warp device: the links, and one set per plant, shared by every environment that shows it."""
 
 from collections import OrderedDict
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
+import torch
 import warp as wp
 from numpy.typing import NDArray
 
 from maniskill_tomato.errors import InvalidInputError
 from maniskill_tomato.plants.organs import Plant
+from maniskill_tomato.robot.iiwa14 import LINK_NAMES
+
+LinkTriangles = Mapping[str, tuple[NDArray[Any], NDArray[Any]]]
+"""Vertices in the link frame, in [m], Shape (V, 3), and faces, Shape (F, 3), by link name."""
 
 
 def build_mesh(vertices: NDArray[Any], faces: NDArray[Any], device: str) -> Any:
@@ -63,3 +69,28 @@ class PlantMeshCache:
         else:
             self._entries.move_to_end(key)
         return entry
+
+
+class LinkMeshes:
+    """The links that have triangles."""
+
+    def __init__(self, robot_meshes: LinkTriangles, warp_device: str) -> None:
+        names = [name for name, (_, faces) in robot_meshes.items() if len(faces)]
+        points = [np.asarray(robot_meshes[name][0], dtype=np.float32) for name in names]
+        self.count = len(names)
+        self._meshes = [
+            build_mesh(p, robot_meshes[name][1], warp_device) for name, p in zip(names, points, strict=True)
+        ]
+        self._indices = [LINK_NAMES.index(name) for name in names]
+        self._lows = [p.min(axis=0) for p in points]
+        self._highs = [p.max(axis=0) for p in points]
+
+    def describe(self, scene: Any, device: torch.device) -> None:
+        """Fills the table of links of a `kernels.Scene`."""
+        meshes = torch.tensor([mesh.id for mesh in self._meshes], dtype=torch.int64, device=device)
+        indices = torch.tensor(self._indices, dtype=torch.int32, device=device)
+        scene.link_meshes = wp.from_torch(meshes, dtype=wp.uint64)
+        scene.link_indices = wp.from_torch(indices)
+        for name, corners in (("link_lows", self._lows), ("link_highs", self._highs)):
+            table = torch.tensor(np.array(corners, dtype=np.float32).reshape(-1, 3), device=device)
+            setattr(scene, name, wp.from_torch(table, dtype=wp.vec3))

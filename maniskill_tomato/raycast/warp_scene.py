@@ -1,5 +1,8 @@
 """Rays traced by NVIDIA Warp, on the CPU or on CUDA: the triangles of a `RayScene` and the launches of its queries.
 
+`RayScene` checks shapes and ranges before it asks, and its methods say what the arguments mean. Only tensors pass
+between the two, all on the scene's device, so that another library can stand in Warp's place.
+
 A query copies its arguments into tensors that recorded kernels read in place, runs them in torch's current stream and
 clones what they wrote. Each kind of query is recorded when it is first made.
 """
@@ -30,11 +33,9 @@ from maniskill_tomato.raycast.images import (
     CastImages,
     Picture,
 )
-from maniskill_tomato.raycast.lattice import ray_lattice
-from maniskill_tomato.raycast.ray_library import LinkMeshes
 from maniskill_tomato.raycast.view_rays import NEAREST_DEPTH, RANGE, RAYS_PER_SIDE, ViewRays, ray_pattern
-from maniskill_tomato.raycast.visibility import Visibility
-from maniskill_tomato.raycast.warp_meshes import PlantMeshCache, PlantMeshes, build_mesh
+from maniskill_tomato.raycast.visibility import Visibility, ray_lattice
+from maniskill_tomato.raycast.warp_meshes import LinkMeshes, LinkTriangles, PlantMeshCache, PlantMeshes
 from maniskill_tomato.robot.d435 import CAMERA_FAR, CameraIntrinsics
 from maniskill_tomato.robot.iiwa14 import LINK_NAMES
 from maniskill_tomato.robot.spheres import sphere_table
@@ -50,13 +51,13 @@ _RECORDED_AT_MOST: Final = 16
 
 
 class WarpScene:
-    """A `RayLibrary` on NVIDIA Warp."""
+    """The triangles of N environments and the queries about them; an answer outlives the next query."""
 
     def __init__(
         self,
         plants: Sequence[Plant],
         intrinsics: CameraIntrinsics,
-        robot_meshes: LinkMeshes,
+        robot_meshes: LinkTriangles,
         rays_per_side: int,
         cached_plants: int,
         device: torch.device,
@@ -65,7 +66,7 @@ class WarpScene:
         start_warp()
         self._device = device
         self._warp_device = str(wp.device_from_torch(str(device)))
-        self._camera: Any = kernels.Camera()
+        self._camera: Any = kernels.FieldOfView()
         self._camera.left = -intrinsics.cx / intrinsics.fx
         self._camera.top = -intrinsics.cy / intrinsics.fy
         self._camera.right = (intrinsics.width - intrinsics.cx) / intrinsics.fx
@@ -77,7 +78,7 @@ class WarpScene:
 
         self._cache = PlantMeshCache(self._warp_device, cached_plants)
         self._shown = [self._cache.get(plant) for plant in plants]
-        self._links = _LinkMeshes(robot_meshes, self._warp_device)
+        self._links = LinkMeshes(robot_meshes, self._warp_device)
         self._scene: Any = kernels.Scene()
         self._links.describe(self._scene, device)
         self._allocate_tables()
@@ -88,7 +89,7 @@ class WarpScene:
         self._finish_work()
 
     def show(self, env_index: int, plant: Plant) -> None:
-        """Shows another plant in one environment."""
+        """Shows another plant in one environment, once all queries under way are done."""
         meshes = self._cache.get(plant)
         # A new mesh is built in Warp's stream, and an old one must outlive the casts still under way with it.
         self._finish_work()
@@ -183,7 +184,17 @@ class WarpScene:
     def clearance(
         self, T_w_links: Tensor, T_w_plant: Tensor, env_idx: Tensor | None, farthest: float
     ) -> Tensor:
-        """See `RayLibrary.clearance`."""
+        """The smallest distance between the arm's spheres (`robot.spheres`) and a plant over S postures of each path.
+
+        Args:
+            T_w_links: Poses of `iiwa14.LINK_NAMES`. Shape (P, S, 9, 4, 4).
+            T_w_plant: Poses of the plants. Shape (P, 4, 4).
+            env_idx: Whose plant each path is held against; None for one path in every environment. Shape (P,).
+            farthest: Largest distance that is told apart, in [m].
+
+        Returns:
+            In [m], negative where a triangle cuts a sphere. Shape (P,).
+        """
         paths, samples = T_w_links.shape[:2]
         recorded = self._recorded(self._record_clearance, paths, samples, farthest)
         environments, plants, links, every = recorded.inputs
@@ -359,31 +370,6 @@ def _pinhole(intrinsics: CameraIntrinsics) -> Any:
         intrinsics.cy,
     )
     return pinhole
-
-
-class _LinkMeshes:
-    """The links that have triangles."""
-
-    def __init__(self, robot_meshes: LinkMeshes, warp_device: str) -> None:
-        names = [name for name, (_, faces) in robot_meshes.items() if len(faces)]
-        points = [np.asarray(robot_meshes[name][0], dtype=np.float32) for name in names]
-        self.count = len(names)
-        self._meshes = [
-            build_mesh(p, robot_meshes[name][1], warp_device) for name, p in zip(names, points, strict=True)
-        ]
-        self._indices = [LINK_NAMES.index(name) for name in names]
-        self._lows = [p.min(axis=0) for p in points]
-        self._highs = [p.max(axis=0) for p in points]
-
-    def describe(self, scene: Any, device: torch.device) -> None:
-        """Fills the table of links of a `kernels.Scene`."""
-        meshes = torch.tensor([mesh.id for mesh in self._meshes], dtype=torch.int64, device=device)
-        indices = torch.tensor(self._indices, dtype=torch.int32, device=device)
-        scene.link_meshes = wp.from_torch(meshes, dtype=wp.uint64)
-        scene.link_indices = wp.from_torch(indices)
-        for name, corners in (("link_lows", self._lows), ("link_highs", self._highs)):
-            table = torch.tensor(np.array(corners, dtype=np.float32).reshape(-1, 3), device=device)
-            setattr(scene, name, wp.from_torch(table, dtype=wp.vec3))
 
 
 class _Views:

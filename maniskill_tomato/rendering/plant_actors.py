@@ -4,6 +4,9 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
+import numpy as np
+from numpy.typing import NDArray
+
 from maniskill_tomato.plants.materials import MATERIALS
 from maniskill_tomato.plants.organs import MeshPart, Plant
 
@@ -14,22 +17,23 @@ if TYPE_CHECKING:
     from mani_skill.utils.structs.actor import Actor
 
 
-def make_render_material(name: str) -> sapien.render.RenderMaterial:
-    """A SAPIEN material from `MATERIALS`; needs a Vulkan device."""
+def repeating_texture(pixels: NDArray[np.uint8]) -> sapien.render.RenderTexture2D:
+    """A texture of sRGB colours with alpha, Shape (rows, columns, 4), that repeats; needs a Vulkan device."""
     import sapien.render
 
-    material = MATERIALS[name]
-    result = sapien.render.RenderMaterial(
-        base_color=[1.0, 1.0, 1.0, 1.0], roughness=material.roughness, specular=material.specular
+    return sapien.render.RenderTexture2D(
+        pixels, "R8G8B8A8Unorm", mipmap_levels=6, filter_mode="linear", address_mode="repeat", srgb=True
     )
-    result.base_color_texture = sapien.render.RenderTexture2D(
-        material.base_color,
-        "R8G8B8A8Unorm",
-        mipmap_levels=6,
-        filter_mode="linear",
-        address_mode="repeat",
-        srgb=True,
-    )
+
+
+def textured_material(
+    pixels: NDArray[np.uint8], roughness: float, specular: float
+) -> sapien.render.RenderMaterial:
+    """A material with a repeating base colour; see `repeating_texture`."""
+    import sapien.render
+
+    result = sapien.render.RenderMaterial(base_color=[1, 1, 1, 1], roughness=roughness, specular=specular)
+    result.base_color_texture = repeating_texture(pixels)
     return result
 
 
@@ -42,11 +46,11 @@ def make_render_shape(
         part: What to show.
         materials: Materials made so far, by name; a missing one is made and added.
     """
-    import numpy as np
     import sapien.render
 
     if part.material not in materials:
-        materials[part.material] = make_render_material(part.material)
+        made = MATERIALS[part.material]
+        materials[part.material] = textured_material(made.base_color, made.roughness, made.specular)
     return sapien.render.RenderShapeTriangleMesh(
         vertices=part.vertices,
         triangles=part.faces.astype(np.uint32),

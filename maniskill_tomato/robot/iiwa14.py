@@ -23,7 +23,6 @@ JOINT_NAMES: Final = tuple(f"joint_{i}" for i in range(1, 8))
 LINK_NAMES: Final = (*(f"link_{i}" for i in range(8)), "link_ee")
 """The links, base to flange; `link_ee` is fixed to `link_7`."""
 
-BASE_LINK_NAME: Final = "link_0"
 EE_LINK_NAME: Final = "link_ee"
 
 

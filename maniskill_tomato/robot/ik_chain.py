@@ -45,6 +45,11 @@ def homogeneous(x: wp.vec3d, y: wp.vec3d, z: wp.vec3d, p: wp.vec3d) -> wp.mat44d
     )  # fmt: skip
 
 
+@wp.func
+def column(m: wp.mat33d, k: int) -> wp.vec3d:
+    return wp.vec3d(m[0, k], m[1, k], m[2, k])
+
+
 @wp.kernel
 def link_transforms_kernel(qpos: wp.array2d[wp.float64], transforms: wp.array2d[wp.mat44d]):
     i = wp.tid()
@@ -69,33 +74,6 @@ def link_transforms_kernel(qpos: wp.array2d[wp.float64], transforms: wp.array2d[
         transforms[i, j + 1] = homogeneous(x, y, z, p)
     p += EE_HEIGHT * z
     transforms[i, 8] = homogeneous(x, y, z, p)
-
-
-@wp.func
-def flange_transform(q: vec7d) -> wp.mat44d:
-    """Pose of `link_ee` in the base frame, from the centres of shoulder, elbow and wrist alone."""
-    x = wp.vec3d(ONE, ZERO, ZERO)
-    y = wp.vec3d(ZERO, ONE, ZERO)
-    z = wp.vec3d(ZERO, ZERO, ONE)
-    p = wp.vec3d(ZERO, ZERO, SHOULDER_HEIGHT)
-    for j in range(7):
-        angle = AXIS_SIGNS[j] * q[j]
-        c = wp.cos(angle)
-        s = wp.sin(angle)
-        if j % 2 == 1:
-            turned = c * x - s * z
-            z = s * x + c * z
-            x = turned
-        else:
-            turned = c * x + s * y
-            y = c * y - s * x
-            x = turned
-        if j == 2:
-            p += UPPER_ARM * z
-        if j == 4:
-            p += FOREARM * z
-    p += HAND * z
-    return homogeneous(x, y, z, p)
 
 
 @wp.kernel

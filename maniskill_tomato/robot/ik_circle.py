@@ -44,6 +44,7 @@ from maniskill_tomato.robot.ik_chain import (
     TWO_PI,
     UPPER_ARM,
     ZERO,
+    column,
     vec7d,
 )
 
@@ -125,25 +126,22 @@ def term(first: wp.vec3d, second: wp.vec3d, constant: wp.vec3d, k: wp.vec3d) -> 
 
 @wp.func
 def elbow_circle(
-    x: wp.vec3d,
-    y: wp.vec3d,
-    z: wp.vec3d,
-    p: wp.vec3d,
-    q_ref: vec7d,
-    tolerance: wp.float64,
-    stretch: wp.float64,
+    p: wp.vec3d, rotation: wp.mat33d, q_ref: vec7d, tolerance: wp.float64, stretch: wp.float64
 ) -> ElbowCircle:
     """The circle for a pose of the hand, with psi = 0 where the elbow of the reference stands.
 
     Args:
-        x: First axis of the end effector in the base frame; y and z are the others.
         p: Position of the end effector, in [m].
+        rotation: Its axes in the base frame as columns.
         q_ref: The reference, in [rad].
         tolerance: How far outside the reachable shell the wrist may lie, in [m]; it is moved onto it.
         stretch: How near to full reach the wrist must be for the arm to count as stretched, in [m]. There an error
             of the distance grows to its square root in q4, and from there in q2 and q6, which may be at limits.
     """
     circle = ElbowCircle()
+    x = column(rotation, 0)
+    y = column(rotation, 1)
+    z = column(rotation, 2)
     to_wrist = p - HAND * z - wp.vec3d(ZERO, ZERO, SHOULDER_HEIGHT)
     distance = wp.length(to_wrist)
     if distance > LARGEST_REACH + tolerance or distance < SMALLEST_REACH - tolerance:

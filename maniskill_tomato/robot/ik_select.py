@@ -62,7 +62,7 @@ class Weights:
 
 
 @wp.struct
-class Choice:
+class ArmAngle:
     cost: wp.float64
     """Least cost found, `NO_COST` where nothing is feasible."""
     psi: wp.float64
@@ -107,9 +107,9 @@ def cheapest_configuration(
     q_ref: vec7d,
     weights: Weights,
     tolerance: wp.float64,
-) -> Choice:
+) -> ArmAngle:
     """The best of a set of configurations at one arm angle."""
-    best = Choice()
+    best = ArmAngle()
     best.cost = NO_COST
     r2 = wp.sqrt(values[Q1_Y] * values[Q1_Y] + values[Q1_X] * values[Q1_X])
     r6 = wp.sqrt(values[Q5_Y] * values[Q5_Y] + values[Q5_X] * values[Q5_X])
@@ -181,7 +181,7 @@ def sorted_breaks(breaks: breaks_type) -> breaks_type:
 
 
 @wp.func
-def sampled_choice(circle: ElbowCircle, q_ref: vec7d, weights: Weights, tolerance: wp.float64) -> Choice:
+def sampled_choice(circle: ElbowCircle, q_ref: vec7d, weights: Weights, tolerance: wp.float64) -> ArmAngle:
     """The best feasible point of the grid, with the range around it that belongs to the same interval."""
     terms = circle.terms
     breaks = breaks_type()
@@ -198,7 +198,7 @@ def sampled_choice(circle: ElbowCircle, q_ref: vec7d, weights: Weights, toleranc
     breaks[22] = ZERO
     breaks = sorted_breaks(breaks)
 
-    best = Choice()
+    best = ArmAngle()
     best.cost = NO_COST
     width_before = breaks[0] + TWO_PI - breaks[BREAKS - 1]
     middle = HALF * (breaks[0] + TWO_PI + breaks[BREAKS - 1])
@@ -261,7 +261,7 @@ def angles_at(
 
 @wp.func
 def refined_psi(
-    circle: ElbowCircle, start: Choice, q_ref: vec7d, weights: Weights, tolerance: wp.float64
+    circle: ElbowCircle, start: ArmAngle, q_ref: vec7d, weights: Weights, tolerance: wp.float64
 ) -> wp.float64:
     """The arm angle of least cost near a choice with its configuration: Brent's method, 20 steps at most."""
     a = start.low

@@ -7,7 +7,7 @@
 
 import warp as wp
 
-from maniskill_tomato.robot.ik_chain import HALF, HAND, ONE, TWO, ZERO, flange_transform, vec7d
+from maniskill_tomato.robot.ik_chain import HALF, HAND, ONE, TWO, ZERO, column, homogeneous, vec7d
 from maniskill_tomato.robot.ik_circle import elbow_circle
 from maniskill_tomato.robot.ik_neighbour import Allowed, hand_of, nearest_neighbour, pose_ratios
 from maniskill_tomato.robot.ik_select import NO_COST, Weights, angles_at, refined_psi, sampled_choice
@@ -29,7 +29,7 @@ LARGEST_SKEW = wp.constant(wp.float64(1.0e-3))
 
 
 @wp.struct
-class Solution:
+class ExactSolution:
     found: wp.int32
     stretched: wp.int32
     """1 if the arm was taken as stretched; exact elbow angles near zero are then worth another attempt."""
@@ -44,13 +44,10 @@ def exact_solution(
     weights: Weights,
     tolerance: wp.float64,
     stretch: wp.float64,
-) -> Solution:
+) -> ExactSolution:
     """The cheapest joint angles that reach a pose to within a few tolerances."""
-    solution = Solution()
-    x = wp.vec3d(rotation[0, 0], rotation[1, 0], rotation[2, 0])
-    y = wp.vec3d(rotation[0, 1], rotation[1, 1], rotation[2, 1])
-    z = wp.vec3d(rotation[0, 2], rotation[1, 2], rotation[2, 2])
-    circle = elbow_circle(x, y, z, position, q_ref, tolerance, stretch)
+    solution = ExactSolution()
+    circle = elbow_circle(position, rotation, q_ref, tolerance, stretch)
     if circle.reachable == 1:
         if stretch > ZERO and circle.q4 == ZERO:
             solution.stretched = 1
@@ -129,22 +126,22 @@ def solve_kernel(
             outcome = REACHABLE
             q = solution.q
         elif neighbours == 1:
-            x = wp.vec3d(rotation[0, 0], rotation[1, 0], rotation[2, 0])
-            y = wp.vec3d(rotation[0, 1], rotation[1, 1], rotation[2, 1])
-            z = wp.vec3d(rotation[0, 2], rotation[1, 2], rotation[2, 2])
             # The wrist of a neighbour pose is at most this far away.
             wrist_shift = allowed.distance + TWO * HAND * wp.sin(HALF * allowed.angle)
-            circle = elbow_circle(x, y, z, position, q_ref, wrist_shift, ZERO)
+            circle = elbow_circle(position, rotation, q_ref, wrist_shift, ZERO)
             if circle.reachable == 1:
                 neighbour = nearest_neighbour(circle, position, rotation, allowed)
                 if neighbour.distance < NO_COST:
                     outcome = NEIGHBOUR
                     q = neighbour.q
-                    hand = hand_of(q)
+                    near = hand_of(q)
                     # The pose found is reachable, maybe also nearer to the reference.
-                    solution = exact_solution(hand.position, hand.rotation, q_ref, weights, STRICT, ZERO)
+                    solution = exact_solution(near.position, near.rotation, q_ref, weights, STRICT, ZERO)
                     if solution.found == 1:
                         q = solution.q
     qpos[i] = q
     reach[i] = outcome
-    reached[i] = flange_transform(q)
+    hand = hand_of(q)
+    reached[i] = homogeneous(
+        column(hand.rotation, 0), column(hand.rotation, 1), column(hand.rotation, 2), hand.position
+    )

@@ -13,18 +13,16 @@ for a single pose, where the kernel takes tens of microseconds.
 import math
 from dataclasses import dataclass
 from enum import IntEnum
-from functools import lru_cache
 from typing import Any
 
 import torch
 import warp as wp
 
-from maniskill_tomato.errors import InvalidInputError
+from maniskill_tomato.errors import InvalidInputError, check_ranges
 from maniskill_tomato.robot import ik_neighbour, ik_select, ik_solve
 from maniskill_tomato.robot.iiwa14 import NUM_JOINTS
 from maniskill_tomato.robot.ik_chain import vec7d
-from maniskill_tomato.robot.kinematics import LARGEST_KEPT_BATCH
-from maniskill_tomato.warp_runtime import RecordedLaunch, start_warp
+from maniskill_tomato.warp_runtime import BatchKernel, start_warp
 
 
 class Reach(IntEnum):
@@ -58,16 +56,14 @@ class IkConfig:
     """Largest angle between a neighbour pose and the pose asked for, in [rad]."""
 
     def __post_init__(self) -> None:
-        for name, least, most in (
-            ("limit_margin", 1e-6, 1.5),
-            ("limit_weight", 0.0, 1e3),
-            ("tolerance", 1e-10, 1e-3),
-            ("neighbour_distance", 1e-6, 0.5),
-            ("neighbour_angle", 1e-6, 1.5),
-        ):
-            value = getattr(self, name)
-            if not least <= value <= most:
-                raise InvalidInputError(f"{name} must lie in [{least}, {most}], got {value!r}")
+        check_ranges(
+            self,
+            limit_margin=(1e-6, 1.5),
+            limit_weight=(0.0, 1e3),
+            tolerance=(1e-10, 1e-3),
+            neighbour_distance=(1e-6, 0.5),
+            neighbour_angle=(1e-6, 1.5),
+        )
 
 
 @dataclass(frozen=True)
@@ -97,7 +93,22 @@ class InverseKinematics:
         if self.device.type == "cuda" and self.device.index is None:
             self.device = torch.device("cuda", torch.cuda.current_device())
         self.config = config or IkConfig()
-        self._kept_launch = lru_cache(maxsize=16)(self._make_launch)
+        weights: Any = ik_select.Weights()
+        weights.margin = self.config.limit_margin
+        weights.limit_weight = self.config.limit_weight
+        allowed: Any = ik_neighbour.Allowed()
+        allowed.distance = self.config.neighbour_distance
+        allowed.angle = self.config.neighbour_angle
+        pose, joints = ((4, 4), torch.float64, wp.mat44d), ((NUM_JOINTS,), torch.float64, vec7d)
+        self._kernels = {
+            neighbour: BatchKernel(
+                ik_solve.solve_kernel,
+                inputs=[pose, joints],
+                constants=[weights, self.config.tolerance, int(neighbour), allowed],
+                outputs=[joints, ((), torch.int64, wp.int64), pose],
+            )
+            for neighbour in (False, True)
+        }
 
     def solve(self, T_base_ee: torch.Tensor, qpos_ref: torch.Tensor, neighbour: bool = True) -> IkSolution:
         """Joint angles that bring the end effector to a pose, the best ones by the cost of `ik_select`.
@@ -138,50 +149,12 @@ class InverseKinematics:
         if batch == 0:
             reach = torch.zeros(0, dtype=torch.int64, device=self.device)
             return IkSolution(qpos_ref.double(), reach, T_base_ee.double())
-        kept = batch <= LARGEST_KEPT_BATCH
-        launch = (self._kept_launch if kept else self._make_launch)(batch, neighbour)
-        launch.poses.copy_(T_base_ee.detach())
-        launch.references.copy_(qpos_ref.detach())
-        launch.run()
-        if int(launch.reach.min()) < 0:
-            row = int(launch.reach.argmin())
+        qpos, reach, reached = self._kernels[neighbour](T_base_ee, qpos_ref)
+        if int(reach.min()) < 0:
+            row = int(reach.argmin())
             raise InvalidInputError(
                 "T_base_ee must hold finite rigid transforms (rotation, position, last row 0 0 0 1) and "
                 f"qpos_ref finite angles; row {row} has T_base_ee = {T_base_ee[row].tolist()}, "
                 f"qpos_ref = {qpos_ref[row].tolist()}"
             )
-        if not kept:
-            return IkSolution(launch.qpos, launch.reach, launch.reached)
-        return IkSolution(launch.qpos.clone(), launch.reach.clone(), launch.reached.clone())
-
-    def _make_launch(self, batch: int, neighbour: bool) -> "_SolveLaunch":
-        return _SolveLaunch(batch, neighbour, self.device, self.config)
-
-
-class _SolveLaunch:
-    """The kernel's launch for one batch size, with its tensors."""
-
-    def __init__(self, batch: int, neighbour: bool, device: torch.device, config: IkConfig):
-        self.poses = torch.zeros(batch, 4, 4, dtype=torch.float64, device=device)
-        self.references = torch.zeros(batch, NUM_JOINTS, dtype=torch.float64, device=device)
-        self.qpos = torch.zeros(batch, NUM_JOINTS, dtype=torch.float64, device=device)
-        self.reach = torch.zeros(batch, dtype=torch.int64, device=device)
-        self.reached = torch.zeros(batch, 4, 4, dtype=torch.float64, device=device)
-        weights: Any = ik_select.Weights()
-        weights.margin = config.limit_margin
-        weights.limit_weight = config.limit_weight
-        allowed: Any = ik_neighbour.Allowed()
-        allowed.distance = config.neighbour_distance
-        allowed.angle = config.neighbour_angle
-        arguments = [
-            wp.from_torch(self.poses, dtype=wp.mat44d),
-            wp.from_torch(self.references, dtype=vec7d),
-            weights,
-            config.tolerance,
-            int(neighbour),
-            allowed,
-            wp.from_torch(self.qpos, dtype=vec7d),
-            wp.from_torch(self.reach),
-            wp.from_torch(self.reached, dtype=wp.mat44d),
-        ]
-        self.run = RecordedLaunch(device, (ik_solve.solve_kernel, batch, arguments))
+        return IkSolution(qpos.clone(), reach.clone(), reached.clone())

@@ -12,10 +12,8 @@ from typing import Final
 import torch
 from torch import Tensor
 
-from maniskill_tomato.errors import InvalidInputError
 from maniskill_tomato.robot.d435 import T_flange_camera_color_optical
-from maniskill_tomato.robot.kinematics import viewpoint_transform
-from maniskill_tomato.robot.rotations import matrix_to_rpy
+from maniskill_tomato.robot.rotations import matrix_to_rpy, require_trailing
 
 CAMERA_ROLLS: Final = tuple(
     math.radians(angle) for angle in (0, 30, -30, 60, -60, 90, -90, 120, -120, 150, -150, 180)
@@ -43,7 +41,7 @@ def look_frame(position: Tensor, target: Tensor) -> Tensor:
         InvalidInputError: A tensor is not floating point or its last dimension is not 3.
     """
     for name, tensor in (("position", position), ("target", target)):
-        _check(name, tensor, (3,))
+        require_trailing(name, tensor, (3,))
     ahead = target - position
     distance = ahead.norm(dim=-1, keepdim=True)
     x_axis = ahead.new_tensor((1.0, 0.0, 0.0)).expand_as(ahead)
@@ -83,14 +81,14 @@ def look_at_pose(position: Tensor, target: Tensor, roll: Tensor | float = 0.0) -
 
 def camera_to_flange(T_world_camera: Tensor) -> Tensor:
     """The pose of `link_ee` that puts the colour camera's optical frame at a pose. Shape (..., 4, 4)."""
-    _check("T_world_camera", T_world_camera, (4, 4))
+    require_trailing("T_world_camera", T_world_camera, (4, 4))
     inverse: Tensor = _mount(T_world_camera.dtype, T_world_camera.device)[1]
     return T_world_camera @ inverse
 
 
 def flange_to_camera(T_world_flange: Tensor) -> Tensor:
     """The pose of the colour camera's optical frame when `link_ee` is at a pose. Shape (..., 4, 4)."""
-    _check("T_world_flange", T_world_flange, (4, 4))
+    require_trailing("T_world_flange", T_world_flange, (4, 4))
     mount: Tensor = _mount(T_world_flange.dtype, T_world_flange.device)[0]
     return T_world_flange @ mount
 
@@ -110,29 +108,8 @@ def camera_to_viewpoint(T_world_camera: Tensor, reference_rpy: Tensor) -> Tensor
     return torch.cat([T_world_flange[..., :3, 3], rpy], dim=-1)
 
 
-def viewpoint_to_camera(viewpoint: Tensor) -> Tensor:
-    """The pose of the colour camera's optical frame when the flange is at a viewpoint.
-
-    Args:
-        viewpoint: x, y, z, in [m], roll, pitch, yaw, in [rad]. Shape (B, 6).
-
-    Returns:
-        T_world_camera, of the type of `viewpoint`. Shape (B, 4, 4).
-    """
-    return flange_to_camera(viewpoint_transform(viewpoint)).to(viewpoint.dtype)
-
-
 @cache
 def _mount(dtype: torch.dtype, device: torch.device) -> tuple[Tensor, Tensor]:
     """T_flange_camera of the colour camera's optical frame, and its inverse."""
     mount = torch.tensor(T_flange_camera_color_optical, dtype=torch.float64)
     return mount.to(device, dtype), torch.linalg.inv(mount).to(device, dtype)
-
-
-def _check(name: str, tensor: Tensor, trailing: tuple[int, ...]) -> None:
-    if tuple(tensor.shape[-len(trailing) :]) != trailing or not tensor.is_floating_point():
-        wanted = ", ".join(["...", *map(str, trailing)])
-        raise InvalidInputError(
-            f"{name} must be a floating-point tensor of shape ({wanted}); "
-            f"got {tensor.dtype} of shape {tuple(tensor.shape)}"
-        )

@@ -10,7 +10,6 @@ share this module.
 """
 
 from dataclasses import dataclass
-from functools import lru_cache
 from typing import Any, Final
 
 import numpy as np
@@ -24,12 +23,8 @@ from maniskill_tomato.robot import look_at_kernels
 from maniskill_tomato.robot.d435 import T_flange_camera_color_optical
 from maniskill_tomato.robot.iiwa14 import NUM_JOINTS
 from maniskill_tomato.robot.inverse_kinematics import InverseKinematics, Reach
-from maniskill_tomato.robot.look_at import (
-    CAMERA_ROLLS,
-    look_at_pose,
-    look_frame,
-)
-from maniskill_tomato.warp_runtime import RecordedLaunch
+from maniskill_tomato.robot.look_at import CAMERA_ROLLS, look_at_pose, look_frame
+from maniskill_tomato.warp_runtime import BatchKernel
 
 MAX_MOVE: Final = 0.12
 """Length of the move that an action of norm 1 asks for, in [m]."""
@@ -111,7 +106,14 @@ class LookAtMover:
         self._rolls = torch.tensor(CAMERA_ROLLS, dtype=torch.float64, device=device)
         # Upright first, then 30 degrees to either side, 60, ...; between the two sides the joints decide.
         self._rank = (self._rolls.abs() * (180.0 / torch.pi / 30.0)).round()
-        self._kept_launch = lru_cache(maxsize=16)(lambda batch: _UprightLaunch(batch, device, inverse))
+        vector, pose = ((3,), torch.float64, wp.vec3d), ((4, 4), torch.float64, wp.mat44d)
+        mount: Any = wp.mat44d(*inverse.ravel())
+        self._upright_move = BatchKernel(
+            look_at_kernels.upright_move,
+            inputs=[vector, vector, vector],
+            constants=[wp.float64(MAX_MOVE), wp.float64(MIN_DISTANCE), mount],
+            outputs=[pose, pose],
+        )
         self._shares = torch.tensor(MOVE_SHARES, dtype=torch.float64, device=device)
 
     def move(self, qpos: Tensor, position: Tensor, target: Tensor, action: Tensor) -> LookAtMove:
@@ -128,7 +130,7 @@ class LookAtMover:
         """
         _check_rows(qpos=(qpos, NUM_JOINTS), position=(position, 3), target=(target, 3), action=(action, 3))
         qpos, position, target = qpos.double(), position.double(), target.double()
-        T_world_camera, T_world_flange = self._kept_launch(len(qpos)).run(position, target, action)
+        T_world_camera, T_world_flange = (T.clone() for T in self._upright_move(position, target, action))
         solution = self._inverse_kinematics.solve(T_world_flange, qpos, neighbour=False)
         near = (solution.qpos - qpos).abs().amax(-1) <= LARGEST_JOINT_STEP
         fits = (solution.reach == int(Reach.REACHABLE)) & near & keeps_clear(T_world_flange)
@@ -196,29 +198,6 @@ class LookAtMover:
         taken = torch.where(found[:, None], solved[every, best], qpos.double())
         T = torch.where(found[:, None, None], T_world_camera[every, best], T_world_camera[:, 0])
         return LookAtMove(taken, reach, T)
-
-
-class _UprightLaunch:
-    """The kernel of full moves with the picture upright for one batch size, with its tensors."""
-
-    def __init__(self, batch: int, device: torch.device, T_camera_flange: npt.NDArray[np.float64]) -> None:
-        def zeros(*shape: int) -> Tensor:
-            return torch.zeros(batch, *shape, dtype=torch.float64, device=device)
-
-        self._inputs = [zeros(3) for _ in range(3)]
-        self._poses = [zeros(4, 4) for _ in range(2)]
-        vectors: list[Any] = [wp.from_torch(tensor, dtype=wp.vec3d) for tensor in self._inputs]
-        poses: list[Any] = [wp.from_torch(tensor, dtype=wp.mat44d) for tensor in self._poses]
-        mount: Any = wp.mat44d(*T_camera_flange.ravel())
-        arguments = [*vectors, wp.float64(MAX_MOVE), wp.float64(MIN_DISTANCE), mount, *poses]
-        self._launch = RecordedLaunch(device, (look_at_kernels.upright_move, batch, arguments))
-
-    def run(self, *inputs: Tensor) -> tuple[Tensor, Tensor]:
-        """Poses of the optical frame and the flange after a move from positions, targets and actions."""
-        for own, given in zip(self._inputs, inputs, strict=True):
-            own.copy_(given)
-        self._launch()
-        return self._poses[0].clone(), self._poses[1].clone()
 
 
 def _check_rows(**tensors: tuple[Tensor, int]) -> None:

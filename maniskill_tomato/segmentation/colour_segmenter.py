@@ -85,11 +85,6 @@ class ColourSegmenter:
         return np.asarray(known & (depth_m - nearest > self.depth_jump_m))
 
 
-def open_colour(**thresholds: float) -> ColourSegmenter:
-    """Opens it; see `ColourSegmenter`."""
-    return ColourSegmenter(**thresholds)  # type: ignore[arg-type]
-
-
 def split_by_watershed(pixels: NDArray[np.bool_], summit: float = 0.6) -> NDArray[np.bool_]:
     """Separates things that touch, each around a summit of the distance to the edge.
 

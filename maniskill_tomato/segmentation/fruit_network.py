@@ -12,8 +12,8 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
+from maniskill_tomato.segmentation.detector_configs import FruitNetworkConfig
 from maniskill_tomato.segmentation.efficientnet_lite import FEATURE_WIDTHS, EfficientNetLite0
-from maniskill_tomato.segmentation.fruit_network_config import FruitNetworkConfig
 
 STRIDE = 2
 """Pixels of the image between neighbouring places of the output."""
@@ -42,10 +42,10 @@ class FruitMaps(NamedTuple):
     """Offset right and down to the centre of the visible box of its fruit, in [px]. Shape (B, 2, h, w)."""
 
 
-def _conv(inputs: int, outputs: int, size: int = 3, stride: int = 1) -> nn.Sequential:
+def _conv(inputs: int, outputs: int) -> nn.Sequential:
     """Convolution, batch normalisation, rectifier."""
     return nn.Sequential(
-        nn.Conv2d(inputs, outputs, size, stride, size // 2, bias=False),
+        nn.Conv2d(inputs, outputs, 3, padding=1, bias=False),
         nn.BatchNorm2d(outputs),
         nn.ReLU(inplace=True),
     )
@@ -57,44 +57,6 @@ def _unshuffled(image: Tensor) -> Tensor:
     return x.contiguous(memory_format=torch.channels_last)
 
 
-class _Block(nn.Module):
-    """Two convolutions beside a shortcut."""
-
-    def __init__(self, width: int) -> None:
-        super().__init__()
-        self.first = _conv(width, width)
-        self.second = nn.Conv2d(width, width, 3, padding=1, bias=False)
-        self.norm = nn.BatchNorm2d(width)
-        nn.init.zeros_(self.norm.weight)  # Starts as the identity.
-
-    def forward(self, x: Tensor) -> Tensor:
-        return functional.relu(x + self.norm(self.second(self.first(x))))
-
-
-class PlainBackbone(nn.Module):
-    """Residual blocks at strides 4 to 32, to begin from random weights."""
-
-    def __init__(self, widths: tuple[int, ...], blocks: tuple[int, ...]) -> None:
-        super().__init__()
-        stages: list[nn.Module] = []
-        previous = 12
-        for width, count in zip(widths, blocks, strict=True):
-            stages.append(
-                nn.Sequential(_conv(previous, width, stride=2), *(_Block(width) for _ in range(count)))
-            )
-            previous = width
-        self.stages = nn.ModuleList(stages)
-
-    def forward(self, image: Tensor) -> list[Tensor]:
-        """Features of images of colours from 0 to 255, of shape (B, 3, H, W), at strides 4, 8, 16 and 32."""
-        x = _unshuffled(image)
-        features = []
-        for stage in self.stages:
-            x = stage(x)
-            features.append(x)
-        return features
-
-
 class FruitNetwork(nn.Module):
     """Image to `FruitMaps`."""
 
@@ -102,15 +64,10 @@ class FruitNetwork(nn.Module):
         super().__init__()
         self.config = config or FruitNetworkConfig()
         neck = self.config.neck_width
-        self.backbone: PlainBackbone | EfficientNetLite0
-        if self.config.backbone == "plain":
-            self.backbone = PlainBackbone(self.config.widths, self.config.blocks)
-            widths: tuple[int, ...] = self.config.widths
-        else:
-            self.backbone, widths = EfficientNetLite0(), FEATURE_WIDTHS
-        self.laterals = nn.ModuleList(nn.Conv2d(width, neck, 1) for width in widths)
-        self.smooths = nn.ModuleList(_conv(neck, neck) for _ in widths[:-1])
-        self.context = nn.Sequential(nn.AdaptiveAvgPool2d(1), nn.Conv2d(widths[-1], neck, 1))
+        self.backbone = EfficientNetLite0()
+        self.laterals = nn.ModuleList(nn.Conv2d(width, neck, 1) for width in FEATURE_WIDTHS)
+        self.smooths = nn.ModuleList(_conv(neck, neck) for _ in FEATURE_WIDTHS[:-1])
+        self.context = nn.Sequential(nn.AdaptiveAvgPool2d(1), nn.Conv2d(FEATURE_WIDTHS[-1], neck, 1))
         fine = self.config.fine_width
         self.fine = _conv(12, fine)
         self.coarse = nn.Conv2d(neck, fine, 1)

@@ -22,10 +22,9 @@ from torchvision.ops.feature_pyramid_network import FeaturePyramidNetwork, LastL
 from torchvision.ops.misc import FrozenBatchNorm2d
 
 from maniskill_tomato.errors import CheckpointError, InvalidInputError, MissingWeightsError
+from maniskill_tomato.segmentation.detector_configs import FIXED_BLOCKS, ClassicAugmentation, MaskRcnnConfig
 from maniskill_tomato.segmentation.efficientnet_lite import FEATURE_WIDTHS, EfficientNetLite0
-from maniskill_tomato.segmentation.fruit_network_config import FIXED_BLOCKS
 from maniskill_tomato.segmentation.instances import Image, Instances, check_image
-from maniskill_tomato.segmentation.training.detector_presets import ClassicAugmentation, MaskRcnnConfig
 from maniskill_tomato.segmentation.weights import load_weights
 
 ASPECT_RATIOS = (0.5, 1.0, 2.0)

@@ -94,11 +94,20 @@ class EncodedMask:
             raise InvalidInputError(
                 f"the runs of a mask must add up to its {height * width} pixels and none be negative"
             )
-        return cls.encode(_expand(runs, height, width))
+        if isinstance(counts, str):
+            return cls(height, width, counts)
+        from pycocotools import mask as coco_mask
+
+        uncoded: Any = {"size": [height, width], "counts": counts}
+        coded: Any = coco_mask.frPyObjects(uncoded, height, width)
+        return cls(height, width, coded["counts"].decode("ascii"))
 
     def decode(self) -> BinaryMask:
         """The mask. Shape (height, width)."""
-        return _expand(_run_lengths(self.counts), self.height, self.width)
+        # pycocotools decodes in a way that NumPy 2 has deprecated.
+        runs = _run_lengths(self.counts)
+        inside = np.arange(len(runs)) % 2 == 1
+        return np.asarray(np.repeat(inside, runs).reshape(self.width, self.height).T)
 
     @property
     def area(self) -> int:
@@ -154,8 +163,3 @@ def _run_lengths(counts: str) -> NDArray[np.int64]:
     for first in (1, 2):
         values[first::2] = np.cumsum(values[first::2])
     return values
-
-
-def _expand(runs: NDArray[np.int64], height: int, width: int) -> BinaryMask:
-    values = np.arange(len(runs)) % 2 == 1
-    return np.asarray(np.repeat(values, runs).reshape(width, height).T)

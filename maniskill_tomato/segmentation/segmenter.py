@@ -1,7 +1,10 @@
-"""The interface of a segmenter, which finds fruits in an image, and the opener by name or by file of weights."""
+"""The interface of a segmenter, which finds fruits in an image, and the opener by name or by file of weights.
+
+The segmenter that knows, from a label image that a renderer gives, stands here too.
+"""
 
 import importlib
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, Protocol, cast
 
@@ -9,16 +12,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from maniskill_tomato.errors import CheckpointError, InvalidInputError
-from maniskill_tomato.segmentation.instances import Image, Instances
+from maniskill_tomato.segmentation.instances import Image, Instances, check_image
 
 SEGMENTERS = {
     "light": "maniskill_tomato.segmentation.light_segmenter:open_light",
-    "colour": "maniskill_tomato.segmentation.colour_segmenter:open_colour",
-    "ground_truth": "maniskill_tomato.segmentation.ground_truth_segmenter:open_ground_truth",
+    "colour": "maniskill_tomato.segmentation.colour_segmenter:ColourSegmenter",
+    "ground_truth": "maniskill_tomato.segmentation.segmenter:GroundTruthSegmenter",
     "mask_rcnn": "maniskill_tomato.segmentation.mask_rcnn:open_mask_rcnn",
     "yolo": "maniskill_tomato.segmentation.yolo:open_yolo",
 }
-"""Name of each kind of segmenter, and the function that opens it."""
+"""Name of each kind of segmenter, and what opens it."""
 
 DEFAULT_SEGMENTER = "light"
 
@@ -37,6 +40,32 @@ class Segmenter(Protocol):
             InvalidInputError: The image or the depth has another shape or type.
         """
         ...
+
+
+class GroundTruthSegmenter:
+    """A `Segmenter` that returns what the label image of the same view says."""
+
+    def __init__(self, labels: Callable[[], NDArray[np.integer]], categories: Mapping[int, str]) -> None:
+        """Takes the renderer's side.
+
+        Args:
+            labels: Gives the label image of the present view, a number for each thing. Shape (H, W).
+            categories: Kind of each number that is a fruit; other numbers are no fruit.
+        """
+        self.labels = labels
+        self.categories = dict(categories)
+
+    def __call__(self, image: Image, depth_m: NDArray[np.float32] | None = None) -> Instances:
+        """The fruits of which a pixel is visible, each with score 1; see `Segmenter`."""
+        check_image(image, depth_m)
+        labels = self.labels()
+        if labels.shape != image.shape[:2]:
+            raise InvalidInputError(
+                f"labels must have the image's shape {image.shape[:2]}, got {labels.shape}; are they of this view?"
+            )
+        present = [number for number in np.unique(labels).tolist() if number in self.categories]
+        masks = labels[None] == np.array(present, labels.dtype)[:, None, None]
+        return Instances.from_masks(masks, categories=tuple(self.categories[n] for n in present))
 
 
 def make_segmenter(name_or_path: str | Path = DEFAULT_SEGMENTER, **options: Any) -> Segmenter:
@@ -63,8 +92,8 @@ def make_segmenter(name_or_path: str | Path = DEFAULT_SEGMENTER, **options: Any)
         name = read_kind(path)
         if name not in SEGMENTERS:
             raise CheckpointError(f"{path} is for a segmenter {name!r}, which this version does not know")
-    module, function = SEGMENTERS[name].split(":")
-    opener = cast(Callable[..., Segmenter], getattr(importlib.import_module(module), function))
+    module, opens = SEGMENTERS[name].split(":")
+    opener = cast(Callable[..., Segmenter], getattr(importlib.import_module(module), opens))
     try:
         return opener(**options)
     except TypeError as error:

@@ -156,7 +156,7 @@ def looked_from(grid: Grid, env: int, position: wp.vec3) -> float:
 
 @wp.func
 def unreachable_share(belief: Belief, env: int, target: wp.vec3, position: wp.vec3) -> float:
-    """One less `ViewLattice.resample` of the reachable candidates; 1 outside the lattice."""
+    """Share of candidates out of reach, interpolated linearly in the lattice; 1 more than half a step outside it."""
     offset = position - target
     distance = wp.max(wp.length(offset), 1.0e-6)
     a = wp.atan2(-offset[1], -offset[0]) / ANGLE_STEP + float(AZIMUTHS // 2)

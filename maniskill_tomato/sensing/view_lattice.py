@@ -11,7 +11,6 @@ from typing import Final
 import torch
 from torch import Tensor
 
-from maniskill_tomato.errors import InvalidInputError
 from maniskill_tomato.robot.iiwa14 import NUM_JOINTS
 from maniskill_tomato.robot.inverse_kinematics import InverseKinematics, Reach
 from maniskill_tomato.robot.look_at import CAMERA_ROLLS, camera_to_flange, look_at_pose
@@ -119,42 +118,6 @@ class ViewLattice:
         coordinates = self.coordinates(target_position, camera_positions).round().long()
         last = torch.tensor(self.shape, device=self.device) - 1
         return self.index(*torch.minimum(coordinates.clamp_min(0), last).unbind(-1))
-
-    def resample(
-        self, table: Tensor, target_position: Tensor, camera_positions: Tensor, outside: float
-    ) -> Tensor:
-        """A number per candidate, interpolated linearly at other camera positions.
-
-        Args:
-            table: Shape (B, K).
-            target_position: In the world frame, in [m]. Shape (B, 3).
-            camera_positions: In the world frame, in [m]. Shape (B, M, 3).
-            outside: The answer more than half a step outside the lattice; nearer ones take the lattice's edge.
-
-        Returns:
-            Shape (B, M).
-
-        Raises:
-            InvalidInputError: A shape does not fit.
-        """
-        batch = table.shape[0]
-        if table.shape != (batch, self.size) or camera_positions.shape[:1] != (batch,):
-            raise InvalidInputError(
-                f"table must have shape (B, {self.size}) and camera_positions (B, M, 3); "
-                f"got {tuple(table.shape)} and {tuple(camera_positions.shape)}"
-            )
-        coordinates = self.coordinates(target_position, camera_positions)
-        last = torch.tensor(self.shape, device=self.device) - 1
-        is_outside = ((coordinates < -0.5) | (coordinates > last + 0.5)).any(dim=-1)
-        coordinates = torch.minimum(coordinates.clamp_min(0.0), last.to(coordinates.dtype))
-        lower = torch.minimum(coordinates.floor().long(), last - 1)
-        share = coordinates - lower
-        values = torch.zeros_like(coordinates[..., 0])
-        for corner in range(8):
-            step = torch.tensor([corner >> 2 & 1, corner >> 1 & 1, corner & 1], device=self.device)
-            weight = torch.where(step.bool(), share, 1.0 - share).prod(dim=-1)
-            values += weight * table.gather(1, self.index(*(lower + step).unbind(-1))).to(values.dtype)
-        return torch.where(is_outside, outside, values)
 
     def reachable(self, target_position: Tensor) -> Tensor:
         """Which candidates the arm can look at its target from, with any of `CAMERA_ROLLS`.

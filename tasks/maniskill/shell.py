@@ -2,7 +2,7 @@
 
 import copy
 from collections.abc import Mapping
-from typing import Any, ClassVar
+from typing import Any, ClassVar, cast
 
 import numpy as np
 import sapien
@@ -19,18 +19,18 @@ from maniskill_tomato.plants.episode_list import Episode
 from maniskill_tomato.plants.organs import SemanticClass
 from maniskill_tomato.robot.d435 import CameraIntrinsics
 from maniskill_tomato.sensing.belief import Belief
+from maniskill_tomato.sensing.observation import ObservationLayout
 from maniskill_tomato.sensing.simulated_camera import RENDERED_SIZE
 from maniskill_tomato.tasks.arm_moves import Plan
-from maniskill_tomato.tasks.ground_truth import GroundTruth
-from maniskill_tomato.tasks.making import default_control, make_setup, option_names
-from maniskill_tomato.tasks.maniskill import scene_mask, scenery, shell_options
+from maniskill_tomato.tasks.ground_truth import WorldTruth
+from maniskill_tomato.tasks.making import check_choice, default_control, make_setup, option_names
+from maniskill_tomato.tasks.maniskill import scenery, shell_options
 from maniskill_tomato.tasks.maniskill.controllers import CONTROL_MODES
 from maniskill_tomato.tasks.maniskill.flat_state import checked_rows, unflatten
 from maniskill_tomato.tasks.maniskill.iiwa14_agent import Iiwa14D435
 from maniskill_tomato.tasks.maniskill.motion import drive_to
-from maniskill_tomato.tasks.maniskill.plant_scene import PlantScene
-from maniskill_tomato.tasks.option_checks import check_choice
-from maniskill_tomato.tasks.planting import Planting
+from maniskill_tomato.tasks.plant_batch import PlantBatch
+from maniskill_tomato.tasks.row.search_game import SearchGame
 from maniskill_tomato.tasks.world import World, check_action
 
 ROBOTS = ("iiwa14_d435", "iiwa14_d435_raw_depth")
@@ -142,15 +142,15 @@ class TomatoEnv(BaseEnv):  # type: ignore[misc]
                 self.device,
                 control=CONTROL_MODES.get(self.control_mode, default_control(self.env_id)),
                 intrinsics=self.camera_intrinsics,
-                picture=self._wrist_picture if self._setup.needs_pictures else None,
+                pictures=self._wrist_pictures if self._setup.needs_pictures else None,
             )
         world = self.world
         self._hand_over_generators()
-        if self._has_actors and world.planting.spec.changes:
+        if self._has_actors and world.plant_batch.spec.changes:
             for i, rng in enumerate(world.rngs):
                 world.show_plant(i, world.game.draw_plant(i, rng, options))
         world.swaps_plants = not self._has_actors
-        self._plants = PlantScene(self.scene, world.planting, with_actors=self._has_actors)
+        self._plants = scenery.PlantScene(self.scene, world.plant_batch, with_actors=self._has_actors)
         world.first_organ_id = torch.tensor(
             self._plants.first_organ_id, dtype=torch.int32, device=self.device
         )
@@ -171,19 +171,23 @@ class TomatoEnv(BaseEnv):  # type: ignore[misc]
             width=camera.width, height=camera.height, fx=K[0, 0], fy=K[1, 1], cx=K[0, 2], cy=K[1, 2]
         )
 
-    def _wrist_picture(self, env_index: int, qpos: Tensor) -> NDArray[np.uint8]:
-        """What the wrist's colour camera sees with an arm at some joint positions. Shape (height, width, 3)."""
+    def _wrist_pictures(self, qpos: Tensor) -> NDArray[np.uint8]:
+        """What the wrists' colour cameras see with the arms at some joint positions, rendered once for all.
+
+        Args:
+            qpos: In [rad]. Shape (num_envs, 7).
+
+        Returns:
+            Shape (num_envs, height, width, 3).
+        """
         self._plants.follow()
-        present = self.agent.robot.get_qpos()
-        if not torch.equal(present[env_index], qpos):
-            goal = present.clone()
-            goal[env_index] = qpos
-            self._put_joints(goal)
+        if not torch.equal(self.agent.robot.get_qpos(), qpos):
+            self._put_joints(qpos)
         self.scene.update_render(update_sensors=True, update_human_render_cameras=False)
         camera = self.scene.sensors["d435"]
         camera.capture()
         colours = camera.get_obs(rgb=True, depth=False, position=False, segmentation=False)["rgb"]
-        return np.asarray(colours[env_index].cpu().numpy())
+        return np.asarray(colours.cpu().numpy())
 
     # ---------------------------------------------------------------- episode
 
@@ -247,7 +251,7 @@ class TomatoEnv(BaseEnv):  # type: ignore[misc]
             robot.set_qpos(qpos)
             return
         gpu_system: Any = self.scene.px
-        with scene_mask.only(self.scene, None):
+        with scenery.writing_only_to(self.scene, None):
             robot.set_qpos(qpos)
             self.scene._gpu_apply_all()
             gpu_system.gpu_update_articulation_kinematics()
@@ -309,18 +313,23 @@ class TomatoEnv(BaseEnv):  # type: ignore[misc]
         return self.world.task
 
     @property
-    def planting(self) -> Planting:
+    def plant_batch(self) -> PlantBatch:
         """The plants."""
-        return self.world.planting
+        return self.world.plant_batch
 
     @property
-    def ground_truth(self) -> GroundTruth:
+    def ground_truth(self) -> WorldTruth:
         """What only the simulator knows; for planners that need the truth."""
         return self.world.ground_truth
 
     @property
+    def keeps_belief(self) -> bool:
+        """Whether there is a `belief`; the general tasks alone have one."""
+        return self.world.keeps_belief
+
+    @property
     def belief(self) -> Belief:
-        """What is known after the last look, for policies; the general tasks alone have one."""
+        """What is known after the last look, for policies; see `World.belief`."""
         return self.world.belief
 
     @property
@@ -358,7 +367,7 @@ class TomatoEnv(BaseEnv):  # type: ignore[misc]
             name: checked_rows(state, ("task", name), len(rows), self.device) for name in world.saved_rows()
         }
         arm = checked_rows(state, ("articulations", robot.name), len(rows), self.device)
-        seeds = [world.planting.seeds[i] for i in rows.tolist()]
+        seeds = [world.plant_batch.seeds[i] for i in rows.tolist()]
         stored = [int(s) for s in task["plant_seed"][:, 0]]
         if stored != seeds:
             raise InvalidInputError(
@@ -368,7 +377,7 @@ class TomatoEnv(BaseEnv):  # type: ignore[misc]
         # The base never moves, and to set its pose again would shift it by rounding.
         dof = robot.max_dof
         qpos, qvel = arm[:, -2 * dof : -dof].float(), arm[:, -dof:].float()
-        with scene_mask.only(self.scene, rows):
+        with scenery.writing_only_to(self.scene, rows):
             robot.set_qvel(qvel)
         world.take_up(rows, task, qpos)
         self._show_world()
@@ -396,22 +405,20 @@ class SearchEnv(TomatoEnv):
     @property
     def soft_starts(self) -> int:
         """Episodes so far that no drawn start made as hard as asked for."""
-        count: int = self._game.soft_starts
-        return count
+        return self._game.soft_starts
 
     @property
-    def layout(self) -> Any:
+    def layout(self) -> ObservationLayout:
         """What the observation holds."""
         return self._game.layout
 
     @property
-    def _game(self) -> Any:
-        return self.world.game
+    def _game(self) -> SearchGame:
+        return cast(SearchGame, self.world.game)
 
     def episode(self, env_index: int, options: Mapping[str, Any]) -> Episode | None:
         """The episode of the list that a reset with these options begins; None without a list."""
-        episode: Episode | None = self._game.episode(env_index, options)
-        return episode
+        return self._game.episode(env_index, options)
 
 
 class RowEnv(SearchEnv):

@@ -8,7 +8,7 @@ from mani_skill.envs.utils.observations import ALL_VISUAL_TEXTURES
 
 from maniskill_tomato.errors import InvalidInputError
 from maniskill_tomato.rendering.vulkan_probe import NO_RENDERING_HINT
-from maniskill_tomato.tasks.option_checks import check_choice
+from maniskill_tomato.tasks.making import check_choice
 
 Motion = Literal["kinematic", "dynamic"]
 

@@ -78,7 +78,7 @@ def extend_episodes(
 def _episode(world: World, plant_seed: int) -> Episode:
     x, y, yaw = world.state.plant_pose[0].tolist()
     camera = world.belief.camera_position[0].tolist()
-    density = leaf_density_of(world.planting.spec.leaf_density, plant_seed)
+    density = leaf_density_of(world.plant_batch.spec.leaf_density, plant_seed)
     return Episode(
         plant_seed=plant_seed,
         leaf_density=1.0 if density is None else density,

@@ -10,7 +10,6 @@ from maniskill_tomato.plants.spec import ROW_PLANT, PlantPose, PlantSpec
 from maniskill_tomato.sensing.camera_perception import MAP_NOISE
 from maniskill_tomato.sensing.simulated_camera import Association, Naming
 from maniskill_tomato.tasks import MAX_GENERAL_STEPS
-from maniskill_tomato.tasks.row.row_rewards import view_gain_reward
 
 Range = tuple[float, float]
 
@@ -80,17 +79,27 @@ class GeneralTaskConfig:
             if not 0.0 <= getattr(self, name) <= 100.0:
                 raise InvalidInputError(f"{name} must be from 0 to 100; got {getattr(self, name)!r}")
 
-    def reward(self, after: Tensor, before: Tensor, success: Tensor, contact: Tensor) -> Tensor:
-        """`view_gain_reward` of a move with this task's weights. Each of shape (B,)."""
-        return view_gain_reward(
-            after,
-            before,
-            success,
-            contact,
-            step_cost=self.step_cost,
-            success_reward=self.success_reward,
-            contact_penalty=self.contact_penalty,
-        )
+    def reward(
+        self, visible_fraction: Tensor, previous_fraction: Tensor, success: Tensor, contact: Tensor
+    ) -> Tensor:
+        """R = V_f - V_f' - c + b [success] - k [contact], with V_f' the fraction before the move.
+
+        The first two terms are a potential's difference (Ng, Harada and Russell 1999, with an undiscounted potential):
+        over an episode they add up to the last V_f less the first, whichever way the camera took. A camera that stays
+        where it sees the target in part loses the step cost c with every move, whereas Eq. 5-9 pays it 0.1 for each.
+
+        Args:
+            visible_fraction: V_f after the move. Shape (B,).
+            previous_fraction: V_f before it. Shape (B,).
+            success: Whether the target is fully visible after it. Shape (B,), bool.
+            contact: Whether the arm touched a plant on the way. Shape (B,), bool.
+
+        Returns:
+            Shape (B,).
+        """
+        gain = visible_fraction - previous_fraction
+        bonus, penalty = self.success_reward * success.float(), self.contact_penalty * contact.float()
+        return gain - self.step_cost + bonus - penalty
 
     @property
     def largest_reward(self) -> float:

@@ -1,4 +1,4 @@
-"""The rules of the general tasks: a hidden tomato, a memory of what was seen, a reward for every gain in sight.
+"""The rules of the general tasks: a hidden tomato, a memory of what was seen, a reward for every gain in V_f.
 
 With a `TargetSequence` all ripe fruits of a row in reach are looked for, one after the other.
 """
@@ -14,6 +14,7 @@ from maniskill_tomato.plants.episode_list import Episode
 from maniskill_tomato.plants.row import Row
 from maniskill_tomato.robot.kinematics import link_transforms
 from maniskill_tomato.robot.look_at import camera_to_viewpoint
+from maniskill_tomato.robot.rotations import FORWARD_RPY
 from maniskill_tomato.robot.transit import TRANSIT_MOVES
 from maniskill_tomato.sensing.belief import Belief
 from maniskill_tomato.sensing.observation import ObservationLayout, ViewpointObserver
@@ -21,22 +22,19 @@ from maniskill_tomato.sensing.sensor_noise import SensorNoise
 from maniskill_tomato.sensing.simulated_camera import Perception
 from maniskill_tomato.tasks import MAX_ROW_STEPS
 from maniskill_tomato.tasks.arm_moves import Plan
-from maniskill_tomato.tasks.row.camera_senses import make_senses
 from maniskill_tomato.tasks.row.episode_selection import EpisodeChoice
 from maniskill_tomato.tasks.row.hidden_starts import HardStarts, Start
 from maniskill_tomato.tasks.row.row_config import CameraConfig, GeneralTaskConfig
-from maniskill_tomato.tasks.row.senses import Sight, Vantage
+from maniskill_tomato.tasks.row.senses import ViewMeasurement, ViewPoses, make_senses
 from maniskill_tomato.tasks.row.target_sequence import TargetSequence, Transits, with_transits
 from maniskill_tomato.tasks.world import World
 from maniskill_tomato.tasks.world_state import MAX_VIEWS
-
-START_RPY = (0.0, torch.pi / 2, 0.0)
-"""The angles that those of a first view are near to, in [rad]: along +x, upright."""
 
 
 class SearchGame:
     """The general task, and the row where `transits` says how arms get from target to target."""
 
+    keeps_belief = True
     saved_columns: tuple[str, ...] = tuple(
         "viewpoint reach target plant_pose plant_seed views view_count looks moves clearance path_length "
         "joint_path_length fraction_before fraction_after noise_seed position_error hidden_below open_targets "
@@ -76,7 +74,7 @@ class SearchGame:
         self._is_camera = perception != "ground_truth"
         self._starts = HardStarts(task, world.scene, world.device)
         self.sequence = None if transits is None else TargetSequence(world, self._observer.lattice, transits)
-        self._sight: Sight | None = None
+        self._measured: ViewMeasurement | None = None
         self._seen_from = torch.zeros(0)
         """Poses of the cameras at the last views. Shape (N, 4, 4)."""
         self.soft_starts = 0
@@ -98,7 +96,7 @@ class SearchGame:
         episode = self.episode(env_index, options)
         if episode is not None:
             return episode.plant_seed
-        return self._world.planting.spec.draw_seed(rng)
+        return self._world.plant_batch.spec.draw_seed(rng)
 
     def begin(
         self, env_idx: Tensor, rngs: Sequence[np.random.RandomState], options: Mapping[str, Any]
@@ -116,7 +114,7 @@ class SearchGame:
         self.soft_starts += sum(not start.is_hard for start in starts)
         world.set_target(env_idx, [start.target for start in starts])
         poses = torch.stack([start.T_world_camera for start in starts]).double()
-        near = torch.tensor([START_RPY], dtype=torch.float64, device=world.device).expand(len(starts), 3)
+        near = torch.tensor([FORWARD_RPY], dtype=torch.float64, device=world.device).expand(len(starts), 3)
         viewpoint = camera_to_viewpoint(poses, near).float()
         world.set_arm(env_idx, torch.stack([start.qpos for start in starts]), viewpoint)
         for i, rng, start in zip(indices, rngs, starts, strict=True):
@@ -127,7 +125,7 @@ class SearchGame:
         for length in (state.path_length, state.joint_path_length):
             length[env_idx] = 0.0
         clearance = world.scene.clearance_at(
-            state.qpos[env_idx], world.planting.T_world_plant[env_idx], env_idx
+            state.qpos[env_idx], world.plant_batch.T_world_plant[env_idx], env_idx
         )
         state.clearance[env_idx] = clearance
         if self.sequence is not None:
@@ -143,24 +141,27 @@ class SearchGame:
         """The fruits that can become targets."""
         if self.sequence is not None:
             return self.sequence.in_reach(env_index)
-        plant, ripe = self._world.planting.plants[env_index], self._world.planting.ripe_fruits[env_index]
+        plant, ripe = (
+            self._world.plant_batch.plants[env_index],
+            self._world.plant_batch.ripe_fruits[env_index],
+        )
         return [j for j in ripe if j < plant.middle_fruits] if isinstance(plant, Row) else ripe
 
     def _start(
         self, env_index: int, rng: np.random.RandomState, episode: Episode | None, options: Mapping[str, Any]
     ) -> Start:
-        planting = self._world.planting
+        plant_batch = self._world.plant_batch
         targets = [episode.target] if episode is not None else self._candidates(env_index)
         camera_position = options.get("camera_position", None)
         if camera_position is None and episode is not None:
             camera_position = episode.camera_position
         if "target" in options:
             targets = [self._world.checked_target(env_index, options["target"])]
-        positions = planting.fruit_positions_w(env_index, targets)
+        positions = plant_batch.fruit_positions_w(env_index, targets)
         if camera_position is not None:
             k = int(rng.randint(len(targets))) if len(targets) > 1 else 0
             return self._starts.given(camera_position, targets[k], positions[k])
-        return self._starts.draw(env_index, rng, targets, positions, planting.T_world_plant[env_index])
+        return self._starts.draw(env_index, rng, targets, positions, plant_batch.T_world_plant[env_index])
 
     def _forget(self, env_idx: Tensor) -> None:
         """Begins with other targets. Shape (b,)."""
@@ -218,7 +219,7 @@ class SearchGame:
             qpos[rows] = before[rows]
             T_w_camera = T_w_camera.clone()
             T_w_camera[rows] = self._seen_from[rows]
-        state.clearance = world.scene.clearance_along(before, qpos, world.planting.T_world_plant)
+        state.clearance = world.scene.clearance_along(before, qpos, world.plant_batch.T_world_plant)
         moved = (T_w_camera[:, :3, 3] - self._seen_from[:, :3, 3]).norm(dim=-1)
         state.path_length = state.path_length + moved
         state.moves = state.moves + 1
@@ -233,7 +234,7 @@ class SearchGame:
         for i, way in plan.transits.items():
             passed = way.passed.float()
             legs = len(passed) - 1
-            T_w_plant = world.planting.T_world_plant[i].expand(legs, 4, 4)
+            T_w_plant = world.plant_batch.T_world_plant[i].expand(legs, 4, 4)
             env_idx = torch.full((legs,), i, device=world.device)
             clearance = world.scene.clearance_along(passed[:-1], passed[1:], T_w_plant, env_idx).min()
             state.clearance[i] = torch.minimum(state.clearance[i], clearance)
@@ -268,7 +269,7 @@ class SearchGame:
         world, state = self._world, self._world.state
         rows = torch.arange(world.num_envs, device=world.device) if mask is None else mask.nonzero()[:, 0]
         state.views[rows, state.view_count[rows].clamp_max(MAX_VIEWS - 1)] = state.qpos[rows]
-        vantage = Vantage(
+        view = ViewPoses(
             T_w_camera=world.T_w_camera,
             T_w_links=world.T_w_links,
             qpos=state.qpos,
@@ -277,23 +278,23 @@ class SearchGame:
         )
         state.view_count[rows] += 1
         state.looks[rows] += 1
-        self._sense(vantage)
+        self._sense(view)
 
-    def _sense(self, vantage: Vantage) -> None:
+    def _sense(self, view: ViewPoses) -> None:
         """Senses one view of some environments and observes it."""
-        state, mask = self._world.state, vantage.mask
-        sight, located = self._senses.look(vantage)
-        seen_from = vantage.T_w_camera
-        if mask is not None and self._sight is not None:
-            sight = sight.where(mask, self._sight)
+        state, mask = self._world.state, view.mask
+        measured, located = self._senses.look(view)
+        seen_from = view.T_w_camera
+        if mask is not None and self._measured is not None:
+            measured = measured.where(mask, self._measured)
             seen_from = torch.where(mask[:, None, None], seen_from, self._seen_from)
-        self._sight, self._seen_from = sight, seen_from
-        state.visible_fraction = sight.visible_fraction
+        self._measured, self._seen_from = measured, seen_from
+        state.visible_fraction = measured.visible_fraction
         if located is not None and len(located):
             # What was seen before stood about the place where the target was thought to be.
             self._senses.revise(self._observer, located)
         self._observer.observe(
-            state.viewpoint, seen_from, sight.rays, sight.told_fraction, self._moves_left(), mask
+            state.viewpoint, seen_from, measured.rays, measured.told_fraction, self._moves_left(), mask
         )
 
     def recall(self, env_idx: Tensor) -> None:
@@ -307,7 +308,7 @@ class SearchGame:
             qpos = state.views[:, k]
             T_w_links = link_transforms(qpos)
             self._sense(
-                Vantage(
+                ViewPoses(
                     T_w_camera=self._world.camera_poses(T_w_links),
                     T_w_links=T_w_links,
                     qpos=qpos,
@@ -330,8 +331,8 @@ class SearchGame:
 
     def info(self) -> dict[str, Tensor]:
         """What came of the last move: V_f, whether that is a success, what it touched, how much of a row is done."""
-        state, sight = self._world.state, self._sight
-        assert sight is not None
+        state, measured = self._world.state, self._measured
+        assert measured is not None
         fraction = state.fraction_after
         info = {
             "success": fraction > self.task.full_visibility,
@@ -340,7 +341,7 @@ class SearchGame:
             "visible_fraction_gain": fraction - state.fraction_before,
             "target_id": self._world.target_id,
             "target_seen": fraction > 0.0,
-            "tomato_seen": sight.tomato_seen.clone(),
+            "tomato_seen": measured.tomato_seen.clone(),
             "reachability": state.reach.clone(),
             "clearance": state.clearance.clone(),
             "plant_contact": state.clearance <= 0.0,
@@ -348,14 +349,14 @@ class SearchGame:
             "path_length": state.path_length.clone(),
         }
         if self._is_camera:
-            info["true_visible_fraction"] = sight.true_fraction.clone()
-            info["true_success"] = sight.true_fraction > self.task.full_visibility
-            assert sight.chosen_fraction is not None and sight.chosen_fruit is not None
-            assert sight.named is not None
-            info["told_visible_fraction"] = sight.told_fraction.clone()
-            info["chosen_visible_fraction"] = sight.chosen_fraction.clone()
-            info["chosen_fruit"] = sight.chosen_fruit.clone()
-            info["target_named"] = sight.named.clone()
+            info["true_visible_fraction"] = measured.true_fraction.clone()
+            info["true_success"] = measured.true_fraction > self.task.full_visibility
+            assert measured.chosen_fraction is not None and measured.chosen_fruit is not None
+            assert measured.named is not None
+            info["told_visible_fraction"] = measured.told_fraction.clone()
+            info["chosen_visible_fraction"] = measured.chosen_fraction.clone()
+            info["chosen_fruit"] = measured.chosen_fruit.clone()
+            info["target_named"] = measured.named.clone()
         if self.sequence is not None:
             info["success"] = state.seen_count >= state.target_count
             over = self.sequence.is_over() | (state.moves >= MAX_ROW_STEPS)
@@ -368,8 +369,8 @@ class SearchGame:
         return info
 
     def reward(self, info: Mapping[str, Tensor]) -> Tensor:
-        """`view_gain_reward` of the last move; in a row each target that was seen is a success, and transits cost what
-        their moves do. Shape (N,)."""
+        """The reward of the last move; in a row each target that was seen is a success, and transits cost what their
+        moves do. Shape (N,)."""
         state = self._world.state
         success = info["success"] if self.sequence is None else info["target_done"]
         reward = self.task.reward(state.fraction_after, state.fraction_before, success, info["plant_contact"])

@@ -47,9 +47,9 @@ class TargetSequence:
 
     def in_reach(self, env_index: int) -> list[int]:
         """The ripe fruits that the arm can look at."""
-        planting = self._world.planting
-        ripe = [j for j in planting.ripe_fruits[env_index] if j < MAX_TARGETS]
-        reachable = self._lattice.reachable(planting.fruit_positions_w(env_index, ripe))
+        plant_batch = self._world.plant_batch
+        ripe = [j for j in plant_batch.ripe_fruits[env_index] if j < MAX_TARGETS]
+        reachable = self._lattice.reachable(plant_batch.fruit_positions_w(env_index, ripe))
         shares = reachable.float().mean(dim=-1).tolist()
         return [j for j, share in zip(ripe, shares, strict=True) if share >= REACHABLE_SHARE]
 
@@ -89,7 +89,7 @@ class TargetSequence:
         left: list[int] = state.open_targets[env_index].nonzero()[:, 0].tolist()
         if not left:
             return False
-        away = world.planting.fruit_positions_w(env_index, left) - world.T_w_camera[env_index, :3, 3]
+        away = world.plant_batch.fruit_positions_w(env_index, left) - world.T_w_camera[env_index, :3, 3]
         nearest = left[int(np.argmin(away.norm(dim=-1).tolist()))]
         world.set_target(torch.tensor([env_index], device=world.device), [nearest])
         state.target_moves[env_index] = 0

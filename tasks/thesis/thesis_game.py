@@ -9,7 +9,6 @@ from torch import Tensor
 
 from maniskill_tomato.robot.inverse_kinematics import Reach
 from maniskill_tomato.tasks.arm_moves import Plan
-from maniskill_tomato.tasks.thesis.other_targets import other_ripe_fruits
 from maniskill_tomato.tasks.thesis.starts import Starts
 from maniskill_tomato.tasks.thesis.thesis_config import ViewpointTaskConfig
 from maniskill_tomato.tasks.thesis.thesis_rewards import in_forbidden_zone
@@ -19,6 +18,7 @@ from maniskill_tomato.tasks.world import World
 class ThesisGame:
     """One class for both tasks; a `ViewpointTaskConfig` tells them apart."""
 
+    keeps_belief = False
     saved_columns: tuple[str, ...] = ("viewpoint", "reach", "target", "plant_pose", "plant_seed")
 
     def __init__(self, world: World, task: ViewpointTaskConfig, other_targets: int = 0) -> None:
@@ -38,14 +38,14 @@ class ThesisGame:
 
     def draw_plant(self, env_index: int, rng: np.random.RandomState, options: Mapping[str, Any]) -> int:
         """The seed of an environment's next plant, the first draw of its episode."""
-        return self._world.planting.spec.draw_seed(rng)
+        return self._world.plant_batch.spec.draw_seed(rng)
 
     def begin(
         self, env_idx: Tensor, rngs: Sequence[np.random.RandomState], options: Mapping[str, Any]
     ) -> None:
         """Draws targets among the ripe fruits, each with the same probability, and starts from the task's ranges."""
         world, indices = self._world, env_idx.tolist()
-        ripe = [world.planting.ripe_fruits[i] for i in indices]
+        ripe = [world.plant_batch.ripe_fruits[i] for i in indices]
         targets = [int(fruits[rng.randint(len(fruits))]) for fruits, rng in zip(ripe, rngs, strict=True)]
         if "target" in options:
             targets = [world.checked_target(i, options["target"]) for i in indices]
@@ -73,8 +73,8 @@ class ThesisGame:
     def recall(self, env_idx: Tensor) -> None:
         """Looks from where the arms are."""
         if self._other_targets:
-            self._others, self._others_exist = other_ripe_fruits(
-                self._world.planting.ripe_fruits, self._world.state.target, self._other_targets
+            self._others, self._others_exist = _other_ripe_fruits(
+                self._world.plant_batch.ripe_fruits, self._world.state.target, self._other_targets
             )
         self._look()
 
@@ -88,7 +88,9 @@ class ThesisGame:
     def _judge(self, target: Tensor) -> dict[str, Tensor]:
         """The present view as one of `target`, indices in `Plant.fruits`. Shape (N,)."""
         world, state = self._world, self._world.state
-        seen = world.scene.visibility(world.T_w_camera, target, world.planting.T_world_plant, world.T_w_links)
+        seen = world.scene.visibility(
+            world.T_w_camera, target, world.plant_batch.T_world_plant, world.T_w_links
+        )
         fraction, tomato_seen = seen.visible_fraction, seen.any_visible
         target_seen = fraction > 0.0
         forbidden = in_forbidden_zone(state.viewpoint[:, :3])
@@ -130,7 +132,7 @@ class ThesisGame:
 
     def _info_of_others(self) -> dict[str, Tensor]:
         judged = self._views_of_others
-        position = self._world.planting.fruit_position_w
+        position = self._world.plant_batch.fruit_position_w
         return {
             "other_visible_fraction": torch.stack([j["visible_fraction"] for j in judged], dim=-1),
             "other_success": torch.stack([j["success"] for j in judged], dim=-1),
@@ -142,3 +144,30 @@ class ThesisGame:
     def reward(self, info: Mapping[str, Tensor]) -> Tensor:
         """R = R_v + P_p. Shape (N,)."""
         return self.task.reward(info["reward_visual"], info["reward_penalty"])
+
+
+def _other_ripe_fruits(
+    ripe_fruits: Sequence[Sequence[int]], target: Tensor, count: int
+) -> tuple[Tensor, Tensor]:
+    """The ripe fruits that follow the target in the order of the plant's, the first again after the last.
+
+    The order makes the choice repeatable without a random draw, and as even as that of the target.
+
+    Args:
+        ripe_fruits: Indices of the ripe fruits of each environment's plant.
+        target: Index of each environment's target in `Plant.fruits`. Shape (N,).
+        count: How many.
+
+    Returns:
+        Their indices, that of the target where the plant has fewer, and whether there is such a fruit. Both of
+        shape (N, count), the latter bool.
+    """
+    fruits, exist = [], []
+    for ripe, own in zip(ripe_fruits, target.tolist(), strict=True):
+        at = ripe.index(own) if own in ripe else -1
+        others = [fruit for fruit in (*ripe[at + 1 :], *ripe[: max(at, 0)]) if fruit != own][:count]
+        missing = count - len(others)
+        fruits.append(others + [own] * missing)
+        exist.append([True] * len(others) + [False] * missing)
+    device = target.device
+    return torch.tensor(fruits, device=device), torch.tensor(exist, device=device)

@@ -17,8 +17,9 @@ from maniskill_tomato.cli import main, parse
 from maniskill_tomato.cli.eval_command import Eval
 from maniskill_tomato.cli.shared_options import PlantOptions
 from maniskill_tomato.cli.train_command import Train
+from maniskill_tomato.files import write_tensors
 from maniskill_tomato.learning.rl.agent import make_agent
-from maniskill_tomato.learning.rl.checkpoint import make_checkpoint, save_checkpoint
+from maniskill_tomato.learning.rl.checkpoint import make_checkpoint
 from maniskill_tomato.learning.rl.presets import get_preset
 from maniskill_tomato.policies.trained_actor import load_actor, load_checkpoint
 from maniskill_tomato.tasks import THESIS_IDS
@@ -40,7 +41,7 @@ SHORT = (
 def make_policy(path: Path, env_id: str = GUIDED) -> Path:
     """An untrained policy, good enough to be evaluated."""
     agent = make_agent(get_preset("td3"), 9, 6)
-    save_checkpoint(path, make_checkpoint(agent, env_id, (-torch.ones(6), torch.ones(6)), {"steps": 0}))
+    write_tensors(path, make_checkpoint(agent, env_id, (-torch.ones(6), torch.ones(6)), {"steps": 0}))
     return path
 
 

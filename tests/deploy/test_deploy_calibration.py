@@ -11,26 +11,19 @@ import numpy as np
 import pytest
 import torch
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from maniskill_tomato.cli import main
 from maniskill_tomato.deploy.calibration.board import CharucoBoard
-from maniskill_tomato.deploy.calibration.board_print import print_board
-from maniskill_tomato.deploy.calibration.calibration_file import read_calibration, write_calibration
 from maniskill_tomato.deploy.calibration.hand_eye import (
     BoardView,
     CalibrationError,
     HandEyeResult,
     board_pose,
     calibrate_hand_eye,
+    write_calibration,
 )
-from maniskill_tomato.deploy.calibration.picture import draw_calibration
-from maniskill_tomato.deploy.calibration.rigid import (
-    difference,
-    inverse,
-    rotation_from_vector,
-    transform,
-    vector_from_rotation,
-)
+from maniskill_tomato.deploy.calibration.picture import draw_calibration, print_board
 from maniskill_tomato.deploy.calibration.view_capture import CapturePlan, camera_poses, capture_views
 from maniskill_tomato.deploy.calibration.view_folder import (
     RecordedView,
@@ -40,12 +33,12 @@ from maniskill_tomato.deploy.calibration.view_folder import (
     write_views,
 )
 from maniskill_tomato.deploy.clock import SimulatedClock
-from maniskill_tomato.deploy.deploy_errors import StoppedError
+from maniskill_tomato.deploy.deploy_errors import ProfileError, StoppedError
 from maniskill_tomato.deploy.guarded_arm import GuardedArm
 from maniskill_tomato.deploy.interface import Arm, ArmState, Camera, Float64, Frame, JointMove
-from maniskill_tomato.deploy.profile import parse_profile
-from maniskill_tomato.deploy.safety import Safety
-from maniskill_tomato.deploy.safety_config import SafetyConfig
+from maniskill_tomato.deploy.profile import Profile, parse_profile
+from maniskill_tomato.deploy.rigid import difference, transform
+from maniskill_tomato.deploy.safety import Safety, SafetyConfig
 from maniskill_tomato.deploy.stops import Stops
 from maniskill_tomato.errors import InvalidInputError
 from maniskill_tomato.robot import d435
@@ -57,13 +50,13 @@ BOARD = CharucoBoard()
 COLOR = d435.color_intrinsics(640, 480, "measured")
 # A bracket 20 mm and 4 degrees off its drawing.
 X = d435.T_flange_camera_color_optical @ transform(
-    rotation_from_vector(np.array([0.03, -0.05, 0.04])), np.array([0.012, -0.008, 0.015])
+    Rotation.from_rotvec([0.03, -0.05, 0.04]), [0.012, -0.008, 0.015]
 )
 # The board lies on a block before the robot, its print up.
 Z = transform(
-    np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
-    @ rotation_from_vector(np.array([0.1, 0.0, 0.3])),
-    np.array([0.5, -0.1, 0.15]),
+    Rotation.from_matrix([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
+    * Rotation.from_rotvec([0.1, 0.0, 0.3]),
+    [0.5, -0.1, 0.15],
 )
 START = np.deg2rad([0.0, 20.0, 0.0, -95.0, 0.0, 65.0, 0.0])
 
@@ -102,7 +95,7 @@ def postures(count: int, seed: int = 0, roll: float = 1.0, tilt: float = 0.6) ->
             torch.from_numpy(middle + distance * away), torch.from_numpy(middle), rng.uniform(-roll, roll)
         ).numpy()
         solution = kinematics.solve(
-            torch.from_numpy(pose @ inverse(X))[None], torch.from_numpy(START)[None], neighbour=False
+            torch.from_numpy(pose @ np.linalg.inv(X))[None], torch.from_numpy(START)[None], neighbour=False
         )
         if int(solution.reach[0]) == 0:
             found.append(solution.qpos[0].numpy())
@@ -110,7 +103,7 @@ def postures(count: int, seed: int = 0, roll: float = 1.0, tilt: float = 0.6) ->
 
 
 def recorded(joints: Float64, number: int, noise: float = 3.0) -> RecordedView:
-    picture = rendered(inverse(flange_pose(joints) @ X) @ Z, number, noise)
+    picture = rendered(np.linalg.inv(flange_pose(joints) @ X) @ Z, number, noise)
     return RecordedView(name=f"view_{number:03d}.png", color=picture, joint_positions=joints)
 
 
@@ -119,7 +112,7 @@ def exact_views(joints: list[Float64], noise_px: float = 0.0, seed: int = 0) -> 
     rng = np.random.default_rng(seed)
     views = []
     for number, q in enumerate(joints):
-        points = BOARD.corners @ (chain := inverse(flange_pose(q) @ X) @ Z)[:3, :3].T + chain[:3, 3]
+        points = BOARD.corners @ (chain := np.linalg.inv(flange_pose(q) @ X) @ Z)[:3, :3].T + chain[:3, 3]
         pixels = COLOR.project(points) + rng.normal(0.0, noise_px, (len(points), 2))
         inside = np.all((pixels > 0) & (pixels < [COLOR.width, COLOR.height]), axis=1)
         views.append(
@@ -211,14 +204,13 @@ def test_turns_about_one_axis_only_are_refused() -> None:
     spun = [
         replace(
             seen[0],
-            T_base_flange=seen[0].T_base_flange
-            @ transform(rotation_from_vector(np.array([0.0, 0.0, a])), np.zeros(3)),
+            T_base_flange=seen[0].T_base_flange @ transform(Rotation.from_rotvec([0.0, 0.0, a]), np.zeros(3)),
         )
         for a in np.linspace(-0.5, 0.5, 8)
     ]
     shown = []
     for view in spun:
-        chain = inverse(view.T_base_flange @ X) @ Z
+        chain = np.linalg.inv(view.T_base_flange @ X) @ Z
         pixels = COLOR.project(BOARD.corners @ chain[:3, :3].T + chain[:3, 3])
         shown.append(replace(view, corner_ids=np.arange(len(pixels), dtype=np.int64), corners_px=pixels))
     with pytest.raises(CalibrationError, match="second axis"):
@@ -267,16 +259,6 @@ def test_the_board_is_printed_at_its_true_size(tmp_path: Path) -> None:
         print_board(tmp_path / "board.bmp", small)
 
 
-def test_rotation_vectors_and_rotations_agree_also_near_half_a_turn() -> None:
-    rng = np.random.default_rng(0)
-    for angle in (0.0, 1e-12, 1e-7, 0.5, 3.0, np.pi - 1e-8, np.pi):
-        axis = rng.normal(size=3)
-        vector = axis / np.linalg.norm(axis) * angle
-        rotation = rotation_from_vector(vector)
-        np.testing.assert_allclose(rotation, cv2.Rodrigues(vector)[0], atol=1e-9)
-        np.testing.assert_allclose(rotation_from_vector(vector_from_rotation(rotation)), rotation, atol=1e-7)
-
-
 def test_a_folder_of_views_comes_back_as_it_was_written(tmp_path: Path, views: list[RecordedView]) -> None:
     write_views(tmp_path, views[:2], COLOR, "123")
     write_views(tmp_path, views[:3], COLOR, "123")
@@ -317,29 +299,30 @@ def test_a_broken_folder_is_told_with_the_key(
         read_views(tmp_path)
 
 
-def test_the_calibration_file_is_read_again_and_by_the_profile(tmp_path: Path, result: HandEyeResult) -> None:
+def profile_of(file: Path) -> Profile:
+    """The profile that names a calibration file."""
+    text = f'[arm]\ndriver = "mock"\n[camera]\ndriver = "mock"\n[calibration]\nfile = "{file.name}"\n'
+    return parse_profile(text, file.with_name("lab.toml"))
+
+
+def test_the_profile_reads_what_the_calibration_file_was_given(tmp_path: Path, result: HandEyeResult) -> None:
     path = tmp_path / "calibration.json"
     write_calibration(path, result, COLOR, "0123 4'5")
-    again = read_calibration(path)
-    np.testing.assert_array_equal(again.T_flange_camera, result.T_flange_camera)
-    assert again.color_size == (640, 480) and again.view_count == 15 and again.serial == "0123 4'5"
-    text = '[arm]\ndriver = "mock"\n[camera]\ndriver = "mock"\n[calibration]\nfile = "calibration.json"\n'
-    profile = parse_profile(text, tmp_path / "lab.toml")
+    profile = profile_of(path)
     assert profile.calibrated
     np.testing.assert_array_equal(profile.T_flange_camera, result.T_flange_camera)
+    table = json.loads(path.read_text())
+    assert table["color_size"] == [640, 480] and table["view_count"] == 15 and table["serial"] == "0123 4'5"
 
 
 @pytest.mark.parametrize(
     ("change", "match"),
     [
-        (lambda t: t.pop("T_flange_camera"), "T_flange_camera is missing"),
-        (lambda t: t["T_flange_camera"][0].__setitem__(0, float("nan")), "finite"),
+        (lambda t: t.pop("T_flange_camera"), "calibration.file .* cannot be used"),
+        (lambda t: t["T_flange_camera"][0].__setitem__(0, float("nan")), "must be a 4 x 4 transform"),
         (lambda t: t["T_flange_camera"][0].__setitem__(0, 2.0), "rotation"),
         (lambda t: t["T_flange_camera"][2].__setitem__(3, 47.0), "metres"),
-        (lambda t: t["T_flange_camera"].pop(), "shape"),
-        (lambda t: t.update(rms_px="small"), "rms_px must be numbers"),
-        (lambda t: t.update(serial=5), "serial must be a string"),
-        (lambda t: t.update(view_count=0), "positive"),
+        (lambda t: t["T_flange_camera"].pop(), "must be a 4 x 4 transform"),
     ],
 )
 def test_a_broken_calibration_file_is_told_with_the_key(
@@ -350,8 +333,8 @@ def test_a_broken_calibration_file_is_told_with_the_key(
     table = json.loads(path.read_text())
     change(table)
     path.write_text(json.dumps(table))
-    with pytest.raises(CalibrationError, match=match):
-        read_calibration(path)
+    with pytest.raises(ProfileError, match=match):
+        profile_of(path)
 
 
 def test_the_picture_of_the_residuals_is_drawn(tmp_path: Path, result: HandEyeResult) -> None:
@@ -368,9 +351,8 @@ def test_the_command_calculates_from_a_folder_and_writes_file_and_picture(
     out = tmp_path / "out"
     main(["deploy", "calibrate", "--views", str(tmp_path / "views"), "--out", str(out)])
     assert "15 views" in capsys.readouterr().out
-    calibration = read_calibration(out / "calibration.json")
-    assert calibration.serial == "42"
-    assert difference(calibration.T_flange_camera, X)[0] < 0.0002
+    assert json.loads((out / "calibration.json").read_text())["serial"] == "42"
+    assert difference(profile_of(out / "calibration.json").T_flange_camera, X)[0] < 0.0002
     assert (out / "calibration.png").stat().st_size > 10_000
 
 
@@ -381,7 +363,7 @@ def test_the_command_calculates_from_a_folder_and_writes_file_and_picture(
         (["--views", "/nowhere"], "there is no folder /nowhere"),
         (["--views", "."], "no views.json"),
         (["--views", ".", "--square", "30"], "square_length must be"),
-        (["--profile", "mock", "--confirm", "--unattended"], "not both"),
+        (["--profile", "mock", "--confirm", "--unattended"], "exclude each other"),
     ],
 )
 def test_the_command_says_in_one_line_what_is_wrong(
@@ -467,7 +449,7 @@ class BoardCamera(Camera):
     def read(self, max_age_s: float = 0.5, after: float | None = None) -> Frame:
         self.number += 1
         self.arm.clock.sleep(0.03)
-        color = rendered(inverse(flange_pose(self.arm.joints) @ X) @ Z, self.number)
+        color = rendered(np.linalg.inv(flange_pose(self.arm.joints) @ X) @ Z, self.number)
         depth = np.zeros(color.shape[:2], np.float32)
         return Frame(
             color=color, depth=depth, intrinsics=COLOR, stamp=self.arm.clock.now(), number=self.number

@@ -114,7 +114,7 @@ def test_a_fault_has_its_own_exit_status(tmp_path: Path, capsys: pytest.CaptureF
         (["run", "--policy", "missing.pt"], "no policy at 'missing.pt'"),
         (["run", "--policy", ""], "no policy at ''"),
         (["run", "--policy", "oracle"], "in simulation only"),
-        (["run", "--confirm", "--unattended"], "not several"),
+        (["run", "--confirm", "--unattended"], "exclude each other"),
         (["run", "--seed", "-1"], "the seed must be 0 or more"),
         (["run", "--out", "/dev/null/x"], "cannot use the folder"),
         (["calibrate", "--profile", "mock", "--out", "/dev/null/x"], "cannot use the folder"),

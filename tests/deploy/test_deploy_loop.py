@@ -19,14 +19,12 @@ from maniskill_tomato.deploy.clock import SimulatedClock
 from maniskill_tomato.deploy.deploy_errors import ProfileError, RefusedError
 from maniskill_tomato.deploy.guarded_arm import GuardedArm
 from maniskill_tomato.deploy.interface import Frame, JointMove
-from maniskill_tomato.deploy.loop import Loop
-from maniskill_tomato.deploy.loop_config import Proposal
+from maniskill_tomato.deploy.loop import TASK, Loop, default_policy
 from maniskill_tomato.deploy.mock.episode import load_episode
-from maniskill_tomato.deploy.policies import TASK, default_policy
 from maniskill_tomato.deploy.profile import Profile, load_profile, parse_profile
 from maniskill_tomato.deploy.profile_files import profile_names
 from maniskill_tomato.deploy.robot_perception import TRUE_MASKS, ImagePerception, Sighting
-from maniskill_tomato.deploy.run_records import KeptSteps, RunResult
+from maniskill_tomato.deploy.run_records import KeptSteps, Proposal, RunResult
 from maniskill_tomato.deploy.stops import Stops
 from maniskill_tomato.deploy.workcell import Workcell, make_workcell
 from maniskill_tomato.errors import PolicyError
@@ -87,7 +85,7 @@ def go(
     options.setdefault("mode", "unattended")
     clock_works = not isinstance(clock, JumpingClock)
     with workcell.arm, workcell.camera, stops or Stops() as listening:
-        loop = workcell.loop(policy or Towards(), listening, **options)
+        loop = Loop(workcell, policy or Towards(), listening, **options)
         result = loop.run()
         world: Any = workcell.arm
         speeds = np.abs(world._world.arm.joint_velocities)
@@ -130,7 +128,7 @@ def test_without_depth_the_arm_goes_back_once_and_no_farther() -> None:
     """A leaf may cover the lens; a camera that gives no depth where it gave some before is broken."""
     faults = 'depth_noise = 0.0\nfaults = { camera = "zero_depth", camera_from_read = 2%s }'
     kept = KeptSteps()
-    broken, workcell = go(profile(faults % ""), recorder=kept)
+    broken, workcell = go(profile(faults % ""), recorders=[kept])
     assert (broken.reason, broken.is_fault, broken.moves) == ("bad_picture", True, 3), broken.detail
     assert [step.outcome for step in kept.steps] == ["moved"] * 3 and kept.steps[2].action is None
     arm: Any = workcell.arm
@@ -188,7 +186,7 @@ def test_refusals_with_a_move_between_them_are_not_in_a_row() -> None:
 
     arm.command = refuse_every_second
     with workcell.arm, workcell.camera, Stops() as stops:
-        result = workcell.loop(open_policy("stay"), stops, "unattended").run()
+        result = Loop(workcell, open_policy("stay"), stops, "unattended").run()
     assert (result.reason, result.moves, result.refused_moves) == ("budget", 6, 3), result.detail
 
 
@@ -235,7 +233,7 @@ class Withheld(TrueMasks):
 def with_perception(of: Profile, perception: Any, policy: Policy) -> RunResult:
     workcell = replace(make_workcell(of, EPISODE), perception=perception)
     with workcell.arm, workcell.camera, Stops() as stops:
-        return workcell.loop(policy, stops, "unattended").run()
+        return Loop(workcell, policy, stops, "unattended").run()
 
 
 def test_a_target_that_stays_out_of_sight_is_lost() -> None:
@@ -270,7 +268,7 @@ def test_a_neighbour_does_not_pass_for_a_target_that_is_not_found(seed: int) -> 
     workcell = replace(workcell, perception=Withheld())
     kept = KeptSteps()
     with workcell.arm, workcell.camera, Stops() as stops:
-        result = workcell.loop(open_policy(default_policy(), env_id=TASK), stops, "unattended", kept).run()
+        result = Loop(workcell, open_policy(default_policy(), env_id=TASK), stops, "unattended", [kept]).run()
     assert not result.success and not result.is_fault
     assert max(step.view.fruits_seen for step in kept.steps) > 0
     assert result.best_visible_fraction < 0.3, "a sliver at most, where a fruit can hardly be located"
@@ -495,4 +493,4 @@ def test_only_the_guarded_arm_commands_an_arm() -> None:
     }
     # The loop's `_arm` is a `GuardedArm`, which its type says; drivers define `command` but do not call one.
     assert callers == {"guarded_arm.py", "loop.py"}
-    assert get_type_hints(Loop.__init__)["arm"] is GuardedArm
+    assert get_type_hints(Workcell)["guarded_arm"] is GuardedArm

@@ -8,8 +8,7 @@ import torch
 
 from maniskill_tomato.deploy.interface import Frame, FrameTruth
 from maniskill_tomato.deploy.mock.episode import load_episode
-from maniskill_tomato.deploy.robot_belief import FIRST_RPY, RobotBelief
-from maniskill_tomato.deploy.robot_perception import PLACE_ERROR, TRUE_MASKS, ImagePerception
+from maniskill_tomato.deploy.robot_perception import PLACE_ERROR, TRUE_MASKS, ImagePerception, RobotBelief
 from maniskill_tomato.raycast.images import FIRST_ORGAN_LABEL, ROBOT_LABEL
 from maniskill_tomato.raycast.scene import RayScene
 from maniskill_tomato.raycast.view_rays import ViewRays
@@ -17,7 +16,7 @@ from maniskill_tomato.robot.d435 import T_flange_camera_color_optical, color_int
 from maniskill_tomato.robot.kinematics import link_transforms
 from maniskill_tomato.robot.look_at_move import LookAtMover
 from maniskill_tomato.robot.robot_description import link_meshes
-from maniskill_tomato.robot.rotations import matrix_to_rpy
+from maniskill_tomato.robot.rotations import FORWARD_RPY, matrix_to_rpy
 from maniskill_tomato.segmentation.instances import Instances
 from maniskill_tomato.sensing.camera_perception import CameraPerception
 from maniskill_tomato.sensing.fruit_detector import FruitDetector
@@ -102,7 +101,7 @@ def test_the_same_frames_give_the_same_observation_in_the_simulator_and_on_the_r
         robots[k].begin(place)
 
     qpos = torch.tensor(np.array([e.start_joints for e in episodes]), dtype=torch.float32)
-    rpy = torch.tensor([FIRST_RPY] * n)
+    rpy = torch.tensor([FORWARD_RPY] * n)
     mover, seen, recalled = LookAtMover(), 0, 0
     for step in range(len(MOVES) + 1):
         links = link_transforms(qpos)

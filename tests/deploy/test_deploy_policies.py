@@ -13,14 +13,16 @@ from onnx import numpy_helper
 
 from maniskill_tomato.assets import asset_path
 from maniskill_tomato.cli import main
+from maniskill_tomato.deploy.loop import Loop
 from maniskill_tomato.deploy.profile import load_profile
 from maniskill_tomato.deploy.run_records import KeptSteps
 from maniskill_tomato.deploy.run_replay import load_recording
 from maniskill_tomato.deploy.stops import Stops
 from maniskill_tomato.deploy.workcell import make_workcell
 from maniskill_tomato.errors import PolicyError
+from maniskill_tomato.files import write_tensors
 from maniskill_tomato.learning.rl.agent import make_agent
-from maniskill_tomato.learning.rl.checkpoint import make_checkpoint, save_checkpoint
+from maniskill_tomato.learning.rl.checkpoint import make_checkpoint
 from maniskill_tomato.learning.rl.export import export_policy
 from maniskill_tomato.learning.rl.presets import get_preset
 from maniskill_tomato.policies.opening import open_policy
@@ -54,7 +56,7 @@ def saved(path: Path, bound: float = 1.0) -> Path:
         agent.actor.output.weight *= 10.0
         agent.actor.output.bias[:] = torch.tensor([0.6, 0.8, 0.5])
     bounds = (-bound * torch.ones(3), bound * torch.ones(3))
-    save_checkpoint(path, make_checkpoint(agent, TASK, bounds, {"steps": 1, "episodes": 1, "seed": 3}))
+    write_tensors(path, make_checkpoint(agent, TASK, bounds, {"steps": 1, "episodes": 1, "seed": 3}))
     return path
 
 
@@ -92,7 +94,7 @@ def test_an_exported_policy_makes_the_moves_that_it_makes_in_torch(tmp_path: Pat
     workcell, kept = make_workcell(load_profile(str(profile)), SEED), KeptSteps()
     with workcell.arm, workcell.camera, Stops() as stops:
         policy = open_policy(source, env_id=TASK)
-        workcell.loop(policy, stops, "unattended", kept).run()
+        Loop(workcell, policy, stops, "unattended", [kept]).run()
     assert len(kept.steps) == len(exported) == 6
     assert any(step.outcome == "moved" for step in kept.steps)
     for step, facts in zip(kept.steps, exported, strict=True):

@@ -11,9 +11,8 @@ import torch
 import maniskill_tomato  # noqa: F401
 from maniskill_tomato.deploy.deploy_errors import NotConnectedError, ProfileError, RefusedError
 from maniskill_tomato.deploy.interface import Frame
-from maniskill_tomato.deploy.picture_fit import depth_in_mm, fit_color, fit_depth
 from maniskill_tomato.deploy.profile import parse_profile
-from maniskill_tomato.deploy.real_agent import IiwaRealAgent
+from maniskill_tomato.deploy.real_agent import IiwaRealAgent, depth_in_mm, fit_color, fit_depth
 from maniskill_tomato.deploy.sim2real import TomatoSim2RealEnv
 from maniskill_tomato.deploy.workcell import make_workcell
 from maniskill_tomato.robot import d435

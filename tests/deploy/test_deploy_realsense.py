@@ -23,7 +23,7 @@ from maniskill_tomato.deploy.deploy_errors import (
 )
 from maniskill_tomato.deploy.drivers import DriverContext, make_camera
 from maniskill_tomato.deploy.interface import Camera
-from maniskill_tomato.deploy.realsense import sdk as sdk_module
+from maniskill_tomato.deploy.realsense import source as sdk_module
 from maniskill_tomato.deploy.realsense.realsense_camera import RealSenseCamera
 from maniskill_tomato.deploy.realsense.realsense_config import RealSenseConfig
 from maniskill_tomato.deploy.realsense.realsense_recording import write_recording

@@ -18,12 +18,11 @@ from maniskill_tomato.deploy.clock import SimulatedClock
 from maniskill_tomato.deploy.deploy_errors import NotConnectedError
 from maniskill_tomato.deploy.drivers import DriverContext
 from maniskill_tomato.deploy.interface import Float64
-from maniskill_tomato.deploy.mock.twin_options import twin_options, twin_world
-from maniskill_tomato.deploy.mock.twin_world import TwinWorld
+from maniskill_tomato.deploy.loop import Loop
+from maniskill_tomato.deploy.mock.twin_world import TwinWorld, twin_options, twin_world
 from maniskill_tomato.deploy.profile import Profile, parse_profile
 from maniskill_tomato.deploy.realsense.realsense_config import RealSenseConfig
-from maniskill_tomato.deploy.realsense.sdk import load_sdk
-from maniskill_tomato.deploy.realsense.source import FrameSource
+from maniskill_tomato.deploy.realsense.source import FrameSource, load_sdk
 from maniskill_tomato.deploy.run_records import KeptSteps, RunResult, Step
 from maniskill_tomato.deploy.run_replay import load_recording
 from maniskill_tomato.deploy.stops import Stops
@@ -123,7 +122,7 @@ def profile(path: Path, recording: Path | None, target: Float64 | None = None) -
 def run(of: Profile, policy: Planner, clock: FastClock | None) -> tuple[RunResult, list[Step]]:
     kept, workcell = KeptSteps(), make_workcell(of, SEED, clock)
     with workcell.arm, workcell.camera, Stops() as stops:
-        result = workcell.loop(policy, stops, "unattended", kept).run()
+        result = Loop(workcell, policy, stops, "unattended", [kept]).run()
     return result, kept.steps
 
 

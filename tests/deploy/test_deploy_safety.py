@@ -10,13 +10,12 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from maniskill_tomato.deploy.clock import SimulatedClock
-from maniskill_tomato.deploy.collision import CollisionChecker
+from maniskill_tomato.deploy.collision import Box, CollisionChecker
 from maniskill_tomato.deploy.deploy_errors import DeviceTimeoutError, FaultError, RefusedError
 from maniskill_tomato.deploy.guarded_arm import GuardedArm
 from maniskill_tomato.deploy.interface import Arm, ArmState, JointMove
 from maniskill_tomato.deploy.plant_points import sphere_distances
-from maniskill_tomato.deploy.safety import Safety, joint_path
-from maniskill_tomato.deploy.safety_config import Box, SafetyConfig
+from maniskill_tomato.deploy.safety import Safety, SafetyConfig, joint_path
 from maniskill_tomato.errors import InvalidInputError
 from maniskill_tomato.robot.d435 import T_flange_camera_color_optical
 from maniskill_tomato.robot.iiwa14 import JOINT_AXES, JOINT_ORIGINS, JOINT_UPPER, READY_QPOS
@@ -77,6 +76,81 @@ def test_each_check_refuses_with_its_reason(
         safety = Safety(SafetyConfig(max_flange_step=0.1))
     refusal = safety.check(move(joints, speed), state(), now, frame)
     assert refusal is not None and refusal.reason == reason, refusal
+
+
+def test_ages_at_the_bound_are_accepted() -> None:
+    config = SafetyConfig(max_state_age=0.5, max_frame_age=8.0)
+    assert Safety(config).check(move(READY_QPOS), state(), 10.5, 2.5) is None
+
+
+@pytest.mark.parametrize("sign", [-1.0, 1.0])
+def test_the_margin_holds_at_both_limits_of_a_joint_and_is_named_in_degrees(sign: float) -> None:
+    safety = Safety(SafetyConfig(joint_margin=0.1))
+    bound = JOINT_UPPER[2] - 0.1
+    goal, start = READY_QPOS.copy(), READY_QPOS.copy()
+    goal[2], start[2] = sign * (bound + 0.01), sign * (bound - 0.05)
+    refusal = safety.check(move(goal), state(start), 10.0)
+    assert refusal is not None and refusal.reason == "joint_limit"
+    assert f"+-{np.rad2deg(bound):.1f} deg, got {sign * np.rad2deg(bound + 0.01):.1f} deg" in refusal.detail
+
+
+def test_an_arm_outside_the_workspace_may_come_in() -> None:
+    goal = turned(j2=0.1)
+    way = np.array([plain_flange(joints) for joints in joint_path(READY_QPOS, goal, 0.05)])
+    assert (np.diff(way[:, 0]) > 1e-3).all()
+    inner = Box(low=(float(way[0, 0]) + 1e-3, -0.9, 0.1), high=(0.9, 0.9, 1.35))
+    safety = Safety(SafetyConfig(workspace=inner, path_step=0.05))
+    assert safety.check(move(goal), state(), 10.0) is None
+    assert safety.check(move(READY_QPOS), state(goal), 10.0) is not None
+
+
+def test_the_first_place_outside_and_in_a_zone_is_named() -> None:
+    goal = turned(j2=0.1)
+    way = np.array([plain_flange(joints) for joints in joint_path(READY_QPOS, goal, 0.02)])
+    fourth = "(" + ", ".join(f"{v:.3f}" for v in way[4]) + ") m"
+    between = float(way[3, 0] + way[4, 0]) / 2
+    workspace = Box(low=(-0.9, -0.9, 0.0), high=(between, 0.9, 1.35))
+    refusal = Safety(SafetyConfig(workspace=workspace, path_step=0.02)).check(move(goal), state(), 10.0)
+    assert refusal is not None and refusal.reason == "workspace" and fourth in refusal.detail
+    zone = Box(low=(between, -0.9, 0.0), high=(float(way[4, 0]) + 1e-4, 0.9, 1.35))
+    refusal = Safety(SafetyConfig(forbidden=(zone,), path_step=0.02)).check(move(goal), state(), 10.0)
+    assert refusal is not None and refusal.reason == "forbidden_zone" and "flange" in refusal.detail
+    assert fourth in refusal.detail
+
+
+def test_a_contact_is_named_with_its_distance_and_the_share_of_the_move_before_it() -> None:
+    goal = turned(j2=0.3)
+    ahead = float(plain_flange(READY_QPOS)[0]) + 0.12
+    wall = Box(low=(ahead, -1.0, 0.0), high=(ahead + 0.08, 1.0, 2.0))
+    safety = Safety(SafetyConfig(obstacles=(wall,), obstacle_clearance=0.02, path_step=0.003))
+    refusal = safety.check(move(goal), state(), 10.0)
+    assert refusal is not None and refusal.reason == "obstacle"
+    words = refusal.detail.split()
+    # Between two samples of the way, 3 mrad apart, no part of the arm moves by more than 4 mm.
+    assert 16 <= int(words[words.index("mm") - 1]) <= 20
+    # Less of the same move is free, as much of it is not.
+    share = float(words[words.index("after") + 1].rstrip("%")) / 100
+    assert 0.1 < share < 0.95
+    assert safety.check(move(turned(j2=0.3 * (share - 0.02))), state(), 10.0) is None
+    assert safety.check(move(turned(j2=0.3 * (share + 0.02))), state(), 10.0) is not None
+    # In ten samples the share is a whole number of tenths.
+    coarse = Safety(SafetyConfig(obstacles=(wall,), obstacle_clearance=0.02, path_step=0.0301))
+    refusal = coarse.check(move(goal), state(), 10.0)
+    assert refusal is not None and "0% of the move" in refusal.detail
+
+
+def test_a_posture_stands_in_collision_with_itself_or_with_enough_points_of_the_plant(safety: Safety) -> None:
+    folded = np.deg2rad([0.0, 110.0, 0.0, -120.0, 0.0, 100.0, 0.0])
+    assert safety.stands_in_collision(folded, None)
+    assert not safety.stands_in_collision(READY_QPOS, None)
+    leaf = plain_flange(READY_QPOS) + np.random.default_rng(0).normal(0.0, 0.005, (20, 3))
+    assert safety.stands_in_collision(READY_QPOS, leaf)
+    assert not safety.stands_in_collision(READY_QPOS, leaf[:3]), "a few points are noise"
+    far = leaf + [0.0, 0.0, 0.6]
+    assert not safety.stands_in_collision(READY_QPOS, far)
+    assert not safety.stands_in_collision(READY_QPOS, np.concatenate([leaf[:3], far]))
+    blind = Safety(SafetyConfig(plant_clearance=None))
+    assert not blind.stands_in_collision(READY_QPOS, leaf)
 
 
 def test_a_state_that_is_not_finite_lets_nothing_through(safety: Safety) -> None:

@@ -31,8 +31,7 @@ from maniskill_tomato.deploy.interface import Arm, JointMove
 from maniskill_tomato.deploy.profile import load_profile
 from maniskill_tomato.deploy.sunrise.client import SunriseClient
 from maniskill_tomato.deploy.sunrise.line_connection import MAX_LINE_BYTES, LineConnection
-from maniskill_tomato.deploy.sunrise.loopback import LoopbackController
-from maniskill_tomato.deploy.sunrise.loopback_faults import Fault
+from maniskill_tomato.deploy.sunrise.loopback import Fault, LoopbackController
 from maniskill_tomato.errors import InvalidInputError
 
 START = np.array([0.0, 0.35, 0.0, -1.2, 0.0, 1.5, 0.0])
@@ -452,7 +451,7 @@ def test_options_are_checked_when_the_profile_is_read() -> None:
     context = DriverContext(clock=MonotonicClock())
     for options, match in (
         ({"prot": 30001}, "arm.prot is unknown"),
-        ({"port": 0}, "port must be between"),
+        ({"port": 0}, "port must be from"),
         ({"torque_margin": [1.0, 2.0]}, "torque_margin must be 7 torques"),
         ({"torque_margin": [0.0] * 7}, "above 0"),
         ({"largest_segment": 0.0}, "largest_segment"),

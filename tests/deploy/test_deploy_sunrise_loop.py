@@ -6,23 +6,21 @@ from typing import Any
 import numpy as np
 import pytest
 
-from maniskill_tomato.deploy.capture import Capture, CaptureConfig
+from maniskill_tomato.deploy.capture import CaptureConfig
 from maniskill_tomato.deploy.clock import MonotonicClock
 from maniskill_tomato.deploy.drivers import DriverContext, make_arm, make_camera
 from maniskill_tomato.deploy.guarded_arm import GuardedArm
 from maniskill_tomato.deploy.interface import Float64
-from maniskill_tomato.deploy.loop import Loop
-from maniskill_tomato.deploy.loop_config import LoopConfig
+from maniskill_tomato.deploy.loop import TASK, Loop
 from maniskill_tomato.deploy.mock.episode import load_episode
-from maniskill_tomato.deploy.mock.twin_options import twin_options, twin_world
-from maniskill_tomato.deploy.policies import TASK
+from maniskill_tomato.deploy.mock.twin_world import twin_options, twin_world
+from maniskill_tomato.deploy.profile import Profile, TargetConfig
 from maniskill_tomato.deploy.robot_perception import TruthPerception
-from maniskill_tomato.deploy.run_records import RunResult
-from maniskill_tomato.deploy.safety import Safety
-from maniskill_tomato.deploy.safety_config import SafetyConfig
+from maniskill_tomato.deploy.run_records import LoopConfig, RunResult
+from maniskill_tomato.deploy.safety import Safety, SafetyConfig
 from maniskill_tomato.deploy.stops import Stops
-from maniskill_tomato.deploy.sunrise.loopback import LoopbackController
-from maniskill_tomato.deploy.sunrise.loopback_faults import Fault
+from maniskill_tomato.deploy.sunrise.loopback import Fault, LoopbackController
+from maniskill_tomato.deploy.workcell import Workcell
 from maniskill_tomato.policies.opening import open_policy
 from maniskill_tomato.robot.d435 import T_flange_camera_color_optical
 
@@ -64,21 +62,33 @@ def run(
         options["reply_timeout_s"] = reply_timeout_s
         world: Any = twin_world(twin_options(TWIN), context)
         world.arm = CarriedBy(controller)
-        camera = make_camera("mock", TWIN, context)
-        with make_arm("sunrise", options, context) as arm, camera, Stops() as stops:
-            result = Loop(
-                arm=GuardedArm(arm, Safety(SafetyConfig(max_state_age=10.0, max_frame_age=60.0)), clock),
-                camera=camera,
-                capture=Capture(camera, CaptureConfig(max_age=5.0), clock),
-                perception=TruthPerception(),
-                policy=open_policy("nbv", env_id=TASK),
-                T_flange_camera=T_flange_camera_color_optical,
-                clock=clock,
-                config=LoopConfig(max_moves=moves),
-                stops=stops,
-                mode="unattended",
-                target_position=world.episode.target_position.double().numpy(),
-            ).run()
+        x, y, z = world.episode.target_position.tolist()
+        profile = Profile(
+            name="rehearsal",
+            text="",
+            description="",
+            arm_driver="sunrise",
+            arm_options=options,
+            camera_driver="mock",
+            camera_options=TWIN,
+            T_flange_camera=T_flange_camera_color_optical,
+            calibrated=False,
+            target=TargetConfig(source="given", position=(x, y, z)),
+            safety=SafetyConfig(max_state_age=10.0, max_frame_age=60.0),
+            loop=LoopConfig(max_moves=moves),
+            capture=CaptureConfig(max_age=5.0),
+        )
+        arm, camera = make_arm("sunrise", options, context), make_camera("mock", TWIN, context)
+        workcell = Workcell(
+            profile=profile,
+            clock=clock,
+            arm=arm,
+            camera=camera,
+            guarded_arm=GuardedArm(arm, Safety(profile.safety), clock),
+            perception=TruthPerception(),
+        )
+        with arm, camera, Stops() as stops:
+            result = Loop(workcell, open_policy("nbv", env_id=TASK), stops, "unattended").run()
     return result, controller
 
 

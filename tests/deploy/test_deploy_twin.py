@@ -15,8 +15,7 @@ from maniskill_tomato.deploy.drivers import DriverContext, make_arm, make_camera
 from maniskill_tomato.deploy.interface import JointMove
 from maniskill_tomato.deploy.mock.dynamics import ArmDynamics
 from maniskill_tomato.deploy.mock.episode import load_episode
-from maniskill_tomato.deploy.robot_belief import RobotBelief
-from maniskill_tomato.deploy.robot_perception import TRUE_MASKS, ImagePerception, TruthPerception
+from maniskill_tomato.deploy.robot_perception import TRUE_MASKS, ImagePerception, RobotBelief, TruthPerception
 from maniskill_tomato.raycast.images import FIRST_ORGAN_LABEL, ROBOT_LABEL
 from maniskill_tomato.raycast.view_rays import DEPTH_MODE, RayLabel
 from maniskill_tomato.robot.d435 import (

@@ -201,6 +201,7 @@ class LineWorld:
 
     device = torch.device("cpu")
     spec = None
+    keeps_belief = True
 
     def __init__(self, num_envs: int = 1) -> None:
         self.num_envs = num_envs
@@ -301,6 +302,24 @@ def test_several_environments_give_the_episodes_of_single_ones() -> None:
         assert one.success and other.success
 
 
+@pytest.mark.parametrize("name", ["view_quality", "random_viewpoint"])
+def test_a_benchmark_of_several_environments_at_once_has_the_same_episodes(tmp_path: Path, name: str) -> None:
+    condition = Condition(
+        name="few",
+        env_options={"episodes": load_episodes("held_out")[:3]},
+    )
+    found = {}
+    for num_envs in (1, 2):
+        store = ResultStore(tmp_path / str(num_envs), {})
+        run_policies(store, [(condition, parse_policies(name), range(3))], 1, num_envs)
+        found[num_envs] = store.episodes("few", name, range(3))
+    assert len(found[2]) == 3
+    for one, other in zip(found[1], found[2], strict=True):
+        assert (one.seed, one.success, one.steps) == (other.seed, other.success, other.steps)
+        np.testing.assert_allclose(one.viewpoints, other.viewpoints, atol=1e-4)
+        np.testing.assert_allclose(one.visible_fraction, other.visible_fraction, atol=1e-4)
+
+
 def test_a_single_episode_in_many_environments_is_refused() -> None:
     with pytest.raises(InvalidInputError, match="num_envs=1"):
         run_episode(cast(Any, LineWorld(4)), Runner("runner", 1.0), 0)
@@ -311,8 +330,9 @@ def test_a_benchmark_runs_what_is_missing_and_nothing_twice(
 ) -> None:
     world = LineWorld()
     runners = {"stay": Runner("stay", 0.5), "nbv": Runner("nbv", 1.0)}
-    monkeypatch.setattr(policy_runs, "_environment", lambda condition: world)
-    monkeypatch.setattr(policy_runs, "_policy", lambda spec, env, condition: runners[spec.label])
+    monkeypatch.setattr(
+        policy_runs, "_opened", lambda spec, condition, num_envs: (world, runners[spec.label])
+    )
     stay, nbv = parse_policies("stay,nbv")
     line = Condition(name="line")
     store = ResultStore(tmp_path, {})

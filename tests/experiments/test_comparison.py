@@ -28,8 +28,9 @@ from maniskill_tomato.experiments.run_comparison import (
     write_comparison,
 )
 from maniskill_tomato.experiments.training_runs import find_runs, load_run, read_clock
+from maniskill_tomato.files import write_tensors
 from maniskill_tomato.learning.rl.agent import make_agent
-from maniskill_tomato.learning.rl.checkpoint import make_checkpoint, save_checkpoint
+from maniskill_tomato.learning.rl.checkpoint import make_checkpoint
 from maniskill_tomato.learning.rl.envs import make_env
 from maniskill_tomato.learning.rl.presets import get_preset
 from maniskill_tomato.tasks import THESIS_IDS
@@ -251,7 +252,7 @@ def test_runs_without_an_evaluation_get_one_on_the_plants_of_their_training(tmp_
     checkpoint = make_checkpoint(
         make_agent(get_preset("td3"), 9, 6), GUIDED, (-torch.ones(6), torch.ones(6)), {}, env_options=options
     )
-    save_checkpoint(new / "policy.pt", checkpoint)
+    write_tensors(new / "policy.pt", checkpoint)
     kept = make_run(tmp_path / "runs" / "old", success=0.25)
     compare_runs(
         RunComparisonConfig(runs=(tmp_path / "runs",), evaluate=2, eval_seed=7, out=tmp_path / "out")
@@ -306,5 +307,6 @@ def test_ppo_trains_evaluates_and_can_be_compared(tmp_path: Path, capsys: pytest
     largest = metrics["per_episode"]["max_visible_fraction"]
     np.testing.assert_allclose(largest, run.metrics["per_episode"]["max_visible_fraction"], atol=0.02)
     assert "Training" in (evaluated / "report.html").read_text()
-    again = run_python(*arguments)
-    assert again.returncode == 2 and "already holds a run" in again.stderr
+    with pytest.raises(SystemExit) as ended:
+        main(list(arguments[2:]))
+    assert ended.value.code == 2 and "already holds a run" in capsys.readouterr().err

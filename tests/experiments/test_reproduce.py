@@ -15,16 +15,18 @@ from torch import Tensor
 from maniskill_tomato.errors import InvalidInputError
 from maniskill_tomato.experiments.configs import ReproductionConfig
 from maniskill_tomato.experiments.episode_record import EpisodeRecord
-from maniskill_tomato.experiments.plots import averaged_curve
-from maniskill_tomato.experiments.reproduction import plan_trials, run_reproduction, untrained_first_steps
-from maniskill_tomato.experiments.thesis_figures import (
+from maniskill_tomato.experiments.plots import (
+    averaged_curve,
     camera_opacities,
-    episode_to_show,
     frustum_faces,
     frustum_points,
     marked_views,
+    plot_trajectories,
+)
+from maniskill_tomato.experiments.reproduction import plan_trials, run_reproduction, untrained_first_steps
+from maniskill_tomato.experiments.thesis_figures import (
+    episode_to_show,
     most_successful,
-    plot_camera_ways,
     plot_evaluation,
     plot_plant_positions,
 )
@@ -236,12 +238,12 @@ def test_figures_are_drawn_for_one_seed_and_for_several(tmp_path: Path) -> None:
     episodes = [make_episode(i, 1 + i % 4, i % 2 == 0) for i in range(8)]
     plot_evaluation({0: episodes}, 0.85, "one", tmp_path / "one.png")
     plot_evaluation({s: episodes for s in range(9)}, 0.85, "nine", tmp_path / "nine.png")
-    plot_camera_ways(episodes, "ways", tmp_path / "ways.png")
+    plot_trajectories(episodes, "ways", tmp_path / "ways.png")
     plot_plant_positions(GUIDED, tmp_path / "plants.png")
     for path in tmp_path.iterdir():
         assert np.asarray(imageio.imread(path)).std() > 5.0, path.name
     with pytest.raises(InvalidInputError):
-        plot_camera_ways([], "none", tmp_path / "none.png")
+        plot_trajectories([], "none", tmp_path / "none.png")
 
 
 def test_untrained_actors_of_small_scale_move_less() -> None:

@@ -51,6 +51,10 @@ def test_wilson_intervals_agree_with_published_values() -> None:
         wilson_interval(1, 0)
     with pytest.raises(InvalidInputError):
         wilson_interval(5, 4)
+    with pytest.raises(InvalidInputError):
+        wilson_interval(0, 0)
+    # One success in one trial: (p + z^2 / 2n) / (1 + z^2 / n) -+ ... is from 1 / (1 + z^2) to 1.
+    assert wilson_interval(1, 1) == pytest.approx((1 / (1 + 1.959964**2), 1.0), abs=1e-6)
 
 
 def test_mean_interval_agrees_with_the_normal_one_for_many_values() -> None:
@@ -117,6 +121,7 @@ def test_the_interquartile_mean_agrees_with_a_plain_loop_along_either_axis() -> 
         lines = values.T if axis == 0 else values
         expected = [float(np.mean(sorted(line)[cut : len(line) - cut])) for line in lines]
         np.testing.assert_allclose(interquartile_mean(values, axis=axis), expected, rtol=1e-12)
+    np.testing.assert_array_equal(interquartile_mean(values), interquartile_mean(values, axis=1))
 
 
 def test_the_bootstrap_of_two_runs_has_the_three_means_that_they_can_give() -> None:
@@ -196,8 +201,12 @@ def test_false_alarms_of_the_paired_test_on_moves_are_as_rare_as_the_p_value_say
 def test_bad_input_is_refused() -> None:
     with pytest.raises(InvalidInputError, match="one or more numbers"):
         mean_interval([])
+    with pytest.raises(InvalidInputError, match="one or more numbers"):
+        mean_interval([[1.0, 2.0], [3.0, 4.0]])
     with pytest.raises(InvalidInputError, match="0 or more"):
         mcnemar_p(-1, 2)
+    with pytest.raises(InvalidInputError, match="0 or more"):
+        mcnemar_p(2, -1)
     with pytest.raises(InvalidInputError, match="same episodes"):
         paired_test([True], [1.0], [True, False], [1.0, 2.0])
 

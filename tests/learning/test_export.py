@@ -23,8 +23,9 @@ from maniskill_tomato.assets import asset_path
 from maniskill_tomato.cli import main
 from maniskill_tomato.errors import CheckpointError, InvalidInputError, PolicyError
 from maniskill_tomato.experiments.rollout import run_episodes
+from maniskill_tomato.files import write_tensors
 from maniskill_tomato.learning.rl.agent import make_agent
-from maniskill_tomato.learning.rl.checkpoint import make_checkpoint, save_checkpoint
+from maniskill_tomato.learning.rl.checkpoint import make_checkpoint
 from maniskill_tomato.learning.rl.envs import make_env
 from maniskill_tomato.learning.rl.export import DenseActor, export_actor, export_policy, rounding_tolerance
 from maniskill_tomato.learning.rl.presets import PRESETS, TrainConfig, get_preset
@@ -51,7 +52,7 @@ def make_policy(path: Path, preset: str = "td3", bound: float = 1.0, gain: float
     with torch.no_grad():
         agent.actor.output.weight *= gain
     bounds = (-bound * torch.ones(6), bound * torch.ones(6))
-    save_checkpoint(path, make_checkpoint(agent, GUIDED, bounds, {"steps": 12, "episodes": 2, "seed": 3}))
+    write_tensors(path, make_checkpoint(agent, GUIDED, bounds, {"steps": 12, "episodes": 2, "seed": 3}))
     return path
 
 
@@ -201,7 +202,7 @@ def test_an_export_follows_a_calculation_by_hand(tmp_path: Path) -> None:
         agent.actor.output.weight[5, 1] = 1.0
         agent.actor.output.bias[2] = 100.0
     bounds = (-0.25 * torch.ones(6), 0.25 * torch.ones(6))
-    save_checkpoint(tmp_path / "p.pt", make_checkpoint(agent, GUIDED, bounds, {}))
+    write_tensors(tmp_path / "p.pt", make_checkpoint(agent, GUIDED, bounds, {}))
     policy = OnnxPolicy.load(export_policy(tmp_path / "p.pt", tmp_path).model)
     observation = CENTRE.copy()
     observation[0] = 0.45  # Half of ee_x's half range of 0.5 above its centre.
@@ -221,7 +222,7 @@ def test_a_running_normaliser_is_exported_as_it_was_last(tmp_path: Path) -> None
     with torch.no_grad():
         agent.actor.output.weight.mul_(100.0)
     bounds = (-torch.ones(6), torch.ones(6))
-    save_checkpoint(tmp_path / "p.pt", make_checkpoint(agent, GUIDED, bounds, {}, with_training_state=False))
+    write_tensors(tmp_path / "p.pt", make_checkpoint(agent, GUIDED, bounds, {}, with_training_state=False))
     model = export_policy(tmp_path / "p.pt", tmp_path / "out").model
     content = json.loads(model.with_suffix(".json").read_text())["normalizer"]
     assert content["kind"] == "running"
@@ -350,7 +351,7 @@ def test_the_description_says_what_plant_the_training_had(tmp_path: Path) -> Non
     options = {"plant": {"preset": "full"}, "plant_pose": (0.8, 0.1, 0.5)}
     lines = []
     for given in (options, {}, None):
-        save_checkpoint(tmp_path / "p.pt", make_checkpoint(agent, GUIDED, bounds, {}, env_options=given))
+        write_tensors(tmp_path / "p.pt", make_checkpoint(agent, GUIDED, bounds, {}, env_options=given))
         model = export_policy(tmp_path / "p.pt", tmp_path).model
         kept = None if given is None else json.loads(json.dumps(given))
         content = json.loads(model.with_suffix(".json").read_text())
@@ -541,7 +542,7 @@ def test_a_policy_of_another_layout_is_not_exported(tmp_path: Path) -> None:
     agent = make_agent(get_preset("td3"), 9, 6)
     data = make_checkpoint(agent, GUIDED, (-torch.ones(6), torch.ones(6)), {})
     data["observation"]["names"] = data["observation"]["names"][::-1]
-    save_checkpoint(tmp_path / "p.pt", data)
+    write_tensors(tmp_path / "p.pt", data)
     with pytest.raises(PolicyError, match="cannot be exported: its observation is target_z"):
         export_policy(tmp_path / "p.pt", tmp_path / "out")
     assert not (tmp_path / "out").exists()
@@ -644,7 +645,7 @@ def test_a_policy_of_the_general_task_is_exported_with_its_own_layout(tmp_path: 
         agent.actor.output.weight *= 100.0
     bounds = (-torch.ones(3), torch.ones(3))
     counters: dict[str, int | float] = {"steps": 12, "episodes": 2, "seed": 3}
-    save_checkpoint(tmp_path / "p.pt", make_checkpoint(agent, "TomatoViewpoint-v1", bounds, counters))
+    write_tensors(tmp_path / "p.pt", make_checkpoint(agent, "TomatoViewpoint-v1", bounds, counters))
     model = export_policy(tmp_path / "p.pt", tmp_path).model
     exported = OnnxPolicy.load(model, "TomatoViewpoint-v1")
     observations = np.random.default_rng(0).uniform(-1.0, 1.0, (5, size)).astype(np.float32)
@@ -657,6 +658,6 @@ def test_a_policy_of_the_general_task_is_exported_with_its_own_layout(tmp_path: 
 def test_a_policy_of_another_observation_than_the_tasks_cannot_be_exported(tmp_path: Path) -> None:
     agent = make_agent(get_preset("general-td3"), ObservationLayout.blind().size, 3)
     bounds = (-torch.ones(3), torch.ones(3))
-    save_checkpoint(tmp_path / "p.pt", make_checkpoint(agent, "TomatoViewpoint-v1", bounds, {}))
+    write_tensors(tmp_path / "p.pt", make_checkpoint(agent, "TomatoViewpoint-v1", bounds, {}))
     with pytest.raises(PolicyError, match="786 values"):
         export_policy(tmp_path / "p.pt", tmp_path)

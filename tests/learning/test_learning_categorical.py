@@ -10,7 +10,7 @@ from torch import Tensor
 
 from maniskill_tomato.errors import InvalidInputError
 from maniskill_tomato.learning.rl.agent import distribution_targets, make_agent, update, update_critic
-from maniskill_tomato.learning.rl.categorical import CategoricalCritic, project
+from maniskill_tomato.learning.rl.critic import CategoricalCritic, project
 from maniskill_tomato.learning.rl.presets import TrainConfig, get_preset
 from maniskill_tomato.learning.rl.replay import Batch
 

@@ -7,8 +7,9 @@ import torch
 
 import maniskill_tomato
 from maniskill_tomato.errors import CheckpointError, InvalidInputError
+from maniskill_tomato.files import write_tensors
 from maniskill_tomato.learning.rl.agent import Agent, make_agent
-from maniskill_tomato.learning.rl.checkpoint import make_checkpoint, save_checkpoint
+from maniskill_tomato.learning.rl.checkpoint import make_checkpoint
 from maniskill_tomato.learning.rl.presets import PRESETS, TrainConfig, get_preset
 from maniskill_tomato.policies.trained_actor import load_actor, load_checkpoint
 
@@ -19,7 +20,7 @@ BOUNDS = (-torch.ones(6), torch.ones(6))
 def saved(path: Path, **changes: Any) -> tuple[Agent, dict[str, Any]]:
     agent = make_agent(get_preset("td3"), 9, 6)
     data = {**make_checkpoint(agent, ENV_ID, BOUNDS, {"steps": 12, "seed": 3}), **changes}
-    save_checkpoint(path, data)
+    write_tensors(path, data)
     return agent, data
 
 
@@ -28,7 +29,7 @@ def test_a_policy_comes_back_as_it_was(tmp_path: Path, preset: str) -> None:
     actions = len(get_preset(preset).action_scale)
     agent = make_agent(get_preset(preset), 9, actions)
     bounds = (-torch.ones(actions), torch.ones(actions))
-    save_checkpoint(tmp_path / "p.pt", make_checkpoint(agent, ENV_ID, bounds, {"steps": 12, "seed": 3}))
+    write_tensors(tmp_path / "p.pt", make_checkpoint(agent, ENV_ID, bounds, {"steps": 12, "seed": 3}))
     policy = load_actor(tmp_path / "p.pt", env_id=ENV_ID)
     observations = torch.randn(8, 9)
     scale = torch.tensor(agent.config.action_scale)

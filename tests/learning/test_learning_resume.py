@@ -23,7 +23,7 @@ from torch import Tensor
 
 from maniskill_tomato import cli
 from maniskill_tomato.errors import CheckpointError, InvalidInputError, TrainingDivergedError
-from maniskill_tomato.learning.rl.checkpoint import save_checkpoint
+from maniskill_tomato.files import write_tensors
 from maniskill_tomato.learning.rl.env_state import env_state, set_env_state
 from maniskill_tomato.learning.rl.envs import make_learner_env
 from maniskill_tomato.learning.rl.presets import TrainConfig, get_preset
@@ -369,7 +369,7 @@ def test_a_checkpoint_of_something_else_is_refused_and_left_alone(
     tmp_path: Path, change: dict[str, Any], message: str
 ) -> None:
     newest = crashed(tmp_path / "run")[-1]
-    save_checkpoint(newest, {**load_checkpoint(newest), **change})
+    write_tensors(newest, {**load_checkpoint(newest), **change})
     before = newest.read_bytes()
     with pytest.raises(CheckpointError, match=message):
         train(tmp_path / "run", resume=True)
@@ -385,7 +385,7 @@ def test_other_options_cannot_continue_a_run(tmp_path: Path) -> None:
 def test_an_environment_that_does_not_tell_its_state_cannot_be_continued(tmp_path: Path) -> None:
     newest = crashed(tmp_path / "run")[-1]
     data = load_checkpoint(newest)
-    save_checkpoint(newest, {**data, "run": {**data["run"], "env": None}})
+    write_tensors(newest, {**data, "run": {**data["run"], "env": None}})
     with pytest.raises(CheckpointError, match="get_run_state and set_run_state"):
         train(tmp_path / "run", resume=True)
 
@@ -530,7 +530,7 @@ def start(*arguments: str) -> Any:
     """The command in a process of its own, forked from one that has loaded the simulator already."""
     context = multiprocessing.get_context("forkserver")
     context.set_forkserver_preload(
-        ["maniskill_tomato.cli", "maniskill_tomato.learning.rl.run", "maniskill_tomato.tasks.vector_env"]
+        ["maniskill_tomato.cli", "maniskill_tomato.learning.rl.trainer", "maniskill_tomato.tasks.vector_env"]
     )
     process = context.Process(target=cli.main, args=(list(arguments),))
     process.start()
@@ -554,7 +554,8 @@ def real_run(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.mark.parametrize(
-    "number", [signal.SIGKILL, signal.SIGTERM, pytest.param(signal.SIGINT, marks=pytest.mark.slow)]
+    "number",
+    [signal.SIGKILL, *(pytest.param(n, marks=pytest.mark.slow) for n in (signal.SIGTERM, signal.SIGINT))],
 )
 def test_a_killed_run_of_the_real_task_ends_as_the_unbroken_one(
     tmp_path: Path, real_run: Path, number: signal.Signals

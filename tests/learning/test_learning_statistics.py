@@ -8,9 +8,8 @@ import pytest
 import torch
 
 from maniskill_tomato.errors import InvalidInputError
-from maniskill_tomato.learning.rl.agent import make_agent
+from maniskill_tomato.learning.rl.agent import SMALLEST_SPREAD, RunningStatistics, make_agent
 from maniskill_tomato.learning.rl.presets import TrainConfig, get_preset
-from maniskill_tomato.learning.rl.running_statistics import SMALLEST_SPREAD, RunningStatistics
 from maniskill_tomato.policies.actor import ObservationNormalizer
 from maniskill_tomato.policies.trained_actor import load_actor
 from maniskill_tomato.tasks import THESIS_IDS

@@ -132,6 +132,7 @@ def test_training_solves_the_toy_task_that_an_untrained_policy_does_not(tmp_path
     assert success_rate(load_actor(trained.policy_path), 100) > 0.7
 
 
+@pytest.mark.slow
 def test_fast_td3_in_small_solves_the_toy_task(tmp_path: Path) -> None:
     """Running normalisation, categorical critics and a noise level for each environment together."""
     config = replace(

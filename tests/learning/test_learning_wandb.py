@@ -18,8 +18,8 @@ from maniskill_tomato.experiments.run_comparison import group_runs
 from maniskill_tomato.experiments.training_runs import load_run
 from maniskill_tomato.learning.rl.envs import make_learner_env
 from maniskill_tomato.learning.rl.presets import TrainConfig, get_preset
-from maniskill_tomato.learning.rl.run import train
 from maniskill_tomato.learning.rl.run_folder import clear_run
+from maniskill_tomato.learning.rl.trainer import train
 from maniskill_tomato.tasks import THESIS_IDS
 
 GUIDED = THESIS_IDS[0]

@@ -355,8 +355,9 @@ def test_eval_runs_the_same_episodes_as_the_benchmark(
     assert metrics["plant_contact_step_share"] == pytest.approx(contacts)
 
 
-def test_the_shipped_policy_finds_tomatoes_on_plants_never_seen_before(tmp_path: Path) -> None:
-    options = ["--episodes", "20", "--no-video", "--no-baseline", "--episode-list", "held_out"]
+@pytest.mark.parametrize("episodes", [6, pytest.param(20, marks=pytest.mark.slow)])
+def test_the_shipped_policy_finds_tomatoes_on_plants_never_seen_before(tmp_path: Path, episodes: int) -> None:
+    options = ["--episodes", str(episodes), "--no-video", "--no-baseline", "--episode-list", "held_out"]
     main(["eval", "TomatoViewpoint-v1", *options, "--out", str(tmp_path)])
     metrics = json.loads((tmp_path / "metrics.json").read_text())
     assert metrics["success_rate"] >= 0.9 and metrics["mean_steps"] <= 6.0

@@ -195,7 +195,7 @@ def test_a_policy_begins_where_the_memory_holds_one_view() -> None:
         def begin(self, belief: Any, rows: Tensor) -> None:
             self.begun.append(rows.tolist())
 
-    world = SimpleNamespace(belief=belief(torch.zeros(3, 4), [1, 1, 1]))
+    world = SimpleNamespace(keeps_belief=True, belief=belief(torch.zeros(3, 4), [1, 1, 1]))
     policy = Recorder()
     follower = as_state_policy(policy, SimpleNamespace(unwrapped=world))
     assert isinstance(follower, BeliefFollower)

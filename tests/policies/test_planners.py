@@ -14,8 +14,8 @@ from maniskill_tomato.assets import asset_path
 from maniskill_tomato.errors import CheckpointError, InvalidInputError
 from maniskill_tomato.experiments.episode_record import EpisodeRecord
 from maniskill_tomato.experiments.rollout import run_episode
+from maniskill_tomato.learning.imitation.imitation_config import RegressionConfig
 from maniskill_tomato.learning.imitation.move_to_see_training import MoveToSeeData, train_move_network
-from maniskill_tomato.learning.imitation.regression_config import RegressionConfig
 from maniskill_tomato.plants.generator import generate_plant
 from maniskill_tomato.plants.organs import Plant
 from maniskill_tomato.policies import baselines, moves
@@ -87,6 +87,7 @@ class FreeWorld(Truth):
 
     num_envs = 1
     device = torch.device("cpu")
+    keeps_belief = True
 
     def __init__(self, plants: list[Plant], box: Box = Box()) -> None:
         self._plants = plants
@@ -470,9 +471,9 @@ def test_the_oracle_says_where_nothing_can_be_seen() -> None:
 
 
 def test_no_planner_needs_fewer_moves_than_the_oracle(world: FreeWorld) -> None:
-    episodes = range(8)
+    episodes = range(4)
     oracle = run(world, Oracle(OracleSearch(world, reachable=anywhere)), episodes)
-    assert sum(e.success for e in oracle) >= 6
+    assert sum(e.success for e in oracle) >= 3
     planners = [
         RandomViewpoint(),
         FixedSweep(),

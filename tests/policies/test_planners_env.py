@@ -52,6 +52,7 @@ def test_the_oracle_needs_as_many_moves_as_it_says(env: gym.Env[Any, Any]) -> No
     assert solved >= 3
 
 
+@pytest.mark.slow
 def test_a_contact_free_oracle_touches_nothing(env: gym.Env[Any, Any]) -> None:
     free = open_for(PolicySpec.parse("oracle"), env, contact_free=True)
     episodes = [run_episode(env, free, seed) for seed in range(4)]

@@ -12,9 +12,9 @@ from numpy.typing import NDArray
 from maniskill_tomato.errors import InvalidInputError
 from maniskill_tomato.plants.generator import generate_plant
 from maniskill_tomato.plants.organs import Fruit, MeshPart, Organ, Plant, Ripeness, SemanticClass
-from maniskill_tomato.raycast.ray_library import LinkMeshes
 from maniskill_tomato.raycast.scene import RayScene
 from maniskill_tomato.raycast.visibility import Visibility
+from maniskill_tomato.raycast.warp_meshes import LinkTriangles
 from maniskill_tomato.robot.d435 import (
     CAMERA_NEAR,
     CameraIntrinsics,
@@ -283,7 +283,7 @@ def link_poses(**where: tuple[float, float, float]) -> torch.Tensor:
 
 
 def test_a_robot_link_in_the_way_hides_and_without_link_poses_it_does_not(device: str) -> None:
-    arm: LinkMeshes = {
+    arm: LinkTriangles = {
         "link_3": box((-1.0, -1.0, -0.05), (0.0, 1.0, 0.05)),
         "link_6": box((-0.1, -0.1, -0.1), (0.1, 0.1, 0.1)),
     }

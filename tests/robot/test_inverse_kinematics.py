@@ -10,6 +10,7 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 import torch
+from scipy.spatial.transform import Rotation
 from torch import Tensor
 from torch.testing import assert_close
 
@@ -17,7 +18,6 @@ from maniskill_tomato.errors import InvalidInputError
 from maniskill_tomato.robot import iiwa14
 from maniskill_tomato.robot.inverse_kinematics import IkConfig, IkSolution, InverseKinematics, Reach
 from maniskill_tomato.robot.kinematics import forward_kinematics
-from maniskill_tomato.robot.rotations import quat_wxyz_to_matrix, rotation_angle_between, rpy_to_matrix
 
 Array = npt.NDArray[np.float64]
 
@@ -31,6 +31,10 @@ BOX_UPPER = (0.2, 0.25, 1.15, 0.0, 0.7 * math.pi, math.pi / 4)
 @pytest.fixture(scope="module")
 def ik() -> InverseKinematics:
     return InverseKinematics()
+
+
+def rpy_to_matrix(rpy: Tensor) -> Tensor:
+    return torch.from_numpy(Rotation.from_euler("xyz", rpy.numpy()).as_matrix())
 
 
 def uniform(count: int, columns: int, seed: int) -> Tensor:
@@ -62,7 +66,8 @@ def home(count: int) -> Tensor:
 def pose_errors(T: Tensor, wanted: Tensor) -> tuple[Tensor, Tensor]:
     """Distance in [m] and angle in [rad] between poses."""
     distance = (T[:, :3, 3] - wanted[:, :3, 3]).norm(dim=-1)
-    return distance, rotation_angle_between(T[:, :3, :3], wanted[:, :3, :3])
+    turns = T[:, :3, :3].transpose(-1, -2) @ wanted[:, :3, :3]
+    return distance, torch.from_numpy(Rotation.from_matrix(turns.numpy()).magnitude())
 
 
 def assert_reached(solution: IkSolution, wanted: Tensor, position_atol: float, angle_atol: float) -> None:
@@ -85,9 +90,8 @@ def random_offsets(count: int, seed: int) -> tuple[Tensor, Tensor]:
     lengths = torch.rand(count, 2, generator=generator, dtype=torch.float64) ** (1 / 6)
     direction, axis = draw(3), draw(3)
     shift = 0.05 * lengths[:, :1] * direction / direction.norm(dim=-1, keepdim=True)
-    half = 0.5 * TEN_DEGREES * lengths[:, 1:]
-    axis = torch.sin(half) * axis / axis.norm(dim=-1, keepdim=True)
-    return shift, quat_wxyz_to_matrix(torch.cat([torch.cos(half), axis], dim=-1))
+    turns = TEN_DEGREES * lengths[:, 1:] * axis / axis.norm(dim=-1, keepdim=True)
+    return shift, torch.from_numpy(Rotation.from_rotvec(turns.numpy()).as_matrix())
 
 
 # --- Reachable poses --------------------------------------------------------------------------------------

@@ -121,25 +121,42 @@ def test_single_precision_comes_back_and_is_computed_in_double() -> None:
     assert_close(poses, forward_kinematics(qpos.double()).float(), rtol=0, atol=0)
 
 
-def test_a_later_call_leaves_earlier_results_alone() -> None:
-    first = link_transforms(torch.zeros(1, 7, dtype=torch.float64))
-    before = first.clone()
-    link_transforms(torch.ones(1, 7, dtype=torch.float64))
-    assert_close(first, before, rtol=0, atol=0)
-
-
 def test_a_batch_too_large_to_keep_buffers_for_gives_the_same() -> None:
     qpos = torch.from_numpy(random_qpos(5000, seed=3))
     # Vector units may round the last bit of a sine otherwise in a batch of another size.
     assert_close(link_transforms(qpos)[:10], link_transforms(qpos[:10]), rtol=0, atol=1e-12)
 
 
-@pytest.mark.parametrize("bad", [torch.zeros(6), torch.zeros(2, 8), torch.zeros(7, dtype=torch.int64)])
+@pytest.mark.parametrize("count", [1, 3, 5000])
+def test_results_are_not_overwritten_by_a_later_call_with_a_batch_of_the_same_size(count: int) -> None:
+    for function, size in ((link_transforms, 7), (viewpoint_transform, 6)):
+        first = function(torch.zeros(count, size, dtype=torch.float64))
+        before = first.clone()
+        function(torch.ones(count, size, dtype=torch.float64))
+        assert_close(first, before, rtol=0, atol=0)
+
+
+def test_an_empty_batch_has_no_poses() -> None:
+    assert link_transforms(torch.zeros(0, 7)).shape == (0, 9, 4, 4)
+    poses = viewpoint_transform(torch.zeros(0, 6))
+    assert poses.shape == (0, 4, 4) and poses.dtype == torch.float64
+
+
+@pytest.mark.parametrize(
+    "bad", [torch.zeros(6), torch.zeros(2, 6), torch.zeros(2, 8), torch.zeros(7, dtype=torch.int64)]
+)
 def test_wrong_shapes_and_integers_are_refused(bad: torch.Tensor) -> None:
     with pytest.raises(InvalidInputError, match="qpos must be"):
         forward_kinematics(bad)
     with pytest.raises(InvalidInputError, match="qpos must be"):
         link_transforms(bad)
+
+
+def test_a_single_number_and_a_further_dimension_are_refused_in_words() -> None:
+    with pytest.raises(InvalidInputError, match="qpos must be"):
+        forward_kinematics(torch.tensor(0.0))
+    with pytest.raises(InvalidInputError, match="qpos must be"):
+        link_transforms(torch.zeros(2, 7, 1))
 
 
 @pytest.mark.gpu
@@ -168,7 +185,14 @@ def test_viewpoint_transform_at_pitch_pi_over_2_looks_along_x() -> None:
 
 
 @pytest.mark.parametrize(
-    "viewpoint", [torch.zeros(6), torch.zeros(2, 7), torch.zeros(2, 6, dtype=torch.int64)]
+    "viewpoint",
+    [
+        torch.zeros(6),
+        torch.zeros(2, 5),
+        torch.zeros(2, 7),
+        torch.zeros(2, 6, 1),
+        torch.zeros(2, 6, dtype=torch.int64),
+    ],
 )
 def test_viewpoint_transform_refuses_other_shapes_and_types(viewpoint: torch.Tensor) -> None:
     with pytest.raises(InvalidInputError, match=r"\(B, 6\)"):

@@ -10,15 +10,12 @@ from numpy.typing import NDArray
 from maniskill_tomato.errors import InvalidInputError
 from maniskill_tomato.segmentation.datasets.annotations import AnnotatedImage, Instance, ignored_fruit
 from maniskill_tomato.segmentation.instances import Instances
-from maniskill_tomato.segmentation.metrics.coco_metrics import CocoScore
 from maniskill_tomato.segmentation.metrics.detection_metrics import (
     DetectionScore,
     ImageTruth,
     PrecisionRecall,
-    box_overlaps,
     image_truth,
     mask_overlaps,
-    match,
     without_narrow,
 )
 
@@ -108,13 +105,11 @@ def test_overlaps_agree_with_a_count_of_pixels() -> None:
     corners = rng.integers(0, 40, (6, 2))
     boxes = np.concatenate([corners, corners + rng.integers(1, 40, (6, 2))], axis=1).astype(np.float64)
     masks = found_boxes(boxes.tolist(), [1.0] * 6).masks
-    of_boxes, of_masks = box_overlaps(boxes[:3], boxes[3:]), mask_overlaps(masks[:3], masks[3:])
+    overlaps = mask_overlaps(masks[:3], masks[3:])
     for i in range(3):
         for j in range(3):
             shared = (masks[i] & masks[3 + j]).sum()
-            expected = shared / (masks[i] | masks[3 + j]).sum(), shared / masks[i].sum()
-            for kind in (of_boxes, of_masks):
-                assert (kind[0][i, j], kind[1][i, j]) == pytest.approx(expected)
+            assert overlaps[i, j] == pytest.approx(shared / (masks[i] | masks[3 + j]).sum())
 
 
 def random_scene(rng: np.random.Generator) -> tuple[Instances, ImageTruth]:
@@ -140,27 +135,47 @@ def test_average_precision_agrees_with_coco(overlap: str) -> None:
     for found, truth in scenes:
         score.add(found, truth)
     average = score.precision_recall().average_precision
-    coco = CocoScore(overlap)  # type: ignore[arg-type]
-    for found, truth in scenes:
-        coco.add(found, truth)
-    theirs = coco.metrics()["AP50"]
+    theirs = score.coco_metrics()["AP50"]
     assert 0.2 < average < 0.9
     assert theirs == pytest.approx(average, abs=0.01)
 
 
-def test_matching_agrees_with_a_plain_loop() -> None:
+@pytest.mark.parametrize("overlap", ["box", "mask"])
+def test_precision_and_recall_agree_with_a_plain_loop_over_pixels(overlap: str) -> None:
     rng = np.random.default_rng(2)
-    for _ in range(50):
-        overlaps = rng.random((7, 5))
-        scores = rng.permutation(7).astype(np.float64)
-        true, counted = match(scores, overlaps, np.zeros((7, 5)), np.zeros(5, bool), 0.5)
+    for _ in range(25):
+        found, truth = random_scene(rng)
+        assert truth.masks is not None
+        hits: list[bool] = []
         taken: set[int] = set()
-        for detection in sorted(range(7), key=lambda d: -scores[d]):
-            options = [f for f in range(5) if f not in taken and overlaps[detection, f] >= 0.5]
-            assert true[detection] == bool(options)
+        for d in sorted(range(len(found)), key=lambda d: -found.scores[d]):
+            shared = [int((found.masks[d] & mask).sum()) for mask in truth.masks]
+            union = [int((found.masks[d] | mask).sum()) for mask in truth.masks]
+            options = [
+                f
+                for f in range(len(shared))
+                if not truth.ignored[f] and f not in taken and 2 * shared[f] >= union[f]
+            ]
             if options:
-                taken.add(max(options, key=lambda f: overlaps[detection, f]))
-        assert counted.all()
+                taken.add(max(options, key=lambda f: shared[f] / union[f]))
+                hits.append(True)
+            elif not any(2 * shared[f] >= found.masks[d].sum() for f in np.flatnonzero(truth.ignored)):
+                hits.append(False)
+        score = DetectionScore(overlap)  # type: ignore[arg-type]
+        score.add(found, truth)
+        curve = score.precision_recall()
+        np.testing.assert_allclose(curve.recall, np.cumsum(hits) / max((~truth.ignored).sum(), 1))
+        np.testing.assert_allclose(curve.precision, np.cumsum(hits) / np.arange(1, len(hits) + 1))
+
+
+def test_detections_beyond_coco_s_hundred_count_in_the_curve() -> None:
+    """A fruit that the 151st detection of an image finds: COCO looks at a hundred of them, Eq. 4-2 at all."""
+    score = DetectionScore()
+    misses = [[50.0, 50, 60, 60]] * 150
+    found = found_boxes([*misses, [0, 0, 10, 10]], [*np.linspace(0.9, 0.5, 150).tolist(), 0.4])
+    score.add(found, true_boxes([[0, 0, 10, 10]]))
+    assert score.precision_recall().recall[-1] == 1 and len(score.precision_recall().recall) == 151
+    assert score.coco_metrics()["AR100"] == 0
 
 
 def test_the_curve_of_a_perfect_detector_has_area_one() -> None:

@@ -8,18 +8,19 @@ import pytest
 import torch
 
 from maniskill_tomato.errors import InvalidInputError
+from maniskill_tomato.segmentation.detector_configs import (
+    MASK_RCNN_PRESETS,
+    ClassicAugmentation,
+    MaskRcnnConfig,
+)
 from maniskill_tomato.segmentation.training.augmentation import (
     brighter,
     classic_augmentation,
     contrasted,
 )
-from maniskill_tomato.segmentation.training.detector_presets import (
-    MASK_RCNN_PRESETS,
-    YOLO_PRESET,
-    ClassicAugmentation,
-    MaskRcnnConfig,
-)
 from maniskill_tomato.segmentation.training.training_pictures import TrainingPicture
+from maniskill_tomato.segmentation.training.yolo_training import YOLO_SETTINGS
+from maniskill_tomato.segmentation.yolo import NMS_THRESHOLD, OBJECT_THRESHOLD
 
 torchvision = pytest.importorskip("torchvision")
 
@@ -76,13 +77,18 @@ def test_strategy_3_is_the_proposal_of_section_6_2() -> None:
 
 
 def test_yolo_is_table_4_1() -> None:
-    assert YOLO_PRESET.epochs == 100
-    assert YOLO_PRESET.batch_size == 1
-    assert YOLO_PRESET.learning_rate == 0.0001
-    assert (YOLO_PRESET.smallest_input, YOLO_PRESET.largest_input) == (288, 448)
-    assert (YOLO_PRESET.object_threshold, YOLO_PRESET.nms_threshold) == (0.5, 0.45)
-    assert YOLO_PRESET.patience == 3
-    assert not YOLO_PRESET.pretrained
+    settings = YOLO_SETTINGS["thesis"]
+    assert (settings["epochs"], settings["batch"], settings["lr0"], settings["patience"]) == (100, 1, 1e-4, 3)
+    # 288 to 448 px: 368 px on average, and 80 px to either side.
+    assert settings["imgsz"] == 368 and settings["multi_scale"] * 368 == pytest.approx(80)
+    assert (OBJECT_THRESHOLD, NMS_THRESHOLD) == (0.5, 0.45)
+    assert not settings["pretrained"]
+
+
+def test_stock_yolo_is_what_the_library_does_by_itself() -> None:
+    stock = YOLO_SETTINGS["stock"]
+    assert (stock["epochs"], stock["imgsz"]) == (100, 448)
+    assert "lr0" not in stock and not stock["pretrained"]
 
 
 def test_settings_that_cannot_be_are_refused() -> None:

@@ -1,8 +1,10 @@
 """Mask R-CNN, YOLO's files and the two commands, on drawn pictures."""
 
 import json
+import sys
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import cv2
 import numpy as np
@@ -13,18 +15,18 @@ from maniskill_tomato.cli import main
 from maniskill_tomato.errors import CheckpointError
 from maniskill_tomato.segmentation.datasets.annotations import AnnotatedImage, AnnotatedImages, Instance
 from maniskill_tomato.segmentation.datasets.coco import write_coco
+from maniskill_tomato.segmentation.detector_configs import MASK_RCNN_PRESETS
 from maniskill_tomato.segmentation.efficientnet_lite import EfficientNetLite0
 from maniskill_tomato.segmentation.instances import box_ellipse, mask_box
 from maniskill_tomato.segmentation.mask_rcnn import Lite0Pyramid
 from maniskill_tomato.segmentation.masks import EncodedMask
 from maniskill_tomato.segmentation.segmenter import make_segmenter
-from maniskill_tomato.segmentation.training.detector_presets import MASK_RCNN_PRESETS
 from maniskill_tomato.segmentation.training.mask_rcnn_training import MaskRcnnTraining, mask_rcnn_target
-from maniskill_tomato.segmentation.training.training_pictures import training_picture
-from maniskill_tomato.segmentation.yolo import (
+from maniskill_tomato.segmentation.training.training_pictures import TrainingImages, training_picture
+from maniskill_tomato.segmentation.training.yolo_training import (
+    YOLO_SETTINGS,
     read_history,
-    stock_settings,
-    thesis_settings,
+    train_yolo,
     write_yolo_data,
     yolo_labels,
 )
@@ -74,10 +76,10 @@ def drawn_set(folder: Path, masks: bool = True) -> tuple[AnnotatedImage, ...]:
 
 def test_mask_rcnn_trains_goes_on_and_opens_as_a_segmenter(tmp_path: Path) -> None:
     images = drawn_set(tmp_path / "set")
-    training = MaskRcnnTraining(TINY, [images], [1.0], images[:1])
+    training = MaskRcnnTraining(TINY, TrainingImages(sets=[images], validation=images[:1]))
     before = {n: p.detach().clone() for n, p in training.network.named_parameters()}
     assert training.run(tmp_path / "run", lambda line: None, lambda: training.step == 1) is None
-    again = MaskRcnnTraining(TINY, [images], [1.0], images[:1])
+    again = MaskRcnnTraining(TINY, TrainingImages(sets=[images], validation=images[:1]))
     again.resume(tmp_path / "run")
     weights = again.run(tmp_path / "run", lambda line: None)
     assert weights is not None
@@ -102,7 +104,7 @@ def test_mask_rcnn_on_imagenet_weights_leaves_its_first_layers_alone(tmp_path: P
         epochs=1,
         batch_size=1,
     )
-    training = MaskRcnnTraining(config, [images], [1.0], pretrained=True)
+    training = MaskRcnnTraining(config, TrainingImages(sets=[images]), pretrained=True)
     start = EfficientNetLite0()
     start.load_imagenet()
     weights = training.run(tmp_path / "run", lambda line: None)
@@ -118,7 +120,7 @@ def test_mask_rcnn_on_imagenet_weights_leaves_its_first_layers_alone(tmp_path: P
 
 def test_a_picture_without_masks_does_not_train_the_mask_head(tmp_path: Path) -> None:
     images = drawn_set(tmp_path / "set", masks=False)
-    training = MaskRcnnTraining(TINY, [images], [1.0])
+    training = MaskRcnnTraining(TINY, TrainingImages(sets=[images]))
     before = {n: p.detach().clone() for n, p in training.network.named_parameters() if "mask" in n}
     terms = training.train_step()
     assert terms["loss_mask"] == 0 and terms["loss_objectness"] > 0
@@ -171,32 +173,42 @@ def test_yolo_losses_are_read_as_those_of_the_others(tmp_path: Path) -> None:
         read_history(path)
 
 
-def test_yolo_is_trained_with_table_4_1_or_with_the_library_s_own_settings() -> None:
-    thesis, stock = thesis_settings(), stock_settings(7)
-    assert (thesis["epochs"], thesis["batch"], thesis["lr0"], thesis["patience"]) == (100, 1, 1e-4, 3)
-    # 288 to 448 px: 368 px on average, and 80 px to either side.
-    assert thesis["imgsz"] == 368 and thesis["multi_scale"] * 368 == pytest.approx(80)
-    assert stock["epochs"] == 7 and "lr0" not in stock and not stock["pretrained"]
+def test_yolo_is_trained_by_its_library_and_its_best_weights_and_losses_are_kept(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    asked: dict[str, object] = {}
+
+    class Library:
+        """What is asked of Ultralytics, and the files that it leaves."""
+
+        def __init__(self, model: str) -> None:
+            asked["model"] = model
+
+        def train(self, **settings: object) -> None:
+            asked.update(settings)
+            folder = Path(str(settings["project"])) / str(settings["name"])
+            (folder / "weights").mkdir(parents=True)
+            (folder / "weights" / "best.pt").write_bytes(b"best")
+            (folder / "results.csv").write_text("epoch,train/box_loss,val/box_loss\n1,3.8,4.1\n2,3.1,3.5\n")
+
+    monkeypatch.setitem(sys.modules, "ultralytics", SimpleNamespace(YOLO=Library))
+    images = drawn_set(tmp_path / "set")
+    of_both = TrainingImages(sets=[images[:1], images[1:2]], validation=images[2:])
+    weights = train_yolo(of_both, tmp_path / "run", YOLO_SETTINGS["thesis"], "yolov3.yaml", seed=4)
+    assert weights.read_bytes() == b"best"
+    assert asked["model"] == "yolov3.yaml" and asked["seed"] == 4
+    assert YOLO_SETTINGS["thesis"].items() <= asked.items()
+    data = Path(str(asked["data"])).parent
+    assert len(list((data / "labels" / "train").iterdir())) == 2
+    assert len(list((data / "labels" / "val").iterdir())) == 1
+    assert (tmp_path / "run" / "losses.png").is_file() and (tmp_path / "run" / "yolo.json").is_file()
 
 
 def test_the_training_command_writes_weights_and_curves(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     drawn_set(tmp_path / "set")
-    network = (
-        "--network.backbone",
-        "plain",
-        "--network.widths",
-        "8",
-        "8",
-        "8",
-        "8",
-        "--network.blocks",
-        "0",
-        "0",
-        "0",
-        "0",
-    )
+    network = ("--network.neck-width", "8", "--augmentation.size", "64")
     options = ("--steps", "2", "--log-every", "1", "--batch-size", "2", *network)
     arguments = ["light", "--data", str(tmp_path / "set"), "--validation", str(tmp_path / "set"), *options]
     main(["train-segmenter", *arguments, "--out", str(tmp_path / "run")])

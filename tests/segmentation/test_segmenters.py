@@ -44,7 +44,7 @@ def test_the_colour_segmenter_finds_single_fruits() -> None:
     image, masks = drawn((40, 40, 18), (120, 80, 25))
     found = make_segmenter("colour")(image)
     assert len(found) == 2 and set(found.categories) == {"tomato_ripe"}
-    overlaps, _ = mask_overlaps(found.masks, masks)
+    overlaps = mask_overlaps(found.masks, masks)
     assert (overlaps.max(axis=0) > 0.9).all()
     assert (found.scores > 0.9).all()
 
@@ -69,7 +69,7 @@ def test_depth_takes_far_fruits_away_and_parts_fruits_of_one_colour() -> None:
     found = ColourSegmenter()(image, depth)
     assert len(found) == 2
     front = masks[1]
-    overlaps, _ = mask_overlaps(found.masks, np.array([front, masks[0] & ~front]))
+    overlaps = mask_overlaps(found.masks, np.array([front, masks[0] & ~front]))
     assert (overlaps.max(axis=0) > 0.8).all()
     depth[masks[0]] = 4.0
     assert len(ColourSegmenter()(image, depth)) == 1
@@ -228,7 +228,7 @@ def test_the_shipped_weights_are_small_and_find_a_drawn_fruit() -> None:
     image[mask] = (np.array((205, 40, 30)) * shade[mask][:, None]).astype(np.float32)
     blurred = cv2.GaussianBlur(image, (0, 0), 1.0).astype(np.uint8)
     found = make_segmenter()(blurred)
-    overlaps, _ = mask_overlaps(found.masks, mask[None])
+    overlaps = mask_overlaps(found.masks, mask[None])
     assert overlaps.max(initial=0) > 0.8 and found.categories[int(overlaps[:, 0].argmax())].startswith(
         "tomato"
     )

@@ -11,7 +11,7 @@ import pytest
 import trimesh
 
 from maniskill_tomato.cli import main, parse
-from maniskill_tomato.cli.dataset_command import Dataset
+from maniskill_tomato.cli.image_commands import Dataset
 from maniskill_tomato.errors import InvalidInputError
 from maniskill_tomato.robot.d435 import (
     CameraIntrinsics,

@@ -190,6 +190,25 @@ def test_a_row_gives_a_place_for_each_target() -> None:
         make_world("TomatoViewpointRow-v1", perception="occlusion_model", target="any")
 
 
+def test_one_rendering_serves_all_environments_of_a_look() -> None:
+    asked = []
+
+    def render(qpos: torch.Tensor) -> np.ndarray[Any, np.dtype[np.uint8]]:
+        asked.append(qpos.clone())
+        return np.zeros((3, 120, 160, 3), dtype=np.uint8)
+
+    intrinsics = color_intrinsics(160, 120)
+    world = make_world(
+        "TomatoViewpoint-v1", 3, perception="thesis_model", pictures=render, intrinsics=intrinsics
+    )
+    world.reset(seed=0)
+    before = len(asked)
+    for k in range(2):
+        world.step(torch.full((3, 3), 0.3))
+        assert len(asked) == before + 1 + k
+        assert torch.equal(asked[-1], world.qpos)
+
+
 @pytest.mark.render
 @pytest.mark.parametrize("perception", ["thesis_model", "improved_model", "segmenter"])
 def test_rendered_perceptions_run_and_their_pictures_lie_on_the_cast_labels(perception: str) -> None:
@@ -205,14 +224,14 @@ def test_rendered_perceptions_run_and_their_pictures_lie_on_the_cast_labels(perc
     *_, info = task.step(torch.tensor([0.0, 0.6, 0.3]))
     assert 0.0 <= float(info["visible_fraction"][0]) <= 1.0
     assert set(info) >= {"true_visible_fraction", "true_success"}
-    picture = task._wrist_picture(0, task.qpos[0]).astype(int)
+    picture = task._wrist_pictures(task.qpos)[0].astype(int)
     assert picture.shape == (240, 320, 3)
     T_w_links = link_transforms(task.agent.robot.get_qpos())
     images = task.world.scene.image(
         task.camera_intrinsics,
         task.world.camera_poses(T_w_links),
         task.target_fruit,
-        task.planting.T_world_plant,
+        task.plant_batch.T_world_plant,
         T_w_links,
     )
     target = (images.label[0] == int(PixelLabel.TARGET)).numpy()
@@ -241,7 +260,7 @@ class Eye:
     def look(self) -> float:
         T_w_links = link_transforms(self.env.agent.robot.get_qpos())
         T_w_camera = self.env.world.camera_poses(T_w_links)
-        frames = self.camera.take(T_w_camera, self.env.planting.T_world_plant, T_w_links)
+        frames = self.camera.take(T_w_camera, self.env.plant_batch.T_world_plant, T_w_links)
         self.perception.look(frames)
         return float(self.perception.visible_fraction[0])
 
@@ -286,7 +305,7 @@ class LabelSegmenter:
             color_intrinsics(*IMAGE_SIZE),
             env.world.camera_poses(T_w_links),
             env.target_fruit,
-            env.planting.T_world_plant,
+            env.plant_batch.T_world_plant,
             T_w_links,
         )
         target = (images.label[0] == int(PixelLabel.TARGET)).numpy()

@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from maniskill_tomato.robot.inverse_kinematics import Reach
-from maniskill_tomato.tasks.row.row_rewards import view_gain_reward
+from maniskill_tomato.tasks.row.row_config import GeneralTaskConfig
 from maniskill_tomato.tasks.thesis import thesis_rewards as rewards
 
 OK, NEAR, OUT = int(Reach.REACHABLE), int(Reach.NEIGHBOUR), int(Reach.UNREACHABLE)
@@ -110,6 +110,13 @@ def test_forbidden_zone_has_the_bounds_of_eq_5_4(
     assert bool(rewards.in_forbidden_zone(torch.tensor([position]))[0]) is expected
 
 
+def test_forbidden_zones_of_a_batch_are_judged_row_by_row() -> None:
+    # Beside the base and too low; too far and too low; free; too far and below the floor; behind the base, but free.
+    positions = [(0.0, 0.1, 0.1), (0.8, 0.0, 0.1), (0.2, -0.1, 0.9), (0.9, 0.5, -0.3), (-0.1, 0.5, 0.5)]
+    found = rewards.in_forbidden_zone(torch.tensor(positions))
+    assert found.tolist() == [True, True, False, True, False]
+
+
 def test_rewards_are_batched_and_keep_their_rows_apart() -> None:
     v = torch.tensor([0.9, 0.0, 0.75, 0.5])
     seen = torch.tensor([True, False, True, True])
@@ -123,29 +130,22 @@ def test_rewards_are_batched_and_keep_their_rows_apart() -> None:
     )
 
 
-def test_view_gain_reward_agrees_with_values_worked_out_by_hand() -> None:
+def test_the_reward_of_the_general_tasks_agrees_with_values_worked_out_by_hand() -> None:
     now = torch.tensor([0.5, 0.9, 0.2, 0.7])
     before = torch.tensor([0.2, 0.7, 0.4, 0.7])
     success, contact = now > 0.8, torch.tensor([False, False, True, False])
-    found = view_gain_reward(
-        now, before, success, contact, step_cost=0.02, success_reward=1.0, contact_penalty=0.5
-    )
+    task = GeneralTaskConfig(step_cost=0.02, success_reward=1.0, contact_penalty=0.5)
+    found = task.reward(now, before, success, contact)
     torch.testing.assert_close(found, torch.tensor([0.28, 1.18, -0.72, -0.02]))
 
 
 def test_lingering_never_pays_and_a_success_always_does() -> None:
+    task = GeneralTaskConfig(step_cost=0.02, success_reward=1.0, contact_penalty=0.0)
+
     def episode(fractions: list[float]) -> float:
         v = torch.tensor(fractions)
-        reward = view_gain_reward(
-            v[1:],
-            v[:-1],
-            v[1:] > 0.8,
-            torch.zeros(len(v) - 1, dtype=torch.bool),
-            step_cost=0.02,
-            success_reward=1.0,
-            contact_penalty=0.0,
-        )
-        return float(reward.sum())
+        no_contact = torch.zeros(len(v) - 1, dtype=torch.bool)
+        return float(task.reward(v[1:], v[:-1], v[1:] > 0.8, no_contact).sum())
 
     finished = episode([0.1, 0.4, 0.9])
     lingering = episode([0.1, 0.4] + [0.75] * 18)

@@ -63,14 +63,14 @@ def test_starts_are_hidden_free_of_contact_and_look_at_a_ripe_fruit_of_the_middl
     base = env.unwrapped
     for seed in range(12):
         _, info = env.reset(seed=seed)
-        plant, target = base.planting.plants[0], int(base.target_fruit[0])
+        plant, target = base.plant_batch.plants[0], int(base.target_fruit[0])
         assert target < plant.middle_fruits and plant.fruits[target].ripeness == "ripe"
         assert 0.0 <= float(info["visible_fraction"]) < 0.3
         assert float(info["clearance"]) > 0.0 and not bool(info["plant_contact"])
         T = flange_to_camera(forward_kinematics(base.agent.robot.get_qpos().double()))[0]
         away = base.target_position_w[0].double() - T[:3, 3]
         torch.testing.assert_close(T[:3, 2], away / away.norm(), atol=1e-5, rtol=0)
-        stem = base.planting.position_w[0].double()
+        stem = base.plant_batch.position_w[0].double()
         low, high = torch.tensor(base.task.start_box, dtype=torch.float64).unbind(-1)
         place = T[:3, 3] - torch.tensor([float(stem[0]), float(stem[1]), 0.0])
         assert bool((place >= low - 1e-5).all()) and bool((place <= high + 1e-5).all())
@@ -81,11 +81,11 @@ def test_visible_fraction_is_that_of_another_scene(env: Any) -> None:
     base, rng = env.unwrapped, np.random.default_rng(0)
     for seed in range(3):
         env.reset(seed=seed)
-        scene = RayScene(base.planting.plants, base.camera_intrinsics)
+        scene = RayScene(base.plant_batch.plants, base.camera_intrinsics)
         for _ in range(4):
             *_, info = env.step(action(rng))
             T = flange_to_camera(forward_kinematics(base.agent.robot.get_qpos()))
-            seen = scene.visibility(T, base.target_fruit, base.planting.T_world_plant)
+            seen = scene.visibility(T, base.target_fruit, base.plant_batch.T_world_plant)
             # The other scene knows no robot, which can only hide more.
             assert float(info["visible_fraction"]) <= float(seen.visible_fraction) + 1e-6
             truth = base.ground_truth.visible_fraction(T)
@@ -223,18 +223,18 @@ def test_episodes_of_a_list_come_by_seed_and_by_index(tmp_path: Path) -> None:
     for seed, options in ((1, {}), (4, {}), (None, {"episode": 1})):
         _, info = env.reset(seed=seed, options=options)
         episode = episodes[1]
-        assert base.planting.seeds[0] == episode.plant_seed
+        assert base.plant_batch.seeds[0] == episode.plant_seed
         assert int(base.target_fruit[0]) == episode.target
         assert float(info["visible_fraction"]) == pytest.approx(episode.start_visibility, abs=1e-4)
         torch.testing.assert_close(
             base.belief.camera_position[0], torch.tensor(episode.camera_position), atol=1e-5, rtol=0
         )
-        pose = torch.cat([base.planting.position_w[0, :2], base.planting.yaw])
+        pose = torch.cat([base.plant_batch.position_w[0, :2], base.plant_batch.yaw])
         torch.testing.assert_close(pose, torch.tensor(episode.plant_pose), atol=1e-5, rtol=0)
     env.close()
     of_file: Any = make(episodes=str(path), plant=None)
     of_file.reset(seed=2)
-    assert of_file.unwrapped.planting.seeds[0] == episodes[2].plant_seed
+    assert of_file.unwrapped.plant_batch.seeds[0] == episodes[2].plant_seed
     of_file.close()
     with pytest.raises(InvalidInputError, match="held_out"):
         make(episodes=str(tmp_path / "missing.json"))
@@ -298,7 +298,7 @@ def test_bad_options_are_refused(env: Any, tmp_path: Path) -> None:
 def test_a_row_is_searched_fruit_by_fruit(row: Any) -> None:
     base, rng = row.unwrapped, np.random.default_rng(0)
     _, info = row.reset(seed=0)
-    ripe = set(base.planting.ripe_fruits[0])
+    ripe = set(base.plant_batch.ripe_fruits[0])
     assert 1 <= int(info["target_count"]) <= len(ripe) and int(info["seen_count"]) == 0
     visited, seen, since = [int(base.target_fruit[0])], 0, 0
     for _ in range(36):
@@ -318,7 +318,7 @@ def test_a_row_is_searched_fruit_by_fruit(row: Any) -> None:
             assert target not in visited and target in ripe
             assert int(base.belief.memory.visits[0]) == 1
             left = [j for j in ripe if j not in visited and j in base.open_targets(0)]
-            positions = base.planting.fruit_positions_w(0, left)
+            positions = base.plant_batch.fruit_positions_w(0, left)
             nearest = left[int((positions - base.belief.camera_position[0]).norm(dim=-1).argmin())]
             assert target == nearest
             visited.append(target)

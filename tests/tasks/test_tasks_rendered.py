@@ -86,9 +86,9 @@ def test_visible_fraction_is_the_share_of_the_targets_outline_that_the_picture_s
 
 def outline_area(base: Any, params: dict[str, torch.Tensor]) -> float:
     """Area of the target's silhouette in the image plane, a fruit being nearly convex, in [px]."""
-    plant = base.planting.plants[0]
+    plant = base.plant_batch.plants[0]
     vertices_p = plant.organs[plant.fruits[int(base.target_fruit[0])].organ_index].vertices
-    T_world_plant = base.planting.T_world_plant[0].numpy()
+    T_world_plant = base.plant_batch.T_world_plant[0].numpy()
     vertices_w = vertices_p @ T_world_plant[:3, :3].T + T_world_plant[:3, 3]
     T_cam_world = params["extrinsic_cv"][0].numpy()
     vertices_c = vertices_w @ T_cam_world[:3, :3].T + T_cam_world[:3, 3]
@@ -102,7 +102,7 @@ def test_depth_points_of_the_target_lie_on_the_target() -> None:
     base: Any = env.unwrapped
     found = 0
     env.reset(seed=0)
-    for target in base.planting.ripe_fruits[0]:
+    for target in base.plant_batch.ripe_fruits[0]:
         env.reset(seed=0, options={"target": target})
         x, y, z = base.target_position_w[0].tolist()
         options = {"target": target, "viewpoint": [x - 0.3, y, z, 0.0, math.pi / 2, 0.0]}
@@ -121,7 +121,7 @@ def test_depth_points_of_the_target_lie_on_the_target() -> None:
         T_cam_world = params["extrinsic_cv"][0].double()
         points_w = (points_c - T_cam_world[:3, 3]) @ T_cam_world[:3, :3]
         distance = (points_w - base.target_position_w[0].double()).norm(dim=-1)
-        plant = base.planting.plants[0]
+        plant = base.plant_batch.plants[0]
         radius = plant.fruits[int(base.target_fruit[0])].radius
         # 1 mm of depth quantisation, and vertices of the mesh lie inside the bounding sphere.
         assert float(distance.median()) < radius + 0.002
@@ -187,7 +187,7 @@ def test_new_plants_are_the_same_with_and_without_a_renderer() -> None:
     pictured = make(SPARSE, obs_mode="segmentation", plant=plant)
     for seed in (3, 1, 3):
         a, b = plain.reset(seed=seed), pictured.reset(seed=seed)
-        assert plain.unwrapped.planting.seeds == pictured.unwrapped.planting.seeds
+        assert plain.unwrapped.plant_batch.seeds == pictured.unwrapped.plant_batch.seeds
         assert torch.equal(a[1]["target_id"], b[1]["target_id"])
         torch.testing.assert_close(
             a[0][:, :6], torch.cat([b[0]["extra"]["ee_position"], b[0]["extra"]["ee_rpy"]], -1)

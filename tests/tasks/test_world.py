@@ -82,6 +82,15 @@ def assert_same(world: World, singles: Sequence[World], exact_share: float = 1.0
 def test_every_environment_plays_as_it_would_alone(
     env_id: str, options: dict[str, Any], num_envs: int
 ) -> None:
+    play_beside_single_worlds(env_id, options, num_envs)
+
+
+def test_rows_with_cameras_play_as_they_would_alone() -> None:
+    play_beside_single_worlds(ROW, {**POOL, "perception": "occlusion_model"}, 2)
+
+
+def play_beside_single_worlds(env_id: str, options: dict[str, Any], num_envs: int) -> None:
+    """Plays the same moves in one world and in a world for each environment, some of which begin anew on the way."""
     # Rounding moves a ray at the edge of a pixel or of a voxel to the next one.
     exact_share = 0.98 if options.keys() & {"perception", "sensor_noise"} else 1.0
     if "perception" in options:

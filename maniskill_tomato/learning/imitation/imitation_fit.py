@@ -1,5 +1,6 @@
 """Fitting a student to the teacher's moves."""
 
+from collections import deque
 from collections.abc import Callable
 
 import torch
@@ -7,7 +8,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 from torch.nn.utils.rnn import pack_padded_sequence, pad_packed_sequence
 
-from maniskill_tomato.errors import TrainingDivergedError
+from maniskill_tomato.learning.descent import descend
 from maniskill_tomato.learning.imitation.imitation_config import ImitationFitConfig
 from maniskill_tomato.learning.imitation.teacher_episodes import ImitationData
 
@@ -97,22 +98,12 @@ def _descend(
     config: ImitationFitConfig,
     report: Callable[[int, float], None],
 ) -> float:
-    actor.train().requires_grad_(True)
-    optimizer = torch.optim.AdamW(
-        actor.parameters(), lr=config.learning_rate, weight_decay=config.weight_decay, fused=True
-    )
-    schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, config.steps)
-    recent: list[float] = []
-    for step in range(1, config.steps + 1):
-        value = loss()
-        if not bool(value.isfinite()):
-            raise TrainingDivergedError(f"the loss of step {step} is not finite; lower learning_rate")
-        optimizer.zero_grad()
-        value.backward()  # type: ignore[no-untyped-call]
-        optimizer.step()
-        schedule.step()
-        recent = [*recent[-499:], value.item()]
+    recent: deque[float] = deque(maxlen=500)
+
+    def tell(step: int, value: float) -> None:
+        recent.append(value)
         if step % 500 == 0 or step == config.steps:
             report(step, sum(recent) / len(recent))
-    actor.eval().requires_grad_(False)
+
+    descend(actor, loss, config, tell)
     return sum(recent) / len(recent)

@@ -10,13 +10,13 @@ import torch
 from torch import Tensor
 
 import maniskill_tomato
-from maniskill_tomato.files import write_atomically
+from maniskill_tomato.files import write_atomically, write_tensors
 from maniskill_tomato.learning.blocks import Block, begin_training, run_blocks
 from maniskill_tomato.learning.imitation.imitation_config import ImitationConfig
 from maniskill_tomato.learning.imitation.imitation_fit import fit_actor, fit_recurrent
 from maniskill_tomato.learning.imitation.teacher_episodes import ImitationData, collect_demonstrations
 from maniskill_tomato.learning.rl.agent import make_agent
-from maniskill_tomato.learning.rl.checkpoint import make_checkpoint, save_checkpoint
+from maniskill_tomato.learning.rl.checkpoint import make_checkpoint
 from maniskill_tomato.learning.rl.envs import make_env
 from maniskill_tomato.learning.rl.presets import get_preset
 from maniskill_tomato.policies.opening import open_policy
@@ -101,7 +101,7 @@ def _fit(config: ImitationConfig, data: ImitationData, path: Path, report: Calla
     fit_actor(agent.actor, data, config.fit, tell)
     bounds = -torch.ones(3), torch.ones(3)
     checkpoint = make_checkpoint(agent, ENV_ID, bounds, {**facts}, with_training_state=False, env_options={})
-    save_checkpoint(path, checkpoint)
+    write_tensors(path, checkpoint)
 
 
 def _collect(

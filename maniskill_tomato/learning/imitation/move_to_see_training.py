@@ -9,7 +9,7 @@ import torch
 from torch import Tensor, nn
 
 from maniskill_tomato.errors import InvalidInputError
-from maniskill_tomato.learning.imitation.regression_config import RegressionConfig
+from maniskill_tomato.learning.imitation.imitation_config import RegressionConfig
 from maniskill_tomato.learning.rl.envs import make_env
 from maniskill_tomato.policies.baselines import RandomStep
 from maniskill_tomato.policies.deep_move_to_see import (

@@ -1,15 +1,12 @@
-"""Writing checkpoints: weights with everything needed to use them, whole or not at all."""
+"""What a checkpoint holds: weights with everything needed to use them."""
 
-import io
 import json
-from pathlib import Path
 from typing import Any
 
 import torch
 from torch import Tensor
 
 import maniskill_tomato
-from maniskill_tomato.files import write_atomically
 from maniskill_tomato.learning.rl.agent import Agent
 from maniskill_tomato.policies.layout import layout_of
 from maniskill_tomato.policies.trained_actor import FORMAT
@@ -82,19 +79,6 @@ def make_checkpoint(
     if run is not None:
         data["run"] = run
     return data
-
-
-def save_checkpoint(path: Path, data: dict[str, Any]) -> None:
-    """Writes `data` to a neighbouring file first and renames it, so that `path` never holds half a
-    checkpoint.
-
-    Raises:
-        CheckpointError: The file cannot be written, for instance because the disk is full; an older file
-            stays.
-    """
-    buffer = io.BytesIO()
-    torch.save(data, buffer)
-    write_atomically(path, buffer.getvalue())
 
 
 def _names(names: tuple[str, ...], count: int) -> list[str]:

@@ -8,9 +8,8 @@ from pathlib import Path
 from typing import Any
 
 from maniskill_tomato.errors import InvalidInputError
-from maniskill_tomato.learning.rl.presets import PRESETS, PresetName, TrainConfig, default_preset, get_preset
-
-KEYS = ("env_id", "preset", "seed", "seeds", "env_options", "config", "package_version")
+from maniskill_tomato.learning.rl.presets import PresetName, TrainConfig, default_preset, get_preset
+from maniskill_tomato.tables import read_table
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -20,15 +19,24 @@ class RunFile:
     env_id: str | None = None
     """Id of the task."""
     preset: PresetName | None = None
-    """The named configuration that `options` change."""
+    """The named configuration that `config` changes."""
     seed: int | None = None
     """Seed of a single run."""
     seeds: tuple[int, ...] = ()
     """Seeds of several runs."""
     env_options: dict[str, Any] = field(default_factory=dict)
     """Options of the task for `gymnasium.make`."""
-    options: dict[str, Any] = field(default_factory=dict)
+    config: dict[str, Any] = field(default_factory=dict)
     """Fields of `TrainConfig`."""
+    package_version: str | None = None
+    """What wrote the file, if a run did."""
+
+    def __post_init__(self) -> None:
+        if min((0 if self.seed is None else self.seed, *self.seeds)) < 0:
+            raise InvalidInputError(
+                f"seeds must be 0 or more, got {self.seed if self.seeds == () else self.seeds}"
+            )
+        self.train_config(self.preset or default_preset(self.env_id))
 
     def train_config(self, preset: PresetName) -> TrainConfig:
         """The options on top of a preset.
@@ -36,48 +44,17 @@ class RunFile:
         Raises:
             InvalidInputError: An option is unknown or its value not allowed.
         """
-        return TrainConfig.from_dict({**get_preset(preset).to_dict(), **self.options})
+        return TrainConfig.from_dict({**get_preset(preset).to_dict(), **self.config})
 
 
 def read_run_file(path: Path) -> RunFile:
-    """Reads a `.toml` or `.json` file.
-
-    Its keys are `env_id`, `preset`, `seed` or `seeds`, the table `config` (fields of `TrainConfig`) and the table
-    `env_options` (options of the task, such as `plant` and `plant_pose`).
+    """Reads a `.toml` or `.json` file, whose entries are the fields of `RunFile`.
 
     Raises:
         InvalidInputError: It is missing, of another form, or says something unknown; the message has the file's
             name.
     """
-    values = _read(path)
-    unknown = sorted(set(values) - set(KEYS))
-    if unknown:
-        raise InvalidInputError(
-            f"{path} has unknown entries {', '.join(unknown)}; known are {', '.join(KEYS)}"
-        )
-    for key in ("env_options", "config"):
-        if not isinstance(values.get(key, {}), dict):
-            raise InvalidInputError(f"{path}: {key} must be a table, got {values[key]!r}")
-    env_id, seed, seeds = values.get("env_id"), values.get("seed"), values.get("seeds", [])
-    if env_id is not None and not isinstance(env_id, str):
-        raise InvalidInputError(f"{path}: env_id must be text, got {env_id!r}")
-    if seed is not None and not _is_seed(seed):
-        raise InvalidInputError(f"{path}: seed must be an integer of 0 or more, got {seed!r}")
-    if not isinstance(seeds, list) or not all(_is_seed(s) for s in seeds):
-        raise InvalidInputError(f"{path}: seeds must be a list of integers of 0 or more, got {seeds!r}")
-    run_file = RunFile(
-        env_id=env_id,
-        preset=_preset(path, values.get("preset")),
-        seed=seed,
-        seeds=tuple(seeds),
-        env_options=values.get("env_options", {}),
-        options=values.get("config", {}),
-    )
-    try:
-        run_file.train_config(run_file.preset or default_preset(env_id))
-    except (InvalidInputError, TypeError) as error:
-        raise InvalidInputError(f"{path}: {error}") from error
-    return run_file
+    return read_table(RunFile, _read(path), path)
 
 
 def read_run_config(run_dir: Path) -> RunFile:
@@ -109,19 +86,6 @@ def parse_seeds(words: tuple[str, ...]) -> tuple[int, ...]:
     if len(set(seeds)) != len(seeds):
         raise InvalidInputError(f"every seed may come once only; got {', '.join(map(str, seeds))}")
     return tuple(seeds)
-
-
-def _is_seed(value: object) -> bool:
-    return isinstance(value, int) and not isinstance(value, bool) and value >= 0
-
-
-def _preset(path: Path, value: object) -> PresetName | None:
-    for name in PRESETS:
-        if value == name:
-            return name
-    if value is None:
-        return None
-    raise InvalidInputError(f"{path}: {InvalidInputError.choice('preset', value, PRESETS)}")
 
 
 def _read(path: Path) -> Mapping[str, Any]:

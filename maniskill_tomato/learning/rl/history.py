@@ -23,7 +23,7 @@ RECENT_EPISODES = 50
 
 
 @dataclass(frozen=True, kw_only=True)
-class EpisodeRecord:
+class TrainingEpisode:
     """One finished training episode."""
 
     episode: int
@@ -49,7 +49,7 @@ class TrainingCurves:
     """The history of a run as arrays."""
 
     episodes: dict[str, NDArray[np.float64]]
-    """One array of shape (episodes,) per field of `EpisodeRecord`."""
+    """One array of shape (episodes,) per field of `TrainingEpisode`."""
     step_reward: NDArray[np.float32]
     """R of every step. Shape (steps,)."""
     step_visible_fraction: NDArray[np.float32]
@@ -60,8 +60,8 @@ class TrainingHistory:
     """Collects steps and episodes of `num_envs` parallel environments."""
 
     def __init__(self, num_envs: int) -> None:
-        self.episodes: list[EpisodeRecord] = []
-        self.recent: deque[EpisodeRecord] = deque(maxlen=RECENT_EPISODES)
+        self.episodes: list[TrainingEpisode] = []
+        self.recent: deque[TrainingEpisode] = deque(maxlen=RECENT_EPISODES)
         self._step_reward: list[float] = []
         self._step_visible_fraction: list[float] = []
         self._running = [_RunningEpisode() for _ in range(num_envs)]
@@ -73,7 +73,7 @@ class TrainingHistory:
         visible_fractions: list[float],
         successes: list[bool],
         dones: list[bool],
-    ) -> list[EpisodeRecord]:
+    ) -> list[TrainingEpisode]:
         """Adds one step of every environment.
 
         Args:
@@ -88,7 +88,7 @@ class TrainingHistory:
         """
         self._step_reward += rewards
         self._step_visible_fraction += visible_fractions
-        finished: list[EpisodeRecord] = []
+        finished: list[TrainingEpisode] = []
         for index, running in enumerate(self._running):
             running.steps += 1
             running.episodic_return += rewards[index]
@@ -97,7 +97,7 @@ class TrainingHistory:
             if not dones[index]:
                 continue
             finished.append(
-                EpisodeRecord(
+                TrainingEpisode(
                     episode=len(self.episodes),
                     end_step=step,
                     final_visible_fraction=visible_fractions[index],
@@ -115,14 +115,14 @@ class TrainingHistory:
             running.loss_sum += loss
 
     def recent_mean(self, field: str) -> float:
-        """Mean of a field of `EpisodeRecord` over the last episodes; NaN before the first has ended."""
+        """Mean of a field of `TrainingEpisode` over the last episodes; NaN before the first has ended."""
         values = [float(getattr(record, field)) for record in self.recent]
         return sum(values) / len(values) if values else float("nan")
 
     def state_dict(self) -> dict[str, Any]:
         """Everything so far, episodes that still run included, exactly and as tensors."""
         return {
-            "episodes": _columns(self.episodes, EpisodeRecord),
+            "episodes": _columns(self.episodes, TrainingEpisode),
             "running": _columns(self._running, _RunningEpisode),
             "step_reward": torch.tensor(self._step_reward, dtype=torch.float64),
             "step_visible_fraction": torch.tensor(self._step_visible_fraction, dtype=torch.float64),
@@ -140,14 +140,14 @@ class TrainingHistory:
                 f"the history is of {len(running)} parallel environments, not of {len(self._running)}"
             )
         self._running = running
-        self.episodes = _rows(state["episodes"], EpisodeRecord)
+        self.episodes = _rows(state["episodes"], TrainingEpisode)
         self.recent = deque(self.episodes[-RECENT_EPISODES:], maxlen=RECENT_EPISODES)
         self._step_reward = state["step_reward"].tolist()
         self._step_visible_fraction = state["step_visible_fraction"].tolist()
 
     def save(self, folder: Path) -> None:
         """Writes `episodes.csv` and `history.npz` (everything, as arrays) into `folder`."""
-        names = [field.name for field in fields(EpisodeRecord)]
+        names = [field.name for field in fields(TrainingEpisode)]
         text = io.StringIO()
         writer = csv.writer(text)
         writer.writerow(names)

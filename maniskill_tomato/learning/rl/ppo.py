@@ -4,7 +4,6 @@ Actions, observations and reward are those of the preset `td3`, for the general 
 algorithm differs.
 """
 
-import json
 import time
 from collections.abc import Sequence
 from pathlib import Path
@@ -18,9 +17,8 @@ from tqdm import tqdm
 
 import maniskill_tomato
 from maniskill_tomato.errors import MissingPackageError
-from maniskill_tomato.files import write_atomically
+from maniskill_tomato.files import write_json, write_tensors
 from maniskill_tomato.learning.interrupt import stop_on_signals
-from maniskill_tomato.learning.rl.checkpoint import save_checkpoint
 from maniskill_tomato.learning.rl.export import DenseActor, export_actor
 from maniskill_tomato.learning.rl.gymnasium_env import Array, make_gymnasium_env, normalize_observation
 from maniskill_tomato.learning.rl.history import TrainingHistory
@@ -41,7 +39,7 @@ SPS_EVERY = 100
 """Environment steps between two points of charts/SPS."""
 
 
-class Recorder(gym.Wrapper[Array, Array, Array, Array]):
+class HistoryWrapper(gym.Wrapper[Array, Array, Array, Array]):
     """Keeps the history of the training, and TensorBoard's charts."""
 
     def __init__(self, env: gym.Env[Array, Array], run_dir: Path) -> None:
@@ -131,7 +129,7 @@ def train_ppo(env_id: str, config: PpoConfig, run_dir: Path, seed: int, progress
         gamma=config.gamma,
         step_cost=config.step_cost,
     )
-    env = Recorder(task, run_dir)
+    env = HistoryWrapper(task, run_dir)
     model = PPO(
         "MlpPolicy",
         env,
@@ -147,7 +145,7 @@ def train_ppo(env_id: str, config: PpoConfig, run_dir: Path, seed: int, progress
         device="cpu",
     )
     model.set_logger(Logger(None, []))  # Its default is a folder among the system's temporary files.
-    write_atomically(run_dir / "config.json", (json.dumps(content, indent=2) + "\n").encode())
+    write_json(run_dir / "config.json", content)
     start = time.perf_counter()
     with (
         stop_on_signals() as stop,
@@ -162,9 +160,7 @@ def train_ppo(env_id: str, config: PpoConfig, run_dir: Path, seed: int, progress
     seconds = time.perf_counter() - start
     env.history.save(run_dir)
     counters = {"steps": env.steps, "episodes": len(env.history.episodes), "seconds": seconds, "seed": seed}
-    save_checkpoint(
-        run_dir / "ppo.pt", {**content, "counters": counters, "policy": model.policy.state_dict()}
-    )
+    write_tensors(run_dir / "ppo.pt", {**content, "counters": counters, "policy": model.policy.state_dict()})
     env.close()
     policy = PpoPolicy(model.policy, config.action_scale)
     export_actor(dense_actor(model.policy, policy, content, counters), run_dir / "policy.onnx")

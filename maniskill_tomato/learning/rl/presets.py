@@ -8,8 +8,6 @@ from maniskill_tomato.errors import InvalidInputError
 from maniskill_tomato.learning.rl.train_config import MAY_CHANGE as MAY_CHANGE
 from maniskill_tomato.learning.rl.train_config import TrainConfig as TrainConfig
 from maniskill_tomato.learning.rl.train_config import modernise as modernise
-from maniskill_tomato.policies.layout import ACTION_NAMES as ACTION_NAMES
-from maniskill_tomato.policies.layout import OBSERVATION_NAMES as OBSERVATION_NAMES
 from maniskill_tomato.tasks import GENERAL_IDS
 
 OBSERVATION_CENTRE = (0.2, 0.0, 0.8, 0.0, math.pi / 2, 0.0, 0.7, 0.0, 0.8)

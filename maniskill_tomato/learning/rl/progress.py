@@ -13,7 +13,7 @@ from typing import Any
 from torch.utils.tensorboard import SummaryWriter
 from tqdm import tqdm
 
-from maniskill_tomato.learning.rl.history import EpisodeRecord, TrainingHistory
+from maniskill_tomato.learning.rl.history import TrainingEpisode, TrainingHistory
 from maniskill_tomato.learning.rl.presets import TrainConfig
 from maniskill_tomato.learning.rl.wandb_log import WandbWriter
 
@@ -138,7 +138,7 @@ class TrainingLog:
         step: int,
         losses: dict[str, float],
         exploration: float,
-        finished: list[EpisodeRecord],
+        finished: list[TrainingEpisode],
         history: TrainingHistory,
     ) -> None:
         """Records one step.

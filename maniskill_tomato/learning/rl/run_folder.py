@@ -2,7 +2,6 @@
 
 import contextlib
 import fcntl
-import json
 import logging
 import os
 import shutil
@@ -12,7 +11,7 @@ from typing import Any
 
 import maniskill_tomato
 from maniskill_tomato.errors import CheckpointError, InvalidInputError
-from maniskill_tomato.files import write_atomically
+from maniskill_tomato.files import write_json
 from maniskill_tomato.learning.rl.presets import MAY_CHANGE, TrainConfig
 from maniskill_tomato.policies.trained_actor import load_checkpoint
 
@@ -113,7 +112,7 @@ def write_config(
         "env_options": env_options,
         "config": config,
     }
-    write_atomically(run_dir / "config.json", (json.dumps(content, indent=2) + "\n").encode())
+    write_json(run_dir / "config.json", content)
 
 
 def checkpoint_path(run_dir: Path, step: int) -> Path:

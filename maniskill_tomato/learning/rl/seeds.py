@@ -1,29 +1,32 @@
 """Several seeds of one configuration, each trained in a process and a folder of its own."""
 
 import contextlib
-import json
 import logging
 import math
+import multiprocessing
 import os
 import signal
-import subprocess
 import sys
-import threading
 import time
 from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass
+from multiprocessing.connection import Connection
+from multiprocessing.process import BaseProcess
 from pathlib import Path
 from typing import Any
 
 from tqdm import tqdm
 
 import maniskill_tomato
-from maniskill_tomato.errors import InvalidInputError
-from maniskill_tomato.files import write_atomically
+from maniskill_tomato.errors import InvalidInputError, TomatoError
+from maniskill_tomato.files import write_json
 from maniskill_tomato.learning.interrupt import stop_on_signals
 from maniskill_tomato.learning.rl.presets import TrainConfig
+from maniskill_tomato.learning.rl.progress import Progress
 from maniskill_tomato.learning.rl.run_folder import LOG_NAME, check_run_dir, clear_run
+from maniskill_tomato.learning.rl.trainer import TrainResult, train
+from maniskill_tomato.worker_pool import start_process
 
 logger = logging.getLogger(__name__)
 
@@ -110,10 +113,9 @@ def train_seeds(
         "env_options": env_options,
         "config": config.to_dict(),
     }
-    write_atomically(out / SEEDS_FILE, (json.dumps(content, indent=2) + "\n").encode())
+    write_json(out / SEEDS_FILE, content)
     waiting = deque(
-        _Worker(seed, folder, _spec(env_id, config, seed, folder, env_options, resume))
-        for seed, folder in folders.items()
+        _Worker(seed, folder, env_id, config, env_options, resume) for seed, folder in folders.items()
     )
     workers = list(waiting)
     at_once = min(len(workers), jobs or len(os.sched_getaffinity(0)))
@@ -149,103 +151,101 @@ def summary_table(results: Sequence[SeedResult]) -> str:
     return "\n".join(lines)
 
 
-def _spec(
-    env_id: str, config: TrainConfig, seed: int, folder: Path, env_options: dict[str, Any], resume: bool
-) -> dict[str, Any]:
-    return {
-        "env_id": env_id,
-        "config": config.to_dict(),
-        "seed": seed,
-        "run_dir": str(folder),
-        "env_options": env_options,
-        "resume": resume and (folder / "config.json").is_file(),
-    }
-
-
 class _Worker:
-    """A seed's process, what it said last, and its log."""
+    """A seed's process and what it said last."""
 
-    def __init__(self, seed: int, run_dir: Path, spec: dict[str, Any]) -> None:
+    def __init__(self, seed: int, run_dir: Path, *training: Any) -> None:
         self.seed = seed
         self.run_dir = run_dir
-        self.progress: dict[str, Any] = {}
-        self._spec = spec
-        self._end: dict[str, Any] = {}
-        self._process: subprocess.Popen[str] | None = None
-        self._reader: threading.Thread | None = None
+        self.progress: Progress | None = None
+        self._training = training
+        self._end: TrainResult | str | None = None
+        self._process: BaseProcess | None = None
 
     @property
     def running(self) -> bool:
-        return self._process is not None and self._process.poll() is None
+        return self._process is not None and self._process.is_alive()
 
     def start(self) -> None:
-        self.run_dir.mkdir(parents=True, exist_ok=True)
-        with (self.run_dir / LOG_NAME).open("a") as log:
-            # Ctrl-C in the terminal must reach this process only, which passes it on once.
-            process = subprocess.Popen(
-                [sys.executable, "-m", "maniskill_tomato.learning.rl.seed_worker"],
-                stdin=subprocess.PIPE,
-                stdout=subprocess.PIPE,
-                stderr=log,
-                text=True,
-                start_new_session=True,
-            )
-        self._process = process
-        assert process.stdin is not None
-        with contextlib.suppress(BrokenPipeError):
-            process.stdin.write(json.dumps(self._spec) + "\n")
-            process.stdin.flush()
-        self._reader = threading.Thread(target=self._listen, daemon=True)
-        self._reader.start()
+        self._messages, sending = multiprocessing.Pipe(duplex=False)
+        self._process = start_process(_train_seed, sending, self.seed, self.run_dir, *self._training)
+        sending.close()
 
-    def _listen(self) -> None:
-        assert self._process is not None and self._process.stdout is not None
-        for line in self._process.stdout:
-            message = json.loads(line)
-            if message["kind"] == "progress":
-                self.progress = message
-            else:
-                self._end = message
+    def listen(self) -> None:
+        """Takes what the process has said since the last time."""
+        with contextlib.suppress(EOFError, OSError):  # It has ended.
+            while self._process is not None and self._messages.poll():
+                message = self._messages.recv()
+                if isinstance(message, Progress):
+                    self.progress = message
+                else:
+                    self._end = message
 
     def ask_to_stop(self) -> None:
-        if self._process is not None and self.running:
-            self._process.send_signal(signal.SIGTERM)
+        if self._process is not None:
+            self._process.terminate()
 
     def kill(self) -> None:
-        if self._process is not None and self.running:
+        if self._process is not None:
             self._process.kill()
-            self._process.wait()
+            self._process.join()
 
     def result(self) -> SeedResult:
-        if self._reader is not None:
-            self._reader.join()
-        if self._process is not None and self._process.stdin is not None:
-            with contextlib.suppress(BrokenPipeError):
-                self._process.stdin.close()
-        known = {**self.progress, **self._end}
-        reason, error = str(known.get("stop_reason", "not started")), None
-        status = None if self._process is None else self._process.returncode
-        if status is not None and self._end.get("kind") != "end":
-            if status == -signal.SIGTERM:  # Stopped before its training had begun.
-                reason = "SIGTERM"
-            else:
-                reason = "failed"
-                cause = (
-                    f"ended by {signal.Signals(-status).name}"
-                    if status < 0
-                    else f"ended with status {status}"
-                )
-                error = known.get("message") or f"{cause}; see {self.run_dir / LOG_NAME}"
+        self.listen()
+        end, progress = self._end, self.progress
+        status = None if self._process is None else self._process.exitcode
+        reason, error = "not started", None
+        if isinstance(end, TrainResult):
+            reason = end.stop_reason
+        elif status == -signal.SIGTERM:  # Stopped before its training had begun.
+            reason = "SIGTERM"
+        elif status is not None:
+            reason = "failed"
+            cause = f"by {signal.Signals(-status).name}" if status < 0 else f"with status {status}"
+            error = end or f"ended {cause}; see {self.run_dir / LOG_NAME}"
+        known = end if isinstance(end, TrainResult) else progress
         return SeedResult(
             seed=self.seed,
             run_dir=self.run_dir,
-            steps=known.get("steps", 0),
-            episodes=known.get("episodes", 0),
-            success=known.get("success", math.nan),
-            seconds=known.get("seconds", 0.0),
+            steps=0 if known is None else known.steps,
+            episodes=0 if known is None else known.episodes,
+            success=math.nan if progress is None else progress.success,
+            seconds=end.seconds if isinstance(end, TrainResult) else 0.0,
             stop_reason=reason,
             error=error,
         )
+
+
+def _train_seed(
+    messages: Connection,
+    seed: int,
+    run_dir: Path,
+    env_id: str,
+    config: TrainConfig,
+    env_options: dict[str, Any],
+    resume: bool,
+) -> None:
+    """Trains in a process of its own, which says everything into the run's log and sends where it is."""
+    run_dir.mkdir(parents=True, exist_ok=True)
+    with (run_dir / LOG_NAME).open("a") as log:
+        for stream in (sys.stdout, sys.stderr):
+            os.dup2(log.fileno(), stream.fileno())
+    logging.basicConfig(level=logging.WARNING, format="%(message)s", stream=sys.stderr)
+    logging.getLogger("maniskill_tomato").setLevel(logging.INFO)
+
+    def send(message: object) -> None:
+        with contextlib.suppress(BrokenPipeError):  # The end of the other process stops the run.
+            messages.send(message)
+
+    resume = resume and (run_dir / "config.json").is_file()
+    try:
+        send(
+            train(env_id, config, run_dir, seed, env_options, resume=resume, show_progress=False, report=send)
+        )
+    except TomatoError as error:
+        logger.error("error: %s", error)
+        send(str(error))
+        raise SystemExit(2) from None
 
 
 class _Display:
@@ -270,20 +270,24 @@ class _Display:
         ]
 
     def refresh(self) -> None:
+        for worker in self._workers:
+            worker.listen()
         for bar, worker in zip(self._bars, self._workers, strict=False):
-            if worker.progress and bar.n != worker.progress[self._key]:
-                bar.n = worker.progress[self._key]
-                success = worker.progress["success"]
+            if worker.progress is not None and bar.n != self._done(worker):
+                bar.n = self._done(worker)
+                success = worker.progress.success
                 bar.set_postfix_str("" if math.isnan(success) else f"success {success:.0%}", refresh=False)
                 bar.refresh()
         if self._lines and time.monotonic() - self._last_line >= LINE_SECONDS:
             self._last_line = time.monotonic()
             logger.info("%s", ", ".join(self._where(worker) for worker in self._workers))
 
+    def _done(self, worker: _Worker) -> int:
+        return 0 if worker.progress is None else int(getattr(worker.progress, self._key))
+
     def _where(self, worker: _Worker) -> str:
-        done = worker.progress.get(self._key, 0)
         of = f" of {self._total}" if self._total else ""
-        return f"seed {worker.seed}: {done}{of} {self._key}"
+        return f"seed {worker.seed}: {self._done(worker)}{of} {self._key}"
 
     def close(self) -> None:
         self.refresh()

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 from typing import Any, Literal
 
 from maniskill_tomato.errors import InvalidInputError
+from maniskill_tomato.tables import read_table
 
 ExplorationName = Literal["epsilon-greedy", "decaying-gaussian", "look-at-goals", "correlated"]
 
@@ -242,17 +243,10 @@ class TrainConfig:
         Options are read as `modernise` leaves them.
 
         Raises:
-            InvalidInputError: A field is unknown (the message lists them) or its value not allowed.
+            InvalidInputError: A field is unknown (the message lists them), or its value is of another kind or not
+                allowed.
         """
-        values = modernise(values)
-        known = {field.name for field in dataclasses.fields(cls)}
-        unknown = sorted(set(values) - known)
-        if unknown:
-            raise InvalidInputError(
-                f"unknown training options: {', '.join(unknown)}; known are {', '.join(sorted(known))}"
-            )
-        arguments: dict[str, Any] = {k: tuple(v) if isinstance(v, list) else v for k, v in values.items()}
-        return cls(**arguments)
+        return read_table(cls, modernise(values), "config")
 
 
 def modernise(values: dict[str, Any]) -> dict[str, Any]:

@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from maniskill_tomato.errors import TrainingDivergedError
+from maniskill_tomato.learning.descent import descend
 from maniskill_tomato.learning.view_quality.quality_config import FitConfig
 from maniskill_tomato.learning.view_quality.quality_episodes import QualityData
 from maniskill_tomato.policies.quality_network import ViewQualityNetwork
@@ -78,32 +78,26 @@ def fit(
     torch.manual_seed(config.seed)
     generator = torch.Generator().manual_seed(config.seed)
     network = network or new_network(config.width, config.blocks)
-    network.train().requires_grad_(True)
-    optimizer = torch.optim.AdamW(
-        network.parameters(), lr=config.learning_rate, weight_decay=config.weight_decay, fused=True
-    )
-    schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, config.steps)
     start = time.perf_counter()
-    count = len(data.scalars)
-    for step in range(1, config.steps + 1):
-        rows = torch.randint(count, (config.batch_size,), generator=generator)
+    latest: dict[str, float] = {}
+
+    def loss() -> Tensor:
+        rows = torch.randint(len(data.scalars), (config.batch_size,), generator=generator)
         flip = torch.rand(config.batch_size, generator=generator) < 0.5 if config.mirror else None
         entropy, error = losses(network, data, rows, config.full_visibility, flip)
-        loss = entropy + config.fraction_weight * error
-        if not bool(loss.isfinite()):
-            raise TrainingDivergedError(f"the loss of step {step} is not finite; lower learning_rate")
-        optimizer.zero_grad()
-        loss.backward()  # type: ignore[no-untyped-call]
-        optimizer.step()
-        schedule.step()
+        latest.update(cross_entropy=entropy.item(), squared_error=error.item())
+        return entropy + config.fraction_weight * error
+
+    def tell(step: int, value: float) -> None:
         if step % 200 == 0 or step == config.steps:
-            values = {"cross_entropy": entropy.item(), "squared_error": error.item()}
+            values = dict(latest)
             if validation is not None:
                 judged = judge(network, validation, config.full_visibility)
                 values |= {f"validation_{name}": value for name, value in judged.items()}
-            values["seconds"] = time.perf_counter() - start
-            report(step, values)
-    return network.eval().requires_grad_(False)
+            report(step, {**values, "seconds": time.perf_counter() - start})
+
+    descend(network, loss, config, tell)
+    return network
 
 
 def judge(

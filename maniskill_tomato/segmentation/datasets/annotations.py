@@ -210,3 +210,13 @@ def leaves_image(box: Box, width: int, height: int, tolerance: float = 1.0) -> b
     """Whether a box leaves the image by more than `tolerance` [px]."""
     x, y, w, h = box
     return min(x, y) < -tolerance or x + w > width + tolerance or y + h > height + tolerance
+
+
+def counted_clip(box: Box | None, width: int, height: int, skipped: Counter[str]) -> Box | None:
+    """The part of a box inside the image as by `clip_box`; what is cut off or left out is counted in `skipped`."""
+    clipped = None if box is None else clip_box(box, width, height)
+    if box is None or clipped is None:
+        skipped["boxes that are empty or outside the image"] += 1
+    elif leaves_image(box, width, height):
+        skipped["boxes clipped to the image"] += 1
+    return clipped

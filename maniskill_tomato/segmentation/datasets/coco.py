@@ -22,8 +22,7 @@ from maniskill_tomato.segmentation.datasets.annotations import (
     AnnotatedImages,
     CameraView,
     Instance,
-    clip_box,
-    leaves_image,
+    counted_clip,
 )
 from maniskill_tomato.segmentation.datasets.picture_files import read_picture
 from maniskill_tomato.segmentation.masks import Box, EncodedMask
@@ -297,12 +296,9 @@ def _read_instance(
                 skipped["annotations with broken polygons or masks"] += 1
                 return None
         given = _box(visible.get("bbox")) or (mask.box_xywh if mask is not None else None)
-        clipped = clip_box(given, image.width, image.height) if given is not None else None
-        if given is None or clipped is None:
-            skipped["boxes that are empty or outside the image"] += 1
+        clipped = counted_clip(given, image.width, image.height, skipped)
+        if clipped is None:
             return None
-        if leaves_image(given, image.width, image.height):
-            skipped["boxes clipped to the image"] += 1
         box = clipped
     if amodal is not None:
         try:

@@ -14,7 +14,7 @@ from maniskill_tomato.segmentation.datasets.annotations import (
     AnnotatedImage,
     AnnotatedImages,
     Instance,
-    clip_box,
+    counted_clip,
     leaves_image,
 )
 from maniskill_tomato.segmentation.datasets.picture_files import read_picture
@@ -157,14 +157,9 @@ def _read_image(folder: Path, path: Path, skipped: Counter[str]) -> AnnotatedIma
             skipped["boxes with broken numbers"] += 1
             continue
         given = (corners[0], corners[1], corners[2] - corners[0], corners[3] - corners[1])
-        box = clip_box(given, width, height)
         if not category:
             skipped["boxes without a name"] += 1
-        elif box is None:
-            skipped["boxes that are empty or outside the image"] += 1
-        else:
-            if leaves_image(given, width, height):
-                skipped["boxes clipped to the image"] += 1
+        elif (box := counted_clip(given, width, height, skipped)) is not None:
             instances.append(Instance(category=category, box_xywh=box))
     return AnnotatedImage(
         path=picture,

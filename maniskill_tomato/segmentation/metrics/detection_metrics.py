@@ -1,18 +1,22 @@
-"""Precision, recall and average precision of a segmenter (Eq. 4-1 to 4-3 of the thesis).
+"""Precision, recall and average precision of a segmenter (Eq. 4-1 to 4-3 of the thesis), and COCO's own figures.
 
-A detection is true if its intersection over union with a fruit reaches a threshold; detections choose in order of their
-scores, each the fruit that it overlaps most among those still free. A fruit that is set aside (`ignored`) counts
-neither as found nor as missed, and a detection of which the threshold's share lies on it is not counted: this is how
-COCO treats crowds.
+pycocotools decides which detections are true: those whose intersection over union with a fruit reaches a threshold.
+Detections choose in order of their scores, each the fruit that it overlaps most among those still free. A fruit that
+is set aside (`ignored`) counts neither as found nor as missed, and a detection of which the threshold's share lies on
+it is not counted: this is how COCO treats crowds.
 """
 
-from dataclasses import dataclass, field
-from typing import Literal
+import contextlib
+import io
+from dataclasses import dataclass
+from typing import Any, Literal
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
+from torchvision.ops import box_iou
 
-from maniskill_tomato.errors import InvalidInputError
+from maniskill_tomato.errors import InvalidInputError, MissingPackageError
 from maniskill_tomato.segmentation.datasets.annotations import (
     BEHIND,
     SMALLEST_SHARE,
@@ -20,8 +24,15 @@ from maniskill_tomato.segmentation.datasets.annotations import (
     ignored_fruit,
 )
 from maniskill_tomato.segmentation.instances import Instances
+from maniskill_tomato.segmentation.masks import EncodedMask
 
 Overlap = Literal["box", "mask"]
+
+COCO_NAMES = ("AP", "AP50", "AP75", "AP_small", "AP_medium", "AP_large", "AR1", "AR10", "AR100")
+"""What COCO reports first: mean AP over overlaps 0.5 to 0.95, at 0.5, at 0.75, by size; mean recall."""
+
+COCO_LIMITS = (1, 10, 100, 100_000)
+"""Detections an image that count: COCO's own for its figures, and all of them for the curve."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -83,7 +94,8 @@ def without_narrow(found: Instances, truth: ImageTruth, threshold: float = 0.5) 
         threshold: Least intersection over union with a fruit of a narrow detection that stays.
     """
     sides = (found.boxes[:, 2:] - found.boxes[:, :2]).min(axis=1, initial=np.inf)
-    overlaps, _ = box_overlaps(found.boxes.astype(np.float64), truth.boxes[~truth.ignored])
+    fruits = torch.from_numpy(truth.boxes[~truth.ignored])
+    overlaps = box_iou(torch.from_numpy(found.boxes).double(), fruits).numpy()
     return found.chosen((sides >= truth.least_side) | (overlaps.max(axis=1, initial=0) >= threshold))
 
 
@@ -119,22 +131,25 @@ class PrecisionRecall:
         return float(self.precision[count - 1]), float(self.recall[count - 1])
 
 
-@dataclass
 class DetectionScore:
-    """Collects the detections of many images; see `precision_recall`."""
+    """Collects the detections of many images as one category; masks are kept encoded.
 
-    overlap: Overlap = "box"
-    """What overlaps are measured on."""
-    threshold: float = 0.5
-    """Least intersection over union of a true detection."""
-    fruits: int = 0
-    """Fruits to be found so far."""
-    _scores: list[NDArray[np.float64]] = field(default_factory=list)
-    _true: list[NDArray[np.bool_]] = field(default_factory=list)
+    Attributes:
+        fruits: Fruits to be found so far.
+    """
 
-    def __post_init__(self) -> None:
-        if not 0 < self.threshold <= 1:
-            raise InvalidInputError(f"threshold must be above 0 and at most 1, got {self.threshold}")
+    def __init__(self, overlap: Overlap = "box") -> None:
+        """Begins without images.
+
+        Args:
+            overlap: Whether boxes or masks are compared.
+        """
+        self.fruits = 0
+        self._overlap = overlap
+        self._images: list[dict[str, Any]] = []
+        self._truths: list[dict[str, Any]] = []
+        self._detections: list[dict[str, Any]] = []
+        self._judged: Any = None
 
     def add(self, found: Instances, truth: ImageTruth) -> None:
         """Counts one image.
@@ -142,89 +157,96 @@ class DetectionScore:
         Raises:
             InvalidInputError: Masks are asked for, but the image has boxes only.
         """
-        overlaps, shares = self._overlaps(found, truth)
-        true, counted = match(found.scores, overlaps, shares, truth.ignored, self.threshold)
-        self._scores.append(found.scores[counted].astype(np.float64))
-        self._true.append(true[counted])
+        if self._overlap == "mask" and truth.masks is None:
+            raise InvalidInputError("masks are compared, but an image has only boxes; compare boxes there")
+        self._judged = None
         self.fruits += int((~truth.ignored).sum())
+        number = len(self._images) + 1
+        height, width = found.masks.shape[1:]
+        self._images.append({"id": number, "height": height, "width": width})
+        for index, ignored in enumerate(truth.ignored.tolist()):
+            entry = self._entry(
+                number, truth.boxes[index], None if truth.masks is None else truth.masks[index]
+            )
+            self._truths.append(entry | {"id": len(self._truths) + 1, "iscrowd": int(ignored)})
+        for box, mask, score in zip(found.boxes, found.masks, found.scores.tolist(), strict=True):
+            self._detections.append(self._entry(number, box, mask) | {"score": score})
 
     def precision_recall(self) -> PrecisionRecall:
-        """The curve over all images so far."""
-        scores = np.concatenate([np.zeros(0), *self._scores])
-        true = np.concatenate([np.zeros(0, bool), *self._true])
-        order = np.argsort(-scores, kind="stable")
-        hits = np.cumsum(true[order])
+        """The curve over all images so far, at an overlap of 0.5.
+
+        Raises:
+            MissingPackageError: pycocotools is not installed.
+        """
+        scores, true = [np.zeros(0)], [np.zeros(0, bool)]
+        if self._detections:
+            # The first entries are those of things of any size, and the first row that of the least overlap, 0.5.
+            for image in self._evaluated().evalImgs[: len(self._images)]:
+                if image is not None:
+                    counted = image["dtIgnore"][0] == 0
+                    scores.append(np.array(image["dtScores"])[counted])
+                    true.append(image["dtMatches"][0][counted] > 0)
+        falling = np.argsort(-np.concatenate(scores), kind="stable")
+        hits = np.cumsum(np.concatenate(true)[falling])
         return PrecisionRecall(
-            scores=scores[order],
+            scores=np.concatenate(scores)[falling],
             precision=hits / np.arange(1, len(hits) + 1),
             recall=hits / max(self.fruits, 1),
             fruits=self.fruits,
         )
 
-    def _overlaps(
-        self, found: Instances, truth: ImageTruth
-    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Intersection over union, and over the detection alone. Each of shape (D, N)."""
-        if self.overlap == "box":
-            return box_overlaps(found.boxes.astype(np.float64), truth.boxes)
-        if truth.masks is None:
-            raise InvalidInputError("masks are compared, but an image has only boxes; compare boxes there")
-        return mask_overlaps(found.masks, truth.masks)
+    def coco_metrics(self) -> dict[str, float]:
+        """COCO's own figures by their names in `COCO_NAMES`; -1 where there was nothing to find.
+
+        Raises:
+            MissingPackageError: pycocotools is not installed.
+        """
+        if not self._detections:
+            return dict.fromkeys(COCO_NAMES, 0.0 if self._truths else -1.0)
+        judged = self._evaluated()
+        with contextlib.redirect_stdout(io.StringIO()):
+            judged.accumulate()
+            judged.summarize()
+        return {name: float(value) for name, value in zip(COCO_NAMES, judged.stats, strict=False)}
+
+    def _entry(self, image: int, box: NDArray[Any], mask: NDArray[np.bool_] | None) -> dict[str, Any]:
+        entry: dict[str, Any] = {"image_id": image, "category_id": 1}
+        if self._overlap == "mask" and mask is not None:
+            encoded = EncodedMask.encode(mask)
+            return entry | {"segmentation": encoded.to_coco(), "area": encoded.area}
+        left, top, right, bottom = box.tolist()
+        sides = right - left, bottom - top
+        return entry | {"bbox": [left, top, *sides], "area": sides[0] * sides[1]}
+
+    def _evaluated(self) -> Any:
+        """COCO's evaluation, with every detection matched."""
+        if self._judged is not None:
+            return self._judged
+        try:
+            from pycocotools.coco import COCO
+            from pycocotools.cocoeval import COCOeval
+        except ImportError as error:
+            raise MissingPackageError.extra("pycocotools", "perception") from error
+        with contextlib.redirect_stdout(io.StringIO()):  # pycocotools prints.
+            truths: Any = COCO()
+            truths.dataset = {
+                "images": self._images,
+                "annotations": self._truths,
+                "categories": [{"id": 1, "name": "tomato"}],
+            }
+            truths.createIndex()
+            judged = COCOeval(
+                truths, truths.loadRes(self._detections), "bbox" if self._overlap == "box" else "segm"
+            )
+            judged.params.maxDets = list(COCO_LIMITS)
+            judged.evaluate()
+        self._judged = judged
+        return judged
 
 
-def match(
-    scores: NDArray[np.floating],
-    overlaps: NDArray[np.float64],
-    shares: NDArray[np.float64],
-    ignored: NDArray[np.bool_],
-    threshold: float,
-) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
-    """Which detections of an image are true, and which count.
-
-    Args:
-        scores: Of the detections. Shape (D,).
-        overlaps: Intersection over union of each with each fruit. Shape (D, N).
-        shares: Share of each detection that lies on each fruit. Shape (D, N).
-        ignored: Fruits that are set aside. Shape (N,).
-        threshold: Least overlap of a true detection.
-
-    Returns:
-        Two arrays of shape (D,).
-    """
-    true, counted = np.zeros(len(scores), bool), np.ones(len(scores), bool)
-    free = ~ignored
-    for detection in np.argsort(-scores, kind="stable"):
-        candidates = np.where(free, overlaps[detection], -1.0)
-        best = int(candidates.argmax()) if len(candidates) else -1
-        if best >= 0 and candidates[best] >= threshold:
-            true[detection], free[best] = True, False
-        elif (shares[detection][ignored] >= threshold).any():
-            counted[detection] = False
-    return true, counted
-
-
-def box_overlaps(
-    a: NDArray[np.float64], b: NDArray[np.float64]
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Intersection over union, and over the area of `a`, of boxes (left, top, right, bottom). Each of shape (A, B)."""
-    lower = np.maximum(a[:, None, :2], b[None, :, :2])
-    upper = np.minimum(a[:, None, 2:], b[None, :, 2:])
-    shared = np.clip(upper - lower, 0, None).prod(axis=2)
-    area_a, area_b = ((c[:, 2:] - c[:, :2]).prod(axis=1) for c in (a, b))
-    return _ratios(shared, area_a[:, None], area_b[None])
-
-
-def mask_overlaps(
-    a: NDArray[np.bool_], b: NDArray[np.bool_]
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """The same of masks of shape (A, H, W) and (B, H, W)."""
+def mask_overlaps(a: NDArray[np.bool_], b: NDArray[np.bool_]) -> NDArray[np.float64]:
+    """Intersection over union of masks of shape (A, H, W) and (B, H, W). Shape (A, B)."""
     flat_a, flat_b = (c.reshape(len(c), int(np.prod(c.shape[1:]))).astype(np.float32) for c in (a, b))
     shared = (flat_a @ flat_b.T).astype(np.float64)
-    areas = [c.sum(axis=1, dtype=np.float64) for c in (flat_a, flat_b)]
-    return _ratios(shared, areas[0][:, None], areas[1][None])
-
-
-def _ratios(
-    shared: NDArray[np.float64], area_a: NDArray[np.float64], area_b: NDArray[np.float64]
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    return shared / np.maximum(area_a + area_b - shared, 1e-9), shared / np.maximum(area_a, 1e-9)
+    area_a, area_b = (c.sum(axis=1, dtype=np.float64) for c in (flat_a, flat_b))
+    return np.asarray(shared / np.maximum(area_a[:, None] + area_b[None] - shared, 1e-9))

@@ -11,7 +11,6 @@ from maniskill_tomato.segmentation.datasets.annotations import BEHIND, SMALLEST_
 from maniskill_tomato.segmentation.datasets.picture_files import write_picture
 from maniskill_tomato.segmentation.drawing import contact_sheet, draw_instances
 from maniskill_tomato.segmentation.instances import Image
-from maniskill_tomato.segmentation.metrics.coco_metrics import CocoScore
 from maniskill_tomato.segmentation.metrics.detection_metrics import (
     DetectionScore,
     Overlap,
@@ -67,7 +66,6 @@ def evaluate_segmenter(
     with_masks = all(f.visible_mask is not None for image in images for f in image.fruits)
     overlaps: tuple[Overlap, ...] = ("box", "mask") if with_masks else ("box",)
     scores: dict[Overlap, DetectionScore] = {overlap: DetectionScore(overlap) for overlap in overlaps}
-    coco = {overlap: CocoScore(overlap) for overlap in overlaps}
     with_rows = any((f.name or "").startswith(BEHIND) for image in images for f in image.fruits)
     front = {overlap: DetectionScore(overlap) for overlap in overlaps} if with_rows else {}
     seconds = []
@@ -79,9 +77,8 @@ def evaluate_segmenter(
         seconds.append(time.perf_counter() - start)
         truth = image_truth(image, smallest_share)
         counted = without_narrow(found, truth)
-        for overlap in overlaps:
-            scores[overlap].add(counted, truth)
-            coco[overlap].add(counted, truth)
+        for score in scores.values():
+            score.add(counted, truth)
         nearby = image_truth(image, smallest_share, rows_behind=False)
         for score in front.values():
             score.add(without_narrow(found, nearby), nearby)
@@ -98,7 +95,7 @@ def evaluate_segmenter(
             f"{overlap}_precision": precision,
             f"{overlap}_recall": recall,
         }
-        metrics |= {f"coco_{overlap}_{k}": v for k, v in coco[overlap].metrics().items()}
+        metrics |= {f"coco_{overlap}_{k}": v for k, v in score.coco_metrics().items()}
     for overlap, score in front.items():
         metrics |= {
             "front_fruits": score.fruits,

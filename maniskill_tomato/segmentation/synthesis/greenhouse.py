@@ -13,7 +13,7 @@ from numpy.random import Generator
 from numpy.typing import NDArray
 
 from maniskill_tomato.plants.generator import generate_plant
-from maniskill_tomato.plants.organs import MeshPart, Plant, SemanticClass
+from maniskill_tomato.plants.organs import MeshPart, Plant, SemanticClass, joined_faces
 from maniskill_tomato.plants.row import ROW_SPACING, Row, generate_row
 from maniskill_tomato.rendering.plant_actors import make_render_shape
 from maniskill_tomato.rendering.vulkan_probe import render_backend
@@ -265,14 +265,12 @@ def _merged(parts: Sequence[MeshPart]) -> list[MeshPart]:
     merged = []
     for material in sorted({part.material for part in parts}):
         same = [part for part in parts if part.material == material]
-        offsets = np.cumsum([0] + [len(part.vertices) for part in same[:-1]])
-        faces = [part.faces + offset for part, offset in zip(same, offsets, strict=True)]
         merged.append(
             MeshPart(
                 vertices=np.concatenate([part.vertices for part in same]),
                 normals=np.concatenate([part.normals for part in same]),
                 uvs=np.concatenate([part.uvs for part in same]),
-                faces=np.concatenate(faces).astype(np.int32),
+                faces=joined_faces(same),
                 material=material,
             )
         )

@@ -11,10 +11,8 @@ from numpy.typing import NDArray
 
 from maniskill_tomato.plants.materials import MATERIALS
 from maniskill_tomato.plants.textures import cloud
+from maniskill_tomato.rendering.plant_actors import repeating_texture, textured_material
 from maniskill_tomato.segmentation.synthesis.appearance import SceneAppearance
-
-UInt8 = NDArray[np.uint8]
-
 
 BLOOM = (0.66, 0.6, 0.4)
 """Colour of what lies on a fruit's skin, sRGB, 0 to 1: in photos from greenhouses green is 0.43 of the red of ripe
@@ -62,7 +60,7 @@ class PlantMaterials(dict[str, sapien.render.RenderMaterial]):
         else:
             colour = colour * np.array(self._appearance.leaf_gain, dtype=np.float32)
         pixels = np.dstack([np.clip(colour, 0, 1), pixels[..., 3:]])
-        self[name] = textured((pixels * 255).astype(np.uint8), roughness=roughness, specular=specular)
+        self[name] = textured_material((pixels * 255).astype(np.uint8), roughness, specular)
         return self[name]
 
 
@@ -73,15 +71,6 @@ def _blemished(colour: NDArray[np.floating[Any]], share: float, rng: Generator) 
     colour = colour * (1 - yellow) + np.array([0.56, 0.58, 0.2]) * yellow
     dry = np.clip((cloud(rng, size, size, 9, octaves=2) - (1.05 - 0.5 * share)) / 0.08, 0, 1)[..., None]
     return np.asarray(colour * (1 - dry) + np.array([0.62, 0.5, 0.3]) * dry)
-
-
-def textured(pixels: UInt8, *, roughness: float, specular: float = 0.3) -> sapien.render.RenderMaterial:
-    """A material with a repeating base colour texture (sRGB with alpha, Shape (rows, columns, 4))."""
-    result = sapien.render.RenderMaterial(base_color=[1, 1, 1, 1], roughness=roughness, specular=specular)
-    result.base_color_texture = sapien.render.RenderTexture2D(
-        pixels, "R8G8B8A8Unorm", mipmap_levels=6, filter_mode="linear", address_mode="repeat", srgb=True
-    )
-    return result
 
 
 @lru_cache(maxsize=8)
@@ -105,7 +94,7 @@ def dirty(colour: tuple[float, float, float], rng: Generator, *, dirt: float) ->
     stain = (dirt * _dirt(int(rng.integers(8))))[..., None]
     mixed = np.array(colour) * (1 - stain) + np.array([0.32, 0.26, 0.18]) * stain
     pixels = np.dstack([np.clip(mixed * 255, 0, 255), np.full(mixed.shape[:2], 255.0)])
-    return textured(pixels.astype(np.uint8), roughness=float(rng.uniform(0.35, 0.9)), specular=0.4)
+    return textured_material(pixels.astype(np.uint8), float(rng.uniform(0.35, 0.9)), 0.4)
 
 
 def printed(colour: tuple[float, float, float], rng: Generator) -> sapien.render.RenderMaterial:
@@ -119,7 +108,7 @@ def printed(colour: tuple[float, float, float], rng: Generator) -> sapien.render
         place = (int(rng.integers(0, 380)), int(rng.integers(60, 240)))
         scale = float(rng.uniform(0.8, 2.4))
         cv2.putText(canvas, word, place, cv2.FONT_HERSHEY_DUPLEX, scale, ink, int(1 + scale), cv2.LINE_AA)
-    return textured(np.dstack([canvas, np.full((256, 512), 255, np.uint8)]), roughness=0.5)
+    return textured_material(np.dstack([canvas, np.full((256, 512), 255, np.uint8)]), 0.5, 0.3)
 
 
 def plain(colour: tuple[float, float, float], *, roughness: float = 0.7) -> sapien.render.RenderMaterial:
@@ -158,15 +147,7 @@ def far_greenery(light: tuple[float, float, float], rng: Generator) -> sapien.re
         colour = np.array([0.4, 0.06, 0.03]) if rng.random() < 0.6 else np.array([0.3, 0.36, 0.14])
         picture = picture * (1 - spot[..., None]) + colour * spot[..., None]
     pixels = np.dstack([np.clip(picture, 0, 1) ** (1 / 2.2) * 255, np.full((rows, columns), 255.0)])
-    texture = sapien.render.RenderTexture2D(
-        pixels.astype(np.uint8),
-        "R8G8B8A8Unorm",
-        mipmap_levels=6,
-        filter_mode="linear",
-        address_mode="repeat",
-        srgb=True,
-    )
     brightest = max(*light, 1.0)
     material = glowing((light[0] / brightest, light[1] / brightest, light[2] / brightest))
-    material.emission_texture = texture
+    material.emission_texture = repeating_texture(pixels.astype(np.uint8))
     return material

@@ -7,9 +7,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from maniskill_tomato.segmentation.detector_configs import AugmentationConfig, ClassicAugmentation
 from maniskill_tomato.segmentation.instances import Image, mask_box
-from maniskill_tomato.segmentation.training.detector_presets import ClassicAugmentation
-from maniskill_tomato.segmentation.training.light_config import AugmentationConfig
 from maniskill_tomato.segmentation.training.training_pictures import TrainingPicture
 
 
@@ -158,26 +157,21 @@ def classic_augmentation(
     """The thesis's augmentation for Mask R-CNN: the picture changed in one way, or not at all (4-2-3)."""
     if rng.random() >= config.probability:
         return picture
-    kinds = [name for name, used in _used(config).items() if used]
+    kinds = [
+        *(["flip"] if config.flip else []),
+        *(["blur"] if config.blur_sigma > 0 else []),
+        "brightness",
+        *(["contrast"] if config.contrast is not None else []),
+    ]
     kind = kinds[int(rng.integers(len(kinds)))]
     if kind == "flip":
         return mirrored(picture)
     if kind == "blur":
-        return replace(
-            picture, image=np.asarray(cv2.GaussianBlur(picture.image, (0, 0), config.blur_sigma), np.uint8)
-        )
+        blurred = cv2.GaussianBlur(picture.image, (0, 0), config.blur_sigma)
+        return replace(picture, image=np.asarray(blurred, np.uint8))
     if kind == "brightness" or config.contrast is None:
         return replace(picture, image=brighter(picture.image, float(rng.uniform(*config.brightness))))
     return replace(picture, image=contrasted(picture.image, float(rng.uniform(*config.contrast))))
-
-
-def _used(config: ClassicAugmentation) -> dict[str, bool]:
-    return {
-        "flip": config.flip,
-        "blur": config.blur_sigma > 0,
-        "brightness": True,
-        "contrast": config.contrast is not None,
-    }
 
 
 def mirrored(picture: TrainingPicture) -> TrainingPicture:

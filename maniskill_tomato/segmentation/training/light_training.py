@@ -2,168 +2,121 @@
 
 import copy
 import logging
-import math
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
 from maniskill_tomato.errors import CheckpointError
 from maniskill_tomato.segmentation.datasets.annotations import AnnotatedImage
-from maniskill_tomato.segmentation.efficientnet_lite import EfficientNetLite0
+from maniskill_tomato.segmentation.detector_configs import AugmentationConfig, LightTrainConfig
 from maniskill_tomato.segmentation.fruit_network import FruitNetwork
 from maniskill_tomato.segmentation.training.augmentation import augmented
+from maniskill_tomato.segmentation.training.detector_training import DetectorTraining
 from maniskill_tomato.segmentation.training.fruit_targets import LOSS_WEIGHTS, fruit_losses, make_targets
-from maniskill_tomato.segmentation.training.light_config import AugmentationConfig, LightTrainConfig
-from maniskill_tomato.segmentation.training.resumable_training import (
-    ResumableTraining,
-    mean_losses,
-    plain_terms,
-)
 from maniskill_tomato.segmentation.training.training_pictures import (
-    PictureDraw,
+    TrainingImages,
     TrainingPicture,
     training_picture,
 )
-from maniskill_tomato.segmentation.weights import load_weights, save_weights
+from maniskill_tomato.segmentation.weights import load_weights
 
 logger = logging.getLogger(__name__)
 
 
-class LightTraining(ResumableTraining):
-    """A training that can be stopped after any step and goes on where it was."""
+class LightTraining(DetectorTraining[FruitNetwork]):
+    """A training of the light segmenter with AdamW; the weights that are kept are averages over the steps."""
+
+    kind = "light"
+    loss_weights: ClassVar[Mapping[str, float]] = LOSS_WEIGHTS
 
     def __init__(
-        self,
-        config: LightTrainConfig,
-        sets: Sequence[Sequence[AnnotatedImage]],
-        shares: Sequence[float],
-        validation: Sequence[AnnotatedImage] = (),
-        start_from: Path | None = None,
+        self, config: LightTrainConfig, images: TrainingImages, start_from: Path | None = None
     ) -> None:
         """Prepares the first step.
 
         Args:
             config: How to train.
-            sets: Sets of annotated images.
-            shares: How often each set is drawn from.
-            validation: Images whose losses are logged, at most 64 of them.
-            start_from: Weights to begin with instead of random ones, at least of the same backbone.
+            images: What to train on; of the validation images at most 64 are used.
+            start_from: Weights to begin with instead of ImageNet's, of the same backbone.
 
         Raises:
-            InvalidInputError: A set is empty, or the shares do not fit.
             CheckpointError: The weights to begin with cannot be used.
+            MissingPackageError: ImageNet's come from a package that is not installed.
         """
-        super().__init__()
-        torch.manual_seed(config.seed)
+        super().__init__(
+            images,
+            steps=config.steps,
+            batch_size=config.batch_size,
+            log_every=config.log_every,
+            save_every=config.save_every,
+            gradient_norm=config.gradient_norm,
+            seed=config.seed,
+        )
         self.config = config
-        self.steps, self.log_every, self.save_every = config.steps, config.log_every, config.save_every
-        self.rng = np.random.default_rng(config.seed)
-        self.draw = PictureDraw(sets=sets, shares=shares, rng=self.rng)
         self.network = FruitNetwork(config.network).to(memory_format=torch.channels_last)
-        groups: list[dict[str, Any]] = [{"params": list(self.network.parameters()), "share": 1.0}]
         backbone = self.network.backbone
-        if isinstance(backbone, EfficientNetLite0):
-            if start_from is None:
-                backbone.load_imagenet()
-            backbone.keep_fixed(config.fixed_blocks)
-            known = {id(p) for p in backbone.parameters()}
-            groups = [
-                {"params": [p for p in self.network.parameters() if id(p) not in known], "share": 1.0},
-                {
-                    "params": [p for p in backbone.parameters() if p.requires_grad],
-                    "share": config.backbone_rate,
-                },
-            ]
-        if start_from is not None:
+        if start_from is None:
+            backbone.load_imagenet()
+        else:
             _load_into(self.network, start_from)
-        self.averaged = copy.deepcopy(self.network).requires_grad_(False)
+        backbone.keep_fixed(config.fixed_blocks)
+        self.kept = copy.deepcopy(self.network).requires_grad_(False)
+        of_backbone = {id(p) for p in backbone.parameters()}
+        groups = [
+            {"params": [p for p in self.network.parameters() if id(p) not in of_backbone], "share": 1.0},
+            {"params": [p for p in backbone.parameters() if p.requires_grad], "share": config.backbone_rate},
+        ]
         self.optimizer = torch.optim.AdamW(groups, config.learning_rate, weight_decay=config.weight_decay)
-        self.validation = _fixed_batches(validation, config) if validation else []
+        self._validation = _fixed_batches(images.validation, config)
+
+    def learning_rate(self) -> float:
+        """See `LightTrainConfig.rate_at`."""
+        return self.config.rate_at(self.step)
+
+    def varied_picture(self) -> TrainingPicture:
+        """A picture, or a mosaic of four, in another light and another place."""
+        variation = self.config.augmentation
+        if self.step >= self.config.steps * (1 - self.config.plain_share):
+            variation = replace(variation, mosaic_probability=0.0)
+        return augmented(lambda: self.images.drawn(self.rng), variation, self.rng)
 
     def train_step(self) -> dict[str, float]:
-        """One batch; the loss terms."""
-        config = self.config
-        variation = config.augmentation
-        if self.step >= config.steps * (1 - config.plain_share):
-            variation = AugmentationConfig(**{**asdict(variation), "mosaic_probability": 0.0})
-        pictures = [augmented(self.draw, variation, self.rng) for _ in range(config.batch_size)]
-        for group in self.optimizer.param_groups:
-            group["lr"] = group["share"] * learning_rate(config, self.step)
-        self.network.train()
-        terms = self._losses(self.network, pictures)
-        loss = weighted(terms)
-        self.optimizer.zero_grad(set_to_none=True)
-        loss.backward()  # type: ignore[no-untyped-call]
-        nn.utils.clip_grad_norm_(self.network.parameters(), config.gradient_norm)
-        self.optimizer.step()
-        self.step += 1
-        self._average()
-        return plain_terms(loss, terms)
-
-    def validation_losses(self) -> dict[str, float]:
-        """The loss terms of the averaged weights on pictures that are always the same, named `val_...`."""
-        self.averaged.eval()
+        """One batch, after which the averaged weights move towards the present ones; faster at the start."""
+        terms = super().train_step()
+        share = min(self.config.averaging, self.step / (self.step + 10))
         with torch.no_grad():
-            batches = [self._losses(self.averaged, pictures) for pictures in self.validation]
-            return mean_losses(plain_terms(weighted(terms), terms) for terms in batches)
+            for mean, now in zip(
+                self.kept.state_dict().values(), self.network.state_dict().values(), strict=True
+            ):
+                if mean.is_floating_point():
+                    mean.lerp_(now, 1 - share)
+                else:
+                    mean.copy_(now)
+        return terms
 
-    def modules(self) -> dict[str, nn.Module]:
-        """The network and its average."""
-        return {"network": self.network, "averaged": self.averaged}
+    def validation_batches(self) -> list[list[TrainingPicture]]:
+        """Pictures that were cut once, without a change of light."""
+        return self._validation
 
-    def write_weights(self, path: Path) -> None:
-        """Writes the averaged weights.
-
-        Raises:
-            CheckpointError: The file cannot be written.
-        """
-        training = {
-            "steps": self.step,
-            "pictures": self.step * self.config.batch_size,
-            "boxes_only": not _with_masks(self.draw.sets),
-            "config": self.described(),
-        }
-        save_weights(path, "light", self.config.network.to_dict(), self.averaged.state_dict(), training)
-
-    def settings(self) -> dict[str, Any]:
-        """Those of the configuration."""
-        return asdict(self.config)
-
-    def _losses(self, network: FruitNetwork, pictures: list[TrainingPicture]) -> dict[str, Tensor]:
+    def losses(self, network: FruitNetwork, pictures: list[TrainingPicture]) -> dict[str, Tensor]:
+        """See `fruit_losses`."""
         images = torch.from_numpy(np.stack([p.image for p in pictures])).permute(0, 3, 1, 2).float()
         with torch.autocast("cpu", dtype=torch.bfloat16, enabled=self.config.bfloat16):
             maps = network(images)
         return fruit_losses(maps, make_targets(pictures))
 
-    def _average(self) -> None:
-        """Moves the averaged weights towards the present ones; faster at the start."""
-        keep = min(self.config.averaging, self.step / (self.step + 10))
-        with torch.no_grad():
-            for mean, now in zip(
-                self.averaged.state_dict().values(), self.network.state_dict().values(), strict=True
-            ):
-                if mean.is_floating_point():
-                    mean.lerp_(now, 1 - keep)
-                else:
-                    mean.copy_(now)
+    def network_config(self) -> dict[str, Any]:
+        """See `FruitNetworkConfig`."""
+        return asdict(self.config.network)
 
-
-def weighted(terms: Mapping[str, Tensor]) -> Tensor:
-    """The loss: the sum of its terms by `LOSS_WEIGHTS`."""
-    return torch.stack([LOSS_WEIGHTS[name] * term for name, term in terms.items()]).sum()
-
-
-def learning_rate(config: LightTrainConfig, step: int) -> float:
-    """The learning rate of a step: linear warm-up, then a cosine down to a hundredth."""
-    if step < config.warmup_steps:
-        return config.learning_rate * (step + 1) / config.warmup_steps
-    progress = (step - config.warmup_steps) / max(config.steps - config.warmup_steps, 1)
-    return config.learning_rate * (0.01 + 0.99 * (1 + math.cos(math.pi * min(progress, 1.0))) / 2)
+    def settings(self) -> dict[str, Any]:
+        """Those of the configuration."""
+        return asdict(self.config)
 
 
 def _load_into(network: FruitNetwork, path: Path) -> None:
@@ -203,10 +156,3 @@ def _fixed_batches(
     pictures = [augmented(lambda image=image: training_picture(image), plain, rng) for image in chosen]  # type: ignore[misc]
     size = config.batch_size
     return [pictures[i : i + size] for i in range(0, len(pictures), size)]
-
-
-def _with_masks(sets: Sequence[Sequence[AnnotatedImage]]) -> bool:
-    """Whether any fruit has a mask, so that masks are learned."""
-    return any(
-        fruit.visible_mask is not None for images in sets for image in images for fruit in image.fruits
-    )

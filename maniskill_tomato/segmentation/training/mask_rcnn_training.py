@@ -1,47 +1,41 @@
 """Training of Mask R-CNN with stochastic gradient descent, epochs and steps of the learning rate, as in 4-2-3."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator
 from dataclasses import asdict
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
-from torch import Tensor, nn
+from torch import Tensor
+from torchvision.models.detection import MaskRCNN
 
-from maniskill_tomato.segmentation.datasets.annotations import AnnotatedImage
+from maniskill_tomato.segmentation.detector_configs import MaskRcnnConfig
 from maniskill_tomato.segmentation.mask_rcnn import build_mask_rcnn
 from maniskill_tomato.segmentation.training.augmentation import classic_augmentation
-from maniskill_tomato.segmentation.training.detector_presets import MaskRcnnConfig
-from maniskill_tomato.segmentation.training.resumable_training import (
-    ResumableTraining,
-    mean_losses,
-    plain_terms,
-)
+from maniskill_tomato.segmentation.training.detector_training import DetectorTraining
 from maniskill_tomato.segmentation.training.training_pictures import (
-    PictureDraw,
+    TrainingImages,
     TrainingPicture,
     training_picture,
 )
-from maniskill_tomato.segmentation.weights import save_weights
 
 GRADIENT_NORM = 5.0
 """Longest gradient, as in the implementation that the thesis built on."""
 
 
-class MaskRcnnTraining(ResumableTraining):
+class MaskRcnnTraining(DetectorTraining[MaskRCNN]):
     """A training of Mask R-CNN; its loss terms are those of Fig. 4-10 to 4-14.
 
     `loss_box_reg` is the boxes' refinement, `loss_classifier` the classifier head, `loss_mask` the mask head,
     `loss_rpn_box_reg` and `loss_objectness` the region proposals.
     """
 
+    kind = "mask_rcnn"
+
     def __init__(
         self,
         config: MaskRcnnConfig,
-        sets: Sequence[Sequence[AnnotatedImage]],
-        shares: Sequence[float],
-        validation: Sequence[AnnotatedImage] = (),
+        images: TrainingImages,
         pretrained: bool = False,
         seed: int = 0,
         log_every: int = 50,
@@ -50,95 +44,63 @@ class MaskRcnnTraining(ResumableTraining):
 
         Args:
             config: How to train.
-            sets: Sets of annotated images; without masks, a picture does not train the mask head.
-            shares: How often each set is drawn from.
-            validation: Images whose losses are measured after each epoch.
+            images: What to train on; without masks, a picture does not train the mask head.
             pretrained: Start from ImageNet weights of the backbone.
             seed: Of the weights and the pictures.
             log_every: Steps between two lines of the history.
 
         Raises:
-            InvalidInputError: A set is empty, or the shares do not fit.
             MissingWeightsError: The backbone's weights cannot be downloaded.
             MissingPackageError: They come from a package that is not installed.
         """
-        super().__init__()
-        torch.manual_seed(seed)
+        super().__init__(
+            images,
+            steps=config.epochs * config.steps_per_epoch,
+            batch_size=config.batch_size,
+            log_every=min(log_every, config.steps_per_epoch),
+            save_every=config.steps_per_epoch,
+            gradient_norm=GRADIENT_NORM,
+            seed=seed,
+        )
         self.config, self.seed, self.pretrained = config, seed, pretrained
-        self.steps, self.save_every = config.epochs * config.steps_per_epoch, config.steps_per_epoch
-        self.log_every = min(log_every, config.steps_per_epoch)
-        self.rng = np.random.default_rng(seed)
-        self.draw = PictureDraw(sets=sets, shares=shares, rng=self.rng)
-        self.network = build_mask_rcnn(config, pretrained)
+        self.network = self.kept = build_mask_rcnn(config, pretrained)
         self.optimizer = torch.optim.SGD(
             [p for p in self.network.parameters() if p.requires_grad],
             config.learning_rates[0][1],
             momentum=config.momentum,
             weight_decay=config.weight_decay,
         )
-        self.validation = list(validation)[: config.validation_steps * config.batch_size]
 
-    def train_step(self) -> dict[str, float]:
-        """One batch; the loss terms."""
-        for group in self.optimizer.param_groups:
-            group["lr"] = self.config.learning_rate(self.step // self.config.steps_per_epoch + 1)
-        pictures = [
-            classic_augmentation(self.draw(), self.config.augmentation, self.rng)
-            for _ in range(self.config.batch_size)
-        ]
-        self.network.train()
-        terms = self._losses(pictures)
-        loss = torch.stack(list(terms.values())).sum()
-        if torch.isfinite(loss):
-            self.optimizer.zero_grad(set_to_none=True)
-            loss.backward()  # type: ignore[no-untyped-call]
-            nn.utils.clip_grad_norm_(self.network.parameters(), GRADIENT_NORM)
-            self.optimizer.step()
-        self.step += 1
-        return plain_terms(loss, terms)
+    def learning_rate(self) -> float:
+        """That of the present epoch."""
+        return self.config.learning_rate(self.step // self.config.steps_per_epoch + 1)
 
-    def validation_losses(self) -> dict[str, float]:
-        """The loss terms on the validation images; torchvision tells them in training mode only, and draws regions."""
-        # Statistics of the normalisation and the random numbers stay as they were.
-        self.network.train()
-        for module in self.network.modules():
-            if isinstance(module, nn.BatchNorm2d | nn.Dropout):
-                module.eval()
-        state = torch.get_rng_state()
-        with torch.no_grad():
-            images = [self._losses([training_picture(image)]) for image in self.validation]
-        torch.set_rng_state(state)
-        return mean_losses(plain_terms(torch.stack(list(terms.values())).sum(), terms) for terms in images)
+    def varied_picture(self) -> TrainingPicture:
+        """A picture that is changed in one way or not at all."""
+        return classic_augmentation(self.images.drawn(self.rng), self.config.augmentation, self.rng)
 
-    def modules(self) -> dict[str, nn.Module]:
-        """The network."""
-        return {"network": self.network}
+    def validation_batches(self) -> Iterator[list[TrainingPicture]]:
+        """The first validation images, each on its own."""
+        for image in self.images.validation[: self.config.validation_steps * self.config.batch_size]:
+            yield [training_picture(image)]
+
+    def losses(self, network: MaskRCNN, pictures: list[TrainingPicture]) -> dict[str, Tensor]:
+        """The loss terms by torchvision's names."""
+        images = [torch.from_numpy(p.image).permute(2, 0, 1).float() / 255 for p in pictures]
+        with torch.autocast("cpu", dtype=torch.bfloat16, enabled=self.config.bfloat16):
+            found: dict[str, Tensor] = network(images, [mask_rcnn_target(p) for p in pictures])
+        terms = {name: term.float() for name, term in found.items()}
+        if any(p.labels is None for p in pictures):
+            terms["loss_mask"] = terms["loss_mask"] * 0
+        return terms
+
+    def network_config(self) -> dict[str, Any]:
+        """See `MaskRcnnConfig`."""
+        return asdict(self.config)
 
     def settings(self) -> dict[str, Any]:
         """Those of the configuration, the seed and where the weights come from."""
         return {**asdict(self.config), "seed": self.seed, "pretrained": self.pretrained}
-
-    def write_weights(self, path: Path) -> None:
-        """Writes the network's weights.
-
-        Raises:
-            CheckpointError: The file cannot be written.
-        """
-        training = {
-            "steps": self.step,
-            "pictures": self.step * self.config.batch_size,
-            "config": self.described(),
-        }
-        save_weights(path, "mask_rcnn", asdict(self.config), self.network.state_dict(), training)
-
-    def _losses(self, pictures: list[TrainingPicture]) -> dict[str, Tensor]:
-        images = [torch.from_numpy(p.image).permute(2, 0, 1).float() / 255 for p in pictures]
-        with torch.autocast("cpu", dtype=torch.bfloat16, enabled=self.config.bfloat16):
-            found: dict[str, Tensor] = self.network(images, [mask_rcnn_target(p) for p in pictures])
-        terms = {name: term.float() for name, term in found.items()}
-        if any(p.labels is None for p in pictures):
-            terms = {**terms, "loss_mask": terms["loss_mask"] * 0}
-        return terms
 
 
 def mask_rcnn_target(picture: TrainingPicture) -> dict[str, Tensor]:

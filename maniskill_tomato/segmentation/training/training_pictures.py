@@ -71,38 +71,45 @@ def training_picture(image: AnnotatedImage) -> TrainingPicture:
 
 
 @dataclass(kw_only=True)
-class PictureDraw:
-    """Draws pictures at random from several sets of images; files are kept in memory as they are on the disk."""
+class TrainingImages:
+    """What a detector is trained on; the pictures that were drawn stay in memory."""
 
     sets: Sequence[Sequence[AnnotatedImage]]
-    """The sets of images."""
-    shares: Sequence[float]
-    """How often each set is drawn from; they need not add up to 1."""
-    rng: np.random.Generator
-    """Where the draws come from."""
+    """Sets of images."""
+    shares: Sequence[float] = ()
+    """How often each set is drawn from, by default all alike; they need not add up to 1."""
+    validation: Sequence[AnnotatedImage] = ()
+    """Images whose losses are measured too."""
 
     def __post_init__(self) -> None:
+        self.shares = tuple(self.shares) or (1.0,) * len(self.sets)
         if not self.sets or any(not s for s in self.sets):
             raise InvalidInputError("there must be images to train on, and some in every set")
         if len(self.shares) != len(self.sets) or min(self.shares) < 0 or not sum(self.shares) > 0:
             raise InvalidInputError(
                 f"there must be one share, at least 0, for each of {len(self.sets)} sets; got {list(self.shares)}"
             )
-        self._kept: dict[tuple[int, int], TrainingPicture] = {}
+        self._drawn: dict[tuple[int, int], TrainingPicture] = {}
 
-    def __call__(self) -> TrainingPicture:
-        """A picture.
+    @property
+    def with_masks(self) -> bool:
+        """Whether any fruit to train on has a mask."""
+        fruits = (fruit for images in self.sets for image in images for fruit in image.fruits)
+        return any(fruit.visible_mask is not None for fruit in fruits)
+
+    def drawn(self, rng: np.random.Generator) -> TrainingPicture:
+        """A picture at random.
 
         Raises:
             InvalidInputError: Its file cannot be read.
         """
         shares = np.array(self.shares, np.float64)
-        which = int(self.rng.choice(len(self.sets), p=shares / shares.sum()))
-        index = int(self.rng.integers(len(self.sets[which])))
+        which = int(rng.choice(len(self.sets), p=shares / shares.sum()))
+        index = int(rng.integers(len(self.sets[which])))
         key = which, index
-        if key not in self._kept:
-            self._kept[key] = _compact(training_picture(self.sets[which][index]))
-        return self._kept[key]
+        if key not in self._drawn:
+            self._drawn[key] = _compact(training_picture(self.sets[which][index]))
+        return self._drawn[key]
 
 
 def _compact(picture: TrainingPicture, longest: int = 640) -> TrainingPicture:

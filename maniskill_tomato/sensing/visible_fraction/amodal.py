@@ -39,7 +39,7 @@ class AmodalModel:
         height, width = view.rgb.shape[:2]
         given = np.array(view.masks, bool).reshape(-1, height, width)
         estimates = []
-        for mask, overlaps in zip(view.masks, mask_overlaps(given, found.masks)[0], strict=True):
+        for mask, overlaps in zip(view.masks, mask_overlaps(given, found.masks), strict=True):
             best = int(overlaps.argmax()) if len(found) else -1
             if best < 0 or overlaps[best] < LEAST_OVERLAP:
                 estimates.append(Estimate.failed())

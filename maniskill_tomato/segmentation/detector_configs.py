@@ -1,9 +1,116 @@
-"""The thesis's detectors: YOLOv3 (Table 4-1), Mask R-CNN strategies 1 and 2 (Tables 4-2 to 4-4) and 3 (6-2)."""
+"""How the detectors are built and trained; cheap to import.
 
-from dataclasses import dataclass
+The thesis's settings are Mask R-CNN strategies 1 and 2 (Tables 4-2 to 4-4) and 3 (6-2); those of YOLO (Table 4-1) stand
+in `training.yolo_training`.
+"""
+
+import math
+from dataclasses import dataclass, field
 from typing import Literal
 
 from maniskill_tomato.errors import InvalidInputError
+
+FIXED_BLOCKS = 6
+"""First of the fifteen blocks that a training on fruits leaves as ImageNet made them, with the stem."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class FruitNetworkConfig:
+    """Size of the light segmenter's network."""
+
+    neck_width: int = 64
+    """Channels on the way back to stride 4."""
+    fine_width: int = 48
+    """Channels at stride 2, where the outputs are."""
+    categories: int = 3
+    """Kinds of fruit that are told apart."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class AugmentationConfig:
+    """How pictures are varied for the light segmenter."""
+
+    size: int = 320
+    """Height and width of a training picture in [px]."""
+    scale: tuple[float, float] = (0.6, 1.6)
+    """Range of the factor on the picture's size, uniform in its logarithm."""
+    mosaic_probability: float = 0.5
+    """How often four pictures share one."""
+    flip_probability: float = 0.5
+    """How often a picture is mirrored left to right."""
+    brightness: tuple[float, float] = (0.6, 1.4)
+    """Factor on all colours."""
+    contrast: tuple[float, float] = (0.7, 1.3)
+    """Factor on the difference from the mean."""
+    gamma: tuple[float, float] = (0.7, 1.4)
+    """Exponent of the colours."""
+    channel_gain: tuple[float, float] = (0.85, 1.15)
+    """Factor on each colour for itself: white balance."""
+    saturation: tuple[float, float] = (0.6, 1.4)
+    """Factor on the difference from grey."""
+    blur_probability: float = 0.2
+    """How often a picture is blurred, by a Gaussian of up to 1.5 px."""
+    noise_probability: float = 0.3
+    """How often each pixel gets Gaussian noise, of up to 10 of 255."""
+    smallest_side: float = 5.0
+    """Fruits narrower than this in [px] are ignored: they need not be found, and finding them is no error."""
+    smallest_share: float = 0.2
+    """Fruits of which less than this share is left in the picture are ignored too."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class LightTrainConfig:
+    """How to train the light segmenter."""
+
+    steps: int = 8000
+    """Batches in all."""
+    batch_size: int = 8
+    """Pictures in a batch."""
+    learning_rate: float = 1.5e-3
+    """Of AdamW, after the warm-up; it falls to a hundredth along a cosine."""
+    weight_decay: float = 1e-3
+    """Of AdamW."""
+    warmup_steps: int = 200
+    """Steps over which the learning rate rises from 0."""
+    gradient_norm: float = 20.0
+    """Longest gradient; longer ones are shortened."""
+    averaging: float = 0.998
+    """Share of the averaged weights, which are those that are kept, that stays at each step."""
+    bfloat16: bool = True
+    """Multiply in 16 bits, which processors with AMX or AVX-512 BF16 do several times faster."""
+    backbone_rate: float = 0.3
+    """Learning rate of a backbone with ImageNet weights, as a share of the others'."""
+    fixed_blocks: int = FIXED_BLOCKS
+    """First blocks of a backbone with ImageNet weights that stay as they are, with the stem."""
+    plain_share: float = 0.0
+    """Last share of the steps, without mosaics, so that the last pictures resemble real ones."""
+    seed: int = 0
+    """Of the weights and the pictures."""
+    log_every: int = 50
+    """Steps between two lines of the history."""
+    save_every: int = 200
+    """Steps between two checkpoints."""
+    network: FruitNetworkConfig = field(default_factory=FruitNetworkConfig)
+    """Size of the network."""
+    augmentation: AugmentationConfig = field(default_factory=AugmentationConfig)
+    """How pictures are varied."""
+
+    def __post_init__(self) -> None:
+        for name in ("steps", "batch_size", "log_every", "save_every"):
+            if getattr(self, name) < 1:
+                raise InvalidInputError(f"{name} must be at least 1, got {getattr(self, name)}")
+        if not 0 < self.learning_rate < 1:
+            raise InvalidInputError(f"learning_rate must be between 0 and 1, got {self.learning_rate}")
+        if not 0 <= self.averaging < 1:
+            raise InvalidInputError(f"averaging must be from 0 to below 1, got {self.averaging}")
+
+    def rate_at(self, step: int) -> float:
+        """The learning rate of a step: linear warm-up, then a cosine down to a hundredth."""
+        if step < self.warmup_steps:
+            return self.learning_rate * (step + 1) / self.warmup_steps
+        progress = (step - self.warmup_steps) / max(self.steps - self.warmup_steps, 1)
+        return self.learning_rate * (0.01 + 0.99 * (1 + math.cos(math.pi * min(progress, 1.0))) / 2)
+
 
 Backbone = Literal["resnet101", "resnet50", "efficientnet_lite0"]
 
@@ -130,31 +237,3 @@ MASK_RCNN_PRESETS: dict[str, MaskRcnnConfig] = {
     ),
 }
 """Mask R-CNN settings by name."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class YoloConfig:
-    """How a YOLO detector is trained (Table 4-1 and the text around it)."""
-
-    epochs: int = 100
-    """N_e, at most."""
-    batch_size: int = 1
-    """N."""
-    learning_rate: float = 1e-4
-    """lr, the first one."""
-    smallest_input: int = 288
-    """I_min in [px]; the input size varies between the two."""
-    largest_input: int = 448
-    """I_max in [px]."""
-    object_threshold: float = 0.5
-    """Least confidence of an object."""
-    nms_threshold: float = 0.45
-    """Of two boxes with a larger intersection over union only the better one stays."""
-    patience: int = 3
-    """Epochs without a better validation loss after which training stops."""
-    pretrained: bool = False
-    """Whether it starts from weights trained elsewhere."""
-
-
-YOLO_PRESET = YoloConfig()
-"""Table 4-1."""

@@ -21,7 +21,7 @@ def grow(spec: PlantSpec, seed: int) -> Plant:
     return spec.grow(seed)
 
 
-class Planting:
+class PlantBatch:
     """One plant for every environment; its seed and pose are columns of the world's state."""
 
     def __init__(self, spec: PlantSpec, state: WorldState) -> None:
