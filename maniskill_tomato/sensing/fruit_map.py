@@ -209,7 +209,8 @@ class FruitMap:
         names = {number: number for number in assigned}
         if identities is None:
             self._merge()
-            names = {number: self.current(number) or number for number in assigned}
+            kept = {number: self.current(number) for number in assigned}
+            names = {number: number if now is None else now for number, now in kept.items()}
         view = MappedView(measurement=measurement, tracks=tuple(names[number] for number in assigned))
         self._keep_best(view)
         return view

@@ -190,8 +190,10 @@ def test_two_tracks_of_one_sphere_become_one_and_keep_the_name_that_was_given() 
     number = only(fruits)
     # From the other side it seems to stand far enough away to be another one.
     fruits.update(view(right, detection(FRUIT + [0.03, 0.028, 0.012], np.array(right), 0.6)))
+    assert len(fruits.tracks) == 2
     for camera in CAMERAS:
-        fruits.update(DETECTOR.measure(cast(camera, [FRUIT])))
+        seen = fruits.update(DETECTOR.measure(cast(camera, [FRUIT])))
+        assert set(seen.tracks) <= fruits.tracks.keys()
     assert len(fruits.tracks) == 1
     assert fruits.current(number) == only(fruits)
 
