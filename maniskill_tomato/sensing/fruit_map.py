@@ -446,7 +446,7 @@ class FruitMap:
     def _parts(self, measurement: Measurement, index: int) -> list[BinaryMask] | None:
         """A detection's mask divided among the well-known tracks that it covers; None if it is of one fruit."""
         frame = measurement.frame
-        circles = []
+        circles: list[tuple[float, float, float]] = []
         mask = measurement.mask(index)
         for track in self.tracks.values():
             if track.views < SURE_VIEWS or track.existence_log_odds <= 0.0:
