@@ -31,6 +31,7 @@ def test_what_the_camera_measures_is_near_the_truth() -> None:
     for seed in range(7):
         env.reset(seed=seed)
         rng = np.random.default_rng(seed)
+        info: dict[str, Any] = {}
         for _ in range(5):
             action = torch.as_tensor(rng.uniform(-1, 1, 3), dtype=torch.float32)
             *_, info = env.step(action)
