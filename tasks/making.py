@@ -286,7 +286,7 @@ def _search_setup(options: SearchOptions) -> TaskSetup:
 
 
 def _camera_config(options: SearchOptions) -> CameraConfig:
-    """How targets are named; a row gives a place for each."""
+    """How targets are named; in a row the robot chooses them."""
     given: dict[str, Any] = {
         name: value
         for name in ("target", "map_noise", "association")
@@ -296,9 +296,10 @@ def _camera_config(options: SearchOptions) -> CameraConfig:
         raise InvalidInputError(
             f"{next(iter(given))} is for a robot that sees through a camera; choose perception= as well"
         )
-    is_row = isinstance(options, RowOptions)
-    if is_row and given.setdefault("target", "map") != "map":
-        raise InvalidInputError(f"target must be 'map' in a row; got {options.target!r}")
+    if isinstance(options, RowOptions) and (named := [n for n in ("target", "map_noise") if n in given]):
+        raise InvalidInputError(
+            f"{named[0]} is for TomatoViewpoint-v1; in a row a robot with a camera chooses its targets itself"
+        )
     config = CameraConfig(**given)
     if options.map_noise is not None and config.target != "map":
         raise InvalidInputError(f"map_noise goes with target='map'; got target={config.target!r}")

@@ -5,7 +5,7 @@ Simulated worlds and the robot use the same class; what differs is who takes the
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
@@ -77,6 +77,8 @@ class _Search:
     target: int | None = None
     ruled_out: frozenset[int] = frozenset()
     """Tracks that cannot be the target."""
+    looks_at: Position | None = None
+    """Where the robot looks without a target, world frame, in [m]. Shape (3,)."""
     centre: Position | None = None
     """About which memory and rays stand, world frame, in [m]. Shape (3,)."""
     views: list[MappedView] | None = None
@@ -159,6 +161,21 @@ class CameraPerception:
         search.target = number
         return self._aim(search)
 
+    def turn_to(self, env_index: int, number: int | None, place_w: Position) -> bool:
+        """Makes a track the target, or looks at a place without one.
+
+        Args:
+            env_index: Which environment.
+            number: The track; None for none.
+            place_w: The place, world frame, in [m]. Shape (3,).
+
+        Returns:
+            Whether memory and rays must be centred anew, with `recall`.
+        """
+        search = self._searches[env_index]
+        search.target, search.looks_at = number, np.array(place_w, dtype=np.float64)
+        return self._aim(search)
+
     def choose(self, env_index: int, threshold: float) -> bool:
         """Makes the largest ripe, sure fruit of the last view the target, if its V_f there is not above a threshold.
 
@@ -202,7 +219,7 @@ class CameraPerception:
             identities = [shown(measurement.mask(k)) for k in range(len(measurement.fruits))]
         view = search.map.update(measurement, identities)
         first = not search.views
-        search.views = [*(search.views or []), view]
+        search.views = [*(_slimmed(earlier) for earlier in search.views or []), view]
         if search.target is not None:
             search.target = search.map.current(search.target)
         if search.place is not None:
@@ -348,6 +365,8 @@ class CameraPerception:
             towards = track.position_w
         elif search.place is not None:
             towards = search.place
+        elif search.looks_at is not None:
+            towards = search.looks_at
         else:
             towards = _scan_centre(search) if view is not None else np.zeros(3)
         if view is not None:
@@ -380,6 +399,15 @@ class CameraPerception:
             torch.cat([part.distance for part in parts]).to(self._device),
             torch.cat([part.label for part in parts]).to(self._device),
         )
+
+
+def _slimmed(view: MappedView) -> MappedView:
+    """An earlier view without what only the last one is asked for, its colours and the truth: a row has a hundred."""
+    frame = view.measurement.frame
+    if frame.rgb is None and frame.true_fruits is None:
+        return view
+    frame = replace(frame, rgb=None, true_fruits=None, true_numbers=())
+    return replace(view, measurement=replace(view.measurement, frame=frame))
 
 
 def _scan_centre(search: _Search) -> Position:

@@ -24,8 +24,16 @@ from maniskill_tomato.tasks import MAX_ROW_STEPS
 from maniskill_tomato.tasks.arm_moves import Plan
 from maniskill_tomato.tasks.row.episode_selection import EpisodeChoice
 from maniskill_tomato.tasks.row.hidden_starts import HardStarts, Start, StartRequest
+from maniskill_tomato.tasks.row.inspecting import InspectedSequence, InspectingSenses
 from maniskill_tomato.tasks.row.row_config import CameraConfig, GeneralTaskConfig
-from maniskill_tomato.tasks.row.senses import ViewMeasurement, ViewPoses, make_senses
+from maniskill_tomato.tasks.row.senses import (
+    CameraSenses,
+    ExactSenses,
+    Senses,
+    ViewMeasurement,
+    ViewPoses,
+    check_pictures,
+)
 from maniskill_tomato.tasks.row.target_sequence import TargetSequence, Transits, with_transits
 from maniskill_tomato.tasks.world import World
 from maniskill_tomato.tasks.world_state import MAX_VIEWS
@@ -70,10 +78,22 @@ class SearchGame:
         self.episodes = episodes
         self._world = world
         self._observer = ViewpointObserver(world.num_envs, world.device, layout, task.max_moves)
-        self._senses = make_senses(perception, world, noise, camera, task.full_visibility)
         self._is_camera = perception != "ground_truth"
         self._starts = HardStarts(task, world.scene, world.device)
-        self.sequence = None if transits is None else TargetSequence(world, self._observer.lattice, transits)
+        self._senses: Senses
+        self.sequence: TargetSequence | None = None
+        lattice = self._observer.lattice
+        if not self._is_camera:
+            self._senses = ExactSenses(world, noise)
+            self.sequence = None if transits is None else TargetSequence(world, lattice, transits)
+        else:
+            check_pictures(perception, world)
+            if transits is None:
+                self._senses = CameraSenses(world, perception, camera, task.full_visibility)
+            else:
+                inspecting = InspectingSenses(world, perception, camera, task.full_visibility)
+                self._senses = inspecting
+                self.sequence = InspectedSequence(world, lattice, transits, inspecting)
         self._measured: ViewMeasurement | None = None
         self._seen_from = torch.zeros(0)
         """Poses of the cameras at the last views. Shape (N, 4, 4)."""
@@ -372,7 +392,7 @@ class SearchGame:
             info["chosen_fruit"] = measured.chosen_fruit.clone()
             info["target_named"] = measured.named.clone()
         if self.sequence is not None:
-            info["success"] = state.seen_count >= state.target_count
+            info["success"] = self.sequence.is_success()
             over = self.sequence.is_over() | (state.moves >= MAX_ROW_STEPS)
             info["fail"] = over & ~info["success"]
             info["seen_count"] = state.seen_count.clone()

@@ -4,7 +4,7 @@ The errors of a view follow from the episode's `noise_seed` and the number of th
 another's, and a view that is looked at again is measured the same.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Protocol
 
 import numpy as np
@@ -256,29 +256,53 @@ class CameraSenses:
 
     def look(self, view: ViewPoses) -> tuple[ViewMeasurement, Tensor | None]:
         """Takes and measures frames."""
-        world = self._world
-        T_w_plant = world.plant_batch.T_world_plant
-        for i, seed in view.seeds(world.state.noise_seed).items():
-            self._camera.seed(i, seed)
-        self._qpos, self._pictures = view.qpos, None
-        frames = self._camera.take(view.T_w_camera, T_w_plant, view.T_w_links, view.mask)
-        moved = self._perception.look(frames)
-        chosen = torch.full((world.num_envs,), NO_FRUIT, device=world.device)
-        for i, frame in enumerate(frames):
-            if frame is None:
-                continue
-            if self._config.target != "map" and not bool(self._perception.is_located[i]):
-                moved[i] |= self._name(i, frame)
-            chosen[i] = self._shown_fruit(i)
+        moved = self._take(view, view.mask)
+        chosen = self._chosen(view.mask)
+        for i in view.seeds(self._world.state.noise_seed):
+            last = self._perception.last_view(i)
+            if self._config.target != "map" and not bool(self._perception.is_located[i]) and last is not None:
+                moved[i] |= self._name(i, last.measurement.frame)
+                chosen[i] = self._shown_fruit(i)
             if self._config.target == "any" and int(chosen[i]) != NO_FRUIT and bool(moved[i]):
                 self._judge_by(i, int(chosen[i]))
-        target = world.state.target
+        return self._measured(view, chosen), moved.nonzero()[:, 0]
+
+    def _take(self, view: ViewPoses, mask: Tensor | None) -> Tensor:
+        """Takes frames of some environments into their maps; which targets turned out to be elsewhere.
+
+        Args:
+            view: From where.
+            mask: Which environments look; all if None. Shape (N,), bool.
+
+        Returns:
+            Shape (N,), bool.
+        """
+        world = self._world
+        for i, seed in replace(view, mask=mask).seeds(world.state.noise_seed).items():
+            self._camera.seed(i, seed)
+        self._qpos, self._pictures = view.qpos, None
+        frames = self._camera.take(view.T_w_camera, world.plant_batch.T_world_plant, view.T_w_links, mask)
+        return self._perception.look(frames)
+
+    def _chosen(self, mask: Tensor | None) -> Tensor:
+        """The fruits that the targets' detections show, of the environments that have looked. Shape (N,)."""
+        n, device = self._world.num_envs, self._world.device
+        looked = range(n) if mask is None else mask.nonzero()[:, 0].tolist()
+        chosen = torch.full((n,), NO_FRUIT, device=device)
+        for i in looked:
+            chosen[i] = self._shown_fruit(i)
+        return chosen
+
+    def _measured(self, view: ViewPoses, chosen: Tensor) -> ViewMeasurement:
+        """What was sensed, with the truth about the targets and about the fruits that were taken for them."""
+        world = self._world
+        target, T_w_plant = world.state.target, world.plant_batch.T_world_plant
         seen = world.scene.visibility(view.T_w_camera, target, T_w_plant, view.T_w_links)
         at = torch.where(chosen == NO_FRUIT, target, chosen)
         of_chosen = seen
         if not torch.equal(at, target):
             of_chosen = world.scene.visibility(view.T_w_camera, at, T_w_plant, view.T_w_links)
-        measured = ViewMeasurement(
+        return ViewMeasurement(
             rays=self._perception.rays(),
             visible_fraction=self._perception.sure_fraction,
             told_fraction=self._perception.visible_fraction,
@@ -288,7 +312,6 @@ class CameraSenses:
             chosen_fruit=chosen,
             named=self._perception.is_located,
         )
-        return measured, moved.nonzero()[:, 0]
 
     def _name(self, env_index: int, frame: PosedFrame) -> bool:
         """Names the track that holds most of the target's pixels, if one does; whether it stands elsewhere.
@@ -338,19 +361,14 @@ class CameraSenses:
         return picture
 
 
-def make_senses(
-    perception: Perception,
-    world: World,
-    noise: SensorNoise,
-    camera: CameraConfig,
-    full_visibility: float,
-) -> Senses:
-    """The senses of a kind of perception; `noise` is for ground truth only, `camera` for the others."""
-    if perception == "ground_truth":
-        return ExactSenses(world, noise)
+def check_pictures(perception: Perception, world: World) -> None:
+    """Checks that a world has the pictures that a kind of perception needs.
+
+    Raises:
+        InvalidInputError: It has none.
+    """
     if perception in RENDERED and world.pictures is None:
         raise InvalidInputError(
             f"perception={perception!r} renders colours, which a world without a simulator cannot; use "
             "gymnasium.make, or 'occlusion_model'"
         )
-    return CameraSenses(world, perception, camera, full_visibility)

@@ -1,0 +1,310 @@
+"""The inspection of a row through a camera: which fruit to look at next, and what was found out of each.
+
+A simulated row and a robot share it. All it knows is the `FruitMap`. The next fruit is the nearest ripe one in reach
+that no view has shown fully yet. When there is none, the robot looks at a part of the row that it has not looked at.
+When there is no such part either, the inspection is over.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Final
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from maniskill_tomato.robot.d435 import CameraIntrinsics
+from maniskill_tomato.sensing.fruit_map import FruitMap, MappedView, Track
+from maniskill_tomato.sensing.measurement import Position
+from maniskill_tomato.sensing.view_lattice import ViewLattice
+
+LARGEST_ERROR: Final = 0.025
+"""A fruit whose place is less certain than this standard deviation of a coordinate, in [m], is not looked at yet."""
+
+LOST_AFTER: Final = 6
+"""A fruit is given up after so many views in a row that do not show it."""
+
+SELDOM_SEEN: Final = 4
+"""One that fewer views have shown is given up after half as many: it may be none."""
+
+SCAN_PLACES: Final[tuple[tuple[float, float, float], ...]] = tuple(
+    (0.83, y, z) for z in (0.45, 0.68) for y in (-0.5, -0.17, 0.17, 0.5)
+)
+"""Where a row is looked at, in the base frame, in [m]: the ripe fruits in reach of validation rows lie from 0.63 to
+1.01, from -0.72 to 0.72 and from 0.36 to 0.73."""
+
+SCAN_RANGE: Final = (0.2, 0.75)
+"""A view shows such a place when it lies in the picture and so far from the camera, in [m]."""
+
+SOLID_SHARE: Final = 0.6
+"""Centres of two fruits are at least this share of the sum of their radii apart; nearer ones are one fruit."""
+
+Float64 = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class SeenView:
+    """The view that showed most of a fruit."""
+
+    view: int
+    """Its number in the inspection, from 0."""
+    sure_fraction: float
+    """Lower bound of V_f."""
+    fraction: float
+    """V_f."""
+    error: float
+    """Its standard error."""
+    T_world_camera: Float64
+    """Pose of the optical frame. Shape (4, 4)."""
+    picture: NDArray[np.uint8] | None
+    """What is round the fruit; None from a camera without colours. Shape (H, W, 3)."""
+    shown_fruit: int | None
+    """Which fruit of the plant it is, where a simulated camera tells."""
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class InspectedFruit:
+    """One fruit of the inspection list."""
+
+    number: int
+    """Its track in the map."""
+    position_w: Position
+    """Centre in the robot's base frame, in [m]. Shape (3,)."""
+    position_error_m: float
+    """Standard deviation of a coordinate, in [m]."""
+    radius_m: float
+    """In [m]."""
+    is_ripe: bool
+    """Whether it is more likely ripe than not."""
+    visible_fraction: float
+    """Largest V_f of any view."""
+    fraction_error: float
+    """Its standard error."""
+    is_fully_seen: bool
+    """Whether the lower bound of V_f is above the threshold."""
+    approach_w: Position | None
+    """Unit vector from the fruit to the camera that saw it fully: a direction in which nothing hides it. None for a
+    fruit that no view showed fully. Shape (3,)."""
+    best: SeenView | None
+    """The view that showed most of it; None if its V_f could never be told."""
+    views: int
+    """Views that it was detected in."""
+
+
+@dataclass(frozen=True, eq=False)
+class Aim:
+    """What the robot looks at next."""
+
+    position_w: Position
+    """In the robot's base frame, in [m]. Shape (3,)."""
+    track: int | None
+    """The fruit; None for a part of the row."""
+
+
+@dataclass(eq=False)
+class Inspection:
+    """One robot's way through one row."""
+
+    threshold: float
+    """V_f above which a fruit is fully seen."""
+    stop_errors: float
+    """Standard errors that V_f must be above it."""
+    scan_places: Sequence[tuple[float, float, float]] = SCAN_PLACES
+    """Parts of the row, in the base frame, in [m]."""
+    aim: Aim | None = None
+    """What the robot looks at now; None before the first view."""
+    is_over: bool = False
+    """Whether nothing is left to look at."""
+    given_up: set[int] = field(default_factory=set)
+    """Tracks that are not looked at any more."""
+
+    def __post_init__(self) -> None:
+        self._best: dict[int, SeenView] = {}
+        self._unscanned = set(range(len(self.scan_places)))
+        self._views = self._lost = 0
+
+    def take_in(self, fruits: FruitMap, view: MappedView) -> list[int]:
+        """Takes in a view that the map has taken in; returns the ripe tracks that are fully seen by it first."""
+        before = {number for number in self._best if self.is_full(number)}
+        self._follow_merged(fruits)
+        frame = view.measurement.frame
+        for index, number in enumerate(view.tracks):
+            fruit, known = view.measurement.fruits[index], self._best.get(number)
+            if number not in fruits.tracks or not fruit.is_depth_measured:
+                continue
+            single = fruit.visible_fraction
+            if not np.isfinite(single) or (known is not None and single < known.fraction - 0.1):
+                continue
+            seen = fruits.fraction(view.measurement, index, number)
+            sure = seen.value - self.stop_errors * seen.error
+            if known is None or sure > known.sure_fraction:
+                mask = view.measurement.mask(index)
+                self._best[number] = SeenView(
+                    view=self._views,
+                    sure_fraction=sure,
+                    fraction=seen.value,
+                    error=seen.error,
+                    T_world_camera=frame.T_world_camera,
+                    picture=None
+                    if frame.rgb is None
+                    else _cut_out(frame.rgb, fruit.corner, fruit.crop.shape),
+                    shown_fruit=frame.shown_fruit(mask),
+                )
+        self._unscanned = {
+            k for k in self._unscanned if not self._shows(frame.T_world_camera, k, frame.intrinsics)
+        }
+        target = None if self.aim is None else self.aim.track
+        self._lost = 0 if target is None or target in view.tracks else self._lost + 1
+        self._views += 1
+        return [
+            number
+            for number in self._best
+            if number not in before and self.is_full(number) and fruits.tracks[number].is_ripe
+        ]
+
+    def is_full(self, number: int) -> bool:
+        """Whether a view has shown a track fully."""
+        return number in self._best and self._best[number].sure_fraction > self.threshold
+
+    def is_done(self, fruits: FruitMap, moves: int, max_moves: int) -> bool:
+        """Whether the robot is done with what it looks at: seen, scanned, gone, lost, or not worth another move.
+
+        Args:
+            fruits: The map.
+            moves: Moves that were made for it.
+            max_moves: Moves after which it is given up.
+        """
+        if self.aim is None:
+            return True
+        number = self.aim.track
+        if number is None:
+            # A fruit that turned up is worth more than the rest of the scan.
+            return moves > 0 or not self._is_unscanned(self.aim)
+        track = fruits.tracks.get(number)
+        if track is None or not track.is_ripe or self.is_full(number) or number in self.given_up:
+            return True
+        patience = LOST_AFTER if track.views >= SELDOM_SEEN else LOST_AFTER // 2
+        if moves >= max_moves or self._lost >= patience:
+            self.given_up.add(number)
+            return True
+        return False
+
+    def next(self, fruits: FruitMap, camera_position: Position, lattice: ViewLattice) -> Aim | None:
+        """Chooses what to look at next, and keeps it as `aim`.
+
+        Args:
+            fruits: The map.
+            camera_position: In the base frame, in [m]. Shape (3,).
+            lattice: Says what the arm reaches.
+
+        Returns:
+            None if nothing is left.
+        """
+        if self.aim is not None and self.aim.track is None:
+            self._unscanned -= {
+                k for k, p in enumerate(self.scan_places) if np.allclose(p, self.aim.position_w)
+            }
+        self._lost = 0
+        full = [track for track in fruits.tracks.values() if self.is_full(track.number)]
+        open_tracks = [
+            track
+            for track in fruits.tracks.values()
+            if self._is_open(track) and not any(_are_one(track, other) for other in full)
+        ]
+        positions = np.array([track.position_w for track in open_tracks]).reshape(-1, 3)
+        fits = lattice.in_reach(torch.as_tensor(positions, dtype=torch.float32, device=lattice.device))
+        near = [track for track, fit in zip(open_tracks, fits.tolist(), strict=True) if fit]
+        if near:
+            track = min(near, key=lambda t: float(np.linalg.norm(t.position_w - camera_position)))
+            self.aim = Aim(track.position_w.copy(), track.number)
+        elif self._unscanned:
+            places = [np.array(self.scan_places[k]) for k in sorted(self._unscanned)]
+            self.aim = Aim(min(places, key=lambda p: float(np.linalg.norm(p - camera_position))), None)
+        else:
+            self.aim, self.is_over = None, True
+        return self.aim
+
+    def fruits(self, fruits: FruitMap) -> list[InspectedFruit]:
+        """The inspection list: every fruit that there more likely is than not, those that were fully seen
+        first."""
+        listed: list[InspectedFruit] = []
+        tracks = [
+            t
+            for t in fruits.tracks.values()
+            if t.existence_log_odds > 0.0 and _position_error(t) < LARGEST_ERROR
+        ]
+        for track in sorted(tracks, key=lambda t: (not self.is_full(t.number), -t.views, t.number)):
+            if not any(_are_one(track, fruits.tracks[other.number]) for other in listed):
+                listed.append(self._inspected(track))
+        return listed
+
+    def _inspected(self, track: Track) -> InspectedFruit:
+        best, full = self._best.get(track.number), self.is_full(track.number)
+        approach = None
+        if best is not None and full:
+            away = best.T_world_camera[:3, 3] - track.position_w
+            approach = away / np.linalg.norm(away)
+        return InspectedFruit(
+            number=track.number,
+            position_w=track.position_w.copy(),
+            position_error_m=_position_error(track),
+            radius_m=track.radius_m,
+            is_ripe=track.is_ripe,
+            visible_fraction=0.0 if best is None else best.fraction,
+            fraction_error=1.0 if best is None else best.error,
+            is_fully_seen=full,
+            approach_w=approach,
+            best=best,
+            views=track.views,
+        )
+
+    def _is_open(self, track: Track) -> bool:
+        return (
+            track.is_ripe
+            and track.existence_log_odds > 0.0
+            and _position_error(track) < LARGEST_ERROR
+            and not self.is_full(track.number)
+            and track.number not in self.given_up
+        )
+
+    def _is_unscanned(self, aim: Aim) -> bool:
+        return any(np.allclose(self.scan_places[k], aim.position_w) for k in self._unscanned)
+
+    def _shows(self, T_world_camera: Float64, place: int, intrinsics: CameraIntrinsics) -> bool:
+        """Whether a view holds a part of the row."""
+        x, y, z = T_world_camera[:3, :3].T @ (np.array(self.scan_places[place]) - T_world_camera[:3, 3])
+        if not SCAN_RANGE[0] < z < SCAN_RANGE[1]:
+            return False
+        u, v = intrinsics.fx * x / z + intrinsics.cx, intrinsics.fy * y / z + intrinsics.cy
+        return bool(0.0 < u < intrinsics.width and 0.0 < v < intrinsics.height)
+
+    def _follow_merged(self, fruits: FruitMap) -> None:
+        """Gives what is known of tracks that others took in to these."""
+        kept: dict[int, SeenView] = {}
+        for number, seen in self._best.items():
+            now = fruits.current(number)
+            if now is not None and (now not in kept or seen.sure_fraction > kept[now].sure_fraction):
+                kept[now] = seen
+        self._best = kept
+        self.given_up = {now for number in self.given_up if (now := fruits.current(number)) is not None}
+        if self.aim is not None and self.aim.track is not None:
+            now = fruits.current(self.aim.track)
+            if now is not None:
+                self.aim = Aim(fruits.tracks[now].position_w.copy(), now)
+
+
+def _are_one(a: Track, b: Track) -> bool:
+    """Whether two tracks are too near to each other to be two fruits."""
+    return bool(np.linalg.norm(a.position_w - b.position_w) < SOLID_SHARE * (a.radius_m + b.radius_m))
+
+
+def _position_error(track: Track) -> float:
+    """Standard deviation of a coordinate, in [m]."""
+    return float(np.sqrt(np.trace(track.covariance[:3, :3]) / 3.0))
+
+
+def _cut_out(rgb: NDArray[np.uint8], corner: tuple[int, int], size: tuple[int, ...]) -> NDArray[np.uint8]:
+    """A square about a detection, twice as large as that, within the picture."""
+    half = max(size)
+    row, column = corner[0] + size[0] // 2, corner[1] + size[1] // 2
+    return rgb[max(row - half, 0) : row + half, max(column - half, 0) : column + half].copy()
