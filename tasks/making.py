@@ -13,8 +13,8 @@ from maniskill_tomato.plants.spec import PlantPose, PlantSpec
 from maniskill_tomato.robot.d435 import CameraIntrinsics, color_intrinsics
 from maniskill_tomato.robot.viewpoint_move import OutsideWorkspace
 from maniskill_tomato.sensing.observation import ObservationLayout
+from maniskill_tomato.sensing.perception_kinds import RENDERED, Perception
 from maniskill_tomato.sensing.sensor_noise import SensorNoise
-from maniskill_tomato.sensing.simulated_camera import RENDERED, Perception
 from maniskill_tomato.tasks import MAX_EPISODE_STEPS, MAX_GENERAL_STEPS, MAX_ROW_STEPS, TASK_IDS
 from maniskill_tomato.tasks.arm_moves import ArmMoves, Control
 from maniskill_tomato.tasks.row.episode_selection import EpisodeChoice

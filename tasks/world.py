@@ -434,6 +434,11 @@ class World:
         return told
 
     @property
+    def targets_begun(self) -> Tensor:
+        """How many targets each episode has had so far. Shape (N,)."""
+        return self.state.targets_begun.clone()
+
+    @property
     def inspecting(self) -> Any:
         """The `InspectingSenses` of a row that is inspected with a camera; other tasks have no such attribute."""
         senses = getattr(getattr(self.game, "sequence", None), "senses", None)

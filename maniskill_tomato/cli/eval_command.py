@@ -88,6 +88,8 @@ class Eval:
         print(summary(result.metrics))
         if "true_success_rate" in result.metrics:
             print(camera_summary(result.metrics))
+        if "recall" in result.metrics:
+            print(inspection_summary(result.metrics))
         if result.left_out:
             print(result.left_out)
         print(f"metrics {self.out / 'metrics.json'}")
@@ -99,7 +101,7 @@ class Eval:
         Raises:
             InvalidInputError: One is not allowed.
         """
-        from maniskill_tomato.sensing.simulated_camera import RENDERED, Naming, Perception
+        from maniskill_tomato.sensing.perception_kinds import RENDERED, Naming, Perception
 
         for flag, value, allowed in (
             ("--perception", self.perception, get_args(Perception)),
@@ -128,6 +130,19 @@ def camera_summary(metrics: dict[str, Any]) -> str:
         f"truly full: the target {metrics['true_success_rate']:.0%}, the chosen fruit "
         f"{metrics['chosen_success_rate']:.0%}, with a true association "
         f"{metrics['true_association_success_rate']:.0%}; false stops {metrics['false_stop_rate']:.0%}"
+    )
+
+
+def inspection_summary(metrics: dict[str, Any]) -> str:
+    """One line with what the inspection lists of rows are worth."""
+    recall, precision = (
+        "none" if metrics[key] is None else f"{metrics[key]:.1%}" for key in ("recall", "precision")
+    )
+    error = metrics["position_error_median_m"]
+    place = "unknown" if error is None else f"{1e3 * error:.1f} mm"
+    return (
+        f"inspection: {recall} of the seeable ripe fruits truly seen, precision {precision}, place {place} (median), "
+        f"{metrics['mean_moves']:.1f} moves a row"
     )
 
 

@@ -1,6 +1,6 @@
 """What episodes through a camera amount to: which fruit the robot stopped at, whether it was truly full, why not."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any, Final, Literal, get_args
 
 import numpy as np
@@ -24,7 +24,7 @@ FARTHEST_PLACE: Final = 0.03
 
 
 def summarise_camera(episodes: Sequence[EpisodeRecord], threshold: float) -> dict[str, Any]:
-    """The figures of episodes that a camera decided; empty for those that the truth did.
+    """The figures of episodes with one target that a camera decided; empty for those that the truth did, and for rows.
 
     All rates are shares of all episodes. A false stop is one that claims success while the target is not fully visible.
 
@@ -32,7 +32,7 @@ def summarise_camera(episodes: Sequence[EpisodeRecord], threshold: float) -> dic
         episodes: One or more.
         threshold: V_f above which a fruit is fully visible.
     """
-    if any(e.chosen_visible_fraction is None for e in episodes):
+    if any(e.chosen_visible_fraction is None or e.row is not None for e in episodes):
         return {}
     right = np.array([_truly_full(e, threshold) for e in episodes])
     claimed = np.array([e.success for e in episodes])
@@ -46,6 +46,60 @@ def summarise_camera(episodes: Sequence[EpisodeRecord], threshold: float) -> dic
         "false_stop_rate": float((claimed & ~right).mean()),
         "failures_by_cause": {cause: causes.count(cause) for cause in get_args(Cause)},
     }
+
+
+def summarise_inspections(
+    episodes: Sequence[EpisodeRecord], seeable: Mapping[int, set[int]], threshold: float
+) -> dict[str, Any]:
+    """The figures of rows that a camera inspected; empty for those that the truth led.
+
+    Args:
+        episodes: One or more.
+        seeable: The ripe fruits of each row that can be seen fully, by its seed, as indices in `Plant.fruits`.
+        threshold: V_f above which a fruit is fully visible.
+
+    Returns:
+        `recall`: the share of the seeable fruits that are listed as fully seen and truly were. `precision`: the share
+        of the fruits listed as ripe that are ripe and listed once. `full_precision`: the share of the fruits listed as
+        ripe and fully seen that are ripe and were fully seen. Errors of place and radius are medians over the
+        fruits that are right, in [m].
+    """
+    rows = [e.row for e in episodes if e.row is not None and e.row.listed is not None]
+    if not rows or len(rows) < len(episodes):
+        return {}
+    wanted = found = claimed = full = 0
+    right: list[dict[str, Any]] = []
+    for episode, row in zip(episodes, rows, strict=True):
+        assert row.listed is not None
+        possible = set(seeable[episode.seed]) | set(row.seen)
+        wanted, found = wanted + len(possible), found + len(row.seen)
+        ripe = [entry for entry in row.listed if entry["is_ripe"]]
+        claimed += sum(entry["is_fully_seen"] for entry in ripe)
+        full += sum(
+            entry["is_fully_seen"] and entry["is_truly_ripe"] and entry["true_fraction"] > threshold
+            for entry in ripe
+        )
+        numbers = [entry["fruit"] for entry in ripe]
+        right += [
+            entry
+            for k, entry in enumerate(ripe)
+            if entry["is_truly_ripe"] and entry["fruit"] not in numbers[:k]
+        ]
+    listed = sum(sum(entry["is_ripe"] for entry in row.listed or ()) for row in rows)
+    return {
+        "recall": found / wanted if wanted else None,
+        "precision": len(right) / listed if listed else None,
+        "full_precision": full / claimed if claimed else None,
+        "position_error_median_m": _median([entry["position_error_m"] for entry in right]),
+        "radius_error_median_m": _median([abs(entry["radius_error_m"]) for entry in right]),
+        "mean_moves": sum(row.moves for row in rows) / len(rows),
+        "mean_camera_path_m": sum(row.path_m for row in rows) / len(rows),
+        "finished_share": sum(e.success for e in episodes) / len(episodes),
+    }
+
+
+def _median(values: Sequence[float]) -> float | None:
+    return float(np.median(values)) if values else None
 
 
 def failure_cause(episode: EpisodeRecord, threshold: float) -> Cause | None:

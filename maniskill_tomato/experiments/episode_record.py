@@ -28,6 +28,8 @@ class RowSearch:
     """Way of the camera, transits included, in [m]."""
     joint_path_rad: float
     """Way of all joints together, transits included, in [rad]."""
+    listed: tuple[dict[str, Any], ...] | None = None
+    """The inspection list of a robot with a camera beside the truth, see `JudgedFruit`; None without a camera."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -189,6 +191,8 @@ class EpisodeRecord:
             search = content["row"]
             if search is not None:
                 lists = {name: tuple(search[name]) for name in ("targets", "seen")}
+                if search.get("listed") is not None:
+                    lists["listed"] = tuple(search["listed"])
                 search = RowSearch(**{**search, **lists})
             return cls(
                 seed=int(content["seed"]),

@@ -1,7 +1,7 @@
 """The wrist cameras of N simulated environments: depth with the D435's faults, and masks or rendered colours."""
 
 from collections.abc import Callable
-from typing import Final, Literal
+from typing import Final
 
 import numpy as np
 from torch import Tensor
@@ -22,34 +22,16 @@ from maniskill_tomato.segmentation.instances import Instances
 from maniskill_tomato.segmentation.segmenter import make_segmenter
 from maniskill_tomato.sensing.camera_perception import CameraPerception
 from maniskill_tomato.sensing.fruit_detector import FruitDetector
+from maniskill_tomato.sensing.perception_kinds import RENDERED, Perception
 from maniskill_tomato.sensing.posed_frame import PosedFrame
 from maniskill_tomato.sensing.visible_fraction.estimate import UInt8
 from maniskill_tomato.sensing.visible_fraction.occlusion_models import make_occlusion_model
-
-Perception = Literal["ground_truth", "occlusion_model", "thesis_model", "improved_model", "segmenter"]
-"""What reward, observation and the target's position come from.
-
-`occlusion_model`: `SphereModel` on a perfect mask and noisy depth. `thesis_model`, `improved_model`: those models on
-the same and rendered colours. `segmenter`: the light segmenter's masks in rendered colours, then `SphereModel`."""
-
-RENDERED: Final[tuple[Perception, ...]] = ("thesis_model", "improved_model", "segmenter")
-"""Those that need colours, and so a renderer."""
 
 IMAGE_SIZE: Final = (320, 240)
 """Width and height of cast images, in [px]."""
 
 RENDERED_SIZE: Final = (640, 480)
 """Width and height of rendered ones unless `sensor_configs` says otherwise, in [px]: the camera's own."""
-
-Naming = Literal["track", "map", "any"]
-"""How a robot that sees through a camera is told its target.
-
-`track`: the episode's target is fixed beforehand; the robot moves until it has a track that holds most of the target's
-visible pixels, and that track is named to it. `map`: a place is given, with an error. `any`: the robot chooses a ripe
-fruit that it does not see fully yet."""
-
-Association = Literal["map", "truth"]
-"""Who says which track a detection belongs to: the fruit map, or the simulator."""
 
 _CATEGORIES: Final = {"ripe": "tomato_ripe", "turning": "tomato_turning", "green": "tomato_unripe"}
 

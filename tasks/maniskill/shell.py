@@ -423,6 +423,16 @@ class SearchEnv(TomatoEnv):
 class RowEnv(SearchEnv):
     """What the shell of the row tells beside."""
 
+    @property
+    def targets_begun(self) -> Tensor:
+        """How many targets each row has had so far. Shape (num_envs,)."""
+        return self.world.targets_begun
+
+    @property
+    def inspecting(self) -> Any:
+        """What knows the inspection lists of rows that are inspected with a camera; there is none otherwise."""
+        return self.world.inspecting
+
     def open_targets(self, env_index: int = 0) -> list[int]:
         """The fruits of a row that are yet to be looked for, as indices in `Plant.fruits`."""
         return self.world.open_targets(env_index)

@@ -18,8 +18,8 @@ from maniskill_tomato.robot.rotations import FORWARD_RPY
 from maniskill_tomato.robot.transit import TRANSIT_MOVES
 from maniskill_tomato.sensing.belief import Belief
 from maniskill_tomato.sensing.observation import ObservationLayout, ViewpointObserver
+from maniskill_tomato.sensing.perception_kinds import Perception
 from maniskill_tomato.sensing.sensor_noise import SensorNoise
-from maniskill_tomato.sensing.simulated_camera import Perception
 from maniskill_tomato.tasks import MAX_ROW_STEPS
 from maniskill_tomato.tasks.arm_moves import Plan
 from maniskill_tomato.tasks.row.episode_selection import EpisodeChoice

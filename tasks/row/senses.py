@@ -15,9 +15,10 @@ from torch import Tensor
 from maniskill_tomato.errors import InvalidInputError
 from maniskill_tomato.raycast.view_rays import ViewRays
 from maniskill_tomato.sensing.observation import ViewpointObserver
+from maniskill_tomato.sensing.perception_kinds import RENDERED, Perception
 from maniskill_tomato.sensing.posed_frame import PosedFrame
 from maniskill_tomato.sensing.sensor_noise import SensorErrors, SensorNoise
-from maniskill_tomato.sensing.simulated_camera import RENDERED, Perception, make_camera
+from maniskill_tomato.sensing.simulated_camera import make_camera
 from maniskill_tomato.tasks.row.row_config import CameraConfig
 from maniskill_tomato.tasks.world import World
 from maniskill_tomato.tasks.world_state import NOISE_SEEDS
