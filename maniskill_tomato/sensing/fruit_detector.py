@@ -130,7 +130,16 @@ def _fruit(
         radius_m=estimate.radius_m,
         is_depth_measured=bool(np.isfinite(fruit_depth(view.depth_m, mask))),
         direction_w=rotation @ (ray / np.linalg.norm(ray)),
+        redness=_redness(frame, mask),
     )
+
+
+def _redness(frame: PosedFrame, mask: BinaryMask) -> float:
+    """(R - G) / (R + G) of the mean colour of a mask; NaN without colours."""
+    if frame.rgb is None:
+        return float("nan")
+    red, green, _ = frame.rgb[mask].mean(axis=0)
+    return float((red - green) / max(red + green, 1.0))
 
 
 def _centre(

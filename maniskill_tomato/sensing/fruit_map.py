@@ -61,6 +61,11 @@ class MapConfig:
     """Share of the detections that are no fruit."""
     ripeness_rate: float = 0.95
     """Share of the fruits whose ripeness is told correctly."""
+    ripe_redness: float = 0.51
+    """Redness (`DetectedFruit.redness`) that is as likely of a ripe fruit as of one that turns. On validation plants
+    ripe fruits have 0.58 or more and turning ones 0.44 or less."""
+    redness_slope: float = 60.0
+    """Log-odds of being ripe that a redness larger by 1 adds."""
     single_error: float = 0.15
     """Standard error of one image's V_f of a fruit that is half visible; see `fraction_error`."""
     fused_error: float = 0.10
@@ -366,6 +371,9 @@ class FruitMap:
             track.ripe_log_odds += told if fruit.is_ripe else -told
         elif track.views == 0:
             track.ripe_log_odds = told
+        if np.isfinite(fruit.redness):
+            colour = c.redness_slope * (fruit.redness - c.ripe_redness)
+            track.ripe_log_odds += float(np.clip(colour, -LARGEST_COLOUR, LARGEST_COLOUR))
         track.ripe_log_odds = float(np.clip(track.ripe_log_odds, -LARGEST_LOG_ODDS, LARGEST_LOG_ODDS))
         track.existence_log_odds += float(np.log(c.detection_rate / c.false_rate)) * float(
             np.clip(fruit.score, 0.0, 1.0)
@@ -486,6 +494,9 @@ UNKNOWN_FRUITS: Final = 10_000
 """With true identities, numbers from here on are those of detections that show no fruit."""
 
 LARGEST_LOG_ODDS: Final = 8.0
+LARGEST_COLOUR: Final = 4.0
+"""Log-odds of being ripe that the colour of one view adds at most."""
+
 SMALLEST_LOG_ODDS: Final = -2.0
 """A track with a smaller log-odds of existence is forgotten."""
 

@@ -13,13 +13,16 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from maniskill_tomato.robot.d435 import CameraIntrinsics
 from maniskill_tomato.sensing.fruit_map import FruitMap, MappedView, Track
 from maniskill_tomato.sensing.measurement import Position
+from maniskill_tomato.sensing.posed_frame import PosedFrame
 from maniskill_tomato.sensing.view_lattice import ViewLattice
 
 LARGEST_ERROR: Final = 0.025
 """A fruit whose place is less certain than this standard deviation of a coordinate, in [m], is not looked at yet."""
+
+LISTED_ERROR: Final = 0.01
+"""A fruit that no view shows fully is listed when its place is more certain than this, in [m]."""
 
 LOST_AFTER: Final = 6
 """A fruit is given up after so many views in a row that do not show it."""
@@ -28,13 +31,20 @@ SELDOM_SEEN: Final = 4
 """One that fewer views have shown is given up after half as many: it may be none."""
 
 SCAN_PLACES: Final[tuple[tuple[float, float, float], ...]] = tuple(
-    (0.83, y, z) for z in (0.45, 0.68) for y in (-0.5, -0.17, 0.17, 0.5)
+    (0.83, y, z) for z in (0.45, 0.68) for y in (-0.6, -0.36, -0.12, 0.12, 0.36, 0.6)
 )
 """Where a row is looked at, in the base frame, in [m]: the ripe fruits in reach of validation rows lie from 0.63 to
 1.01, from -0.72 to 0.72 and from 0.36 to 0.73."""
 
-SCAN_RANGE: Final = (0.2, 0.75)
-"""A view shows such a place when it lies in the picture and so far from the camera, in [m]."""
+SCAN_RANGE: Final = (0.2, 0.7)
+"""A view shows such a place when it lies in the picture so far along the optical axis, in [m], and nothing stands
+farther in front of it than `SCAN_DEPTH`."""
+
+SCAN_DEPTH: Final = 0.12
+"""In [m]: what is nearer to the place belongs to the same cluster of leaves and fruits."""
+
+SURE_VIEWS: Final = 3
+"""A fruit that no view shows fully is listed when so many views have detected it."""
 
 SOLID_SHARE: Final = 0.6
 """Centres of two fruits are at least this share of the sum of their radii apart; nearer ones are one fruit."""
@@ -150,9 +160,7 @@ class Inspection:
                     else _cut_out(frame.rgb, fruit.corner, fruit.crop.shape),
                     shown_fruit=frame.shown_fruit(mask),
                 )
-        self._unscanned = {
-            k for k in self._unscanned if not self._shows(frame.T_world_camera, k, frame.intrinsics)
-        }
+        self._unscanned = {k for k in self._unscanned if not self._shows(frame, k)}
         target = None if self.aim is None else self.aim.track
         self._lost = 0 if target is None or target in view.tracks else self._lost + 1
         self._views += 1
@@ -231,7 +239,8 @@ class Inspection:
         tracks = [
             t
             for t in fruits.tracks.values()
-            if t.existence_log_odds > 0.0 and _position_error(t) < LARGEST_ERROR
+            if self.is_full(t.number)
+            or (t.existence_log_odds > 0.0 and t.views >= SURE_VIEWS and _position_error(t) < LISTED_ERROR)
         ]
         for track in sorted(tracks, key=lambda t: (not self.is_full(t.number), -t.views, t.number)):
             if not any(_are_one(track, fruits.tracks[other.number]) for other in listed):
@@ -270,13 +279,17 @@ class Inspection:
     def _is_unscanned(self, aim: Aim) -> bool:
         return any(np.allclose(self.scan_places[k], aim.position_w) for k in self._unscanned)
 
-    def _shows(self, T_world_camera: Float64, place: int, intrinsics: CameraIntrinsics) -> bool:
-        """Whether a view holds a part of the row."""
-        x, y, z = T_world_camera[:3, :3].T @ (np.array(self.scan_places[place]) - T_world_camera[:3, 3])
+    def _shows(self, frame: PosedFrame, place: int) -> bool:
+        """Whether a view holds a part of the row, not hidden by what stands far in front of it."""
+        pose, camera = frame.T_world_camera, frame.intrinsics
+        x, y, z = pose[:3, :3].T @ (np.array(self.scan_places[place]) - pose[:3, 3])
         if not SCAN_RANGE[0] < z < SCAN_RANGE[1]:
             return False
-        u, v = intrinsics.fx * x / z + intrinsics.cx, intrinsics.fy * y / z + intrinsics.cy
-        return bool(0.0 < u < intrinsics.width and 0.0 < v < intrinsics.height)
+        column, row = int(camera.fx * x / z + camera.cx), int(camera.fy * y / z + camera.cy)
+        if not (0 <= column < camera.width and 0 <= row < camera.height):
+            return False
+        depth = float(frame.depth_m[row, column])
+        return bool(np.isfinite(depth) and depth > z - SCAN_DEPTH)
 
     def _follow_merged(self, fruits: FruitMap) -> None:
         """Gives what is known of tracks that others took in to these."""

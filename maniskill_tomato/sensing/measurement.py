@@ -39,6 +39,8 @@ class DetectedFruit:
     """Whether its depth was measured; if not, it is that of what is seen round it."""
     direction_w: Position
     """Unit vector from the camera through the middle of the visible pixels, world frame. Shape (3,)."""
+    redness: float = float("nan")
+    """(R - G) / (R + G) of the mean colour of the visible pixels; NaN without colours."""
 
     @property
     def is_ripe(self) -> bool:
