@@ -134,12 +134,16 @@ def _fruit(
     )
 
 
+DARK: Final = 30.0
+"""Sum of red and green below which a colour says nothing, of 510."""
+
+
 def _redness(frame: PosedFrame, mask: BinaryMask) -> float:
-    """(R - G) / (R + G) of the mean colour of a mask; NaN without colours."""
+    """(R - G) / (R + G) of the mean colour of a mask; NaN without colours, and where it is too dark to tell."""
     if frame.rgb is None:
         return float("nan")
     red, green, _ = frame.rgb[mask].mean(axis=0)
-    return float((red - green) / max(red + green, 1.0))
+    return float((red - green) / (red + green)) if red + green > DARK else float("nan")
 
 
 def _centre(

@@ -40,7 +40,7 @@ class DetectedFruit:
     direction_w: Position
     """Unit vector from the camera through the middle of the visible pixels, world frame. Shape (3,)."""
     redness: float = float("nan")
-    """(R - G) / (R + G) of the mean colour of the visible pixels; NaN without colours."""
+    """(R - G) / (R + G) of the mean colour of the visible pixels; NaN where that is not known."""
 
     @property
     def is_ripe(self) -> bool:

@@ -186,9 +186,10 @@ def test_unknown_ways_to_name_a_target_are_refused_with_what_is_allowed(
         make_world("TomatoViewpoint-v1", **options)
 
 
-def test_a_row_gives_a_place_for_each_target() -> None:
-    with pytest.raises(InvalidInputError, match="'map' in a row"):
-        make_world("TomatoViewpointRow-v1", perception="occlusion_model", target="any")
+@pytest.mark.parametrize("option", [{"target": "any"}, {"map_noise": 0.01}])
+def test_nobody_names_the_targets_of_a_row(option: dict[str, Any]) -> None:
+    with pytest.raises(InvalidInputError, match="chooses its targets itself"):
+        make_world("TomatoViewpointRow-v1", perception="occlusion_model", **option)
 
 
 def test_one_rendering_serves_all_environments_of_a_look() -> None:

@@ -321,3 +321,24 @@ def test_a_view_without_depth_is_judged_by_the_maps_sphere_alone() -> None:
     measured = DETECTOR.measure(half)
     assert not measured.fruits[0].is_depth_measured
     assert fruits.fraction(measured, 0, only(fruits)).value == pytest.approx(0.5, abs=0.1)
+
+
+def test_colour_tells_a_fruit_that_turns_from_a_ripe_one_where_the_segmenter_is_wrong() -> None:
+    camera = np.array(CAMERAS[0])
+    for redness, is_ripe in ((0.30, False), (0.64, True)):
+        fruits = FruitMap()
+        for called_ripe in (True, False, not is_ripe):
+            seen = replace(detection(FRUIT, camera, ripe=called_ripe), redness=redness)
+            fruits.update(view(CAMERAS[0], seen))
+        assert fruits.tracks[only(fruits)].is_ripe == is_ripe
+
+
+def test_the_redness_of_a_detection_is_that_of_its_visible_pixels() -> None:
+    frame = cast(CAMERAS[0], [FRUIT])
+    assert frame.true_fruits is not None
+    colours = np.full((*frame.depth_m.shape, 3), (40, 160, 60), np.uint8)
+    colours[frame.true_fruits.masks[0]] = (180, 60, 30)
+    (seen,) = DETECTOR.measure(replace(frame, rgb=colours)).fruits
+    assert seen.redness == pytest.approx((180 - 60) / (180 + 60))
+    (blind,) = DETECTOR.measure(frame).fruits
+    assert np.isnan(blind.redness)
