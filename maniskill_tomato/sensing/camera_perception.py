@@ -378,7 +378,7 @@ class CameraPerception:
             search.fraction = search.map.fraction(view.measurement, index, search.target)
         if search.centre is not None and np.linalg.norm(towards - search.centre) <= RECENTRE:
             return False
-        search.centre = np.round(np.asarray(towards, dtype=np.float64), CENTRE_DECIMALS)
+        search.centre = np.array([round(float(value), CENTRE_DECIMALS) for value in towards])
         return view is not None
 
     def _new_map(self) -> FruitMap:

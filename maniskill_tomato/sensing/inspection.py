@@ -18,8 +18,13 @@ from maniskill_tomato.sensing.measurement import Position
 from maniskill_tomato.sensing.posed_frame import PosedFrame
 from maniskill_tomato.sensing.view_lattice import ViewLattice
 
-LARGEST_ERROR: Final = 0.025
-"""A fruit whose place is less certain than this standard deviation of a coordinate, in [m], is not looked at yet."""
+SURE_ERROR: Final = 0.01
+"""Fruits whose place is more certain than this standard deviation of a coordinate, in [m], come before the parts of the
+row that no view has shown."""
+
+LARGEST_ERROR: Final = 0.02
+"""Less certain ones come after these; they are often slivers whose depth is that of a leaf. Those that are less certain
+than this, in [m], are not looked at."""
 
 LISTED_ERROR: Final = 0.01
 """A fruit that no view shows fully is listed when its place is more certain than this, in [m]."""
@@ -27,8 +32,14 @@ LISTED_ERROR: Final = 0.01
 LOST_AFTER: Final = 6
 """A fruit is given up after so many views in a row that do not show it."""
 
-SELDOM_SEEN: Final = 4
-"""One that fewer views have shown is given up after half as many: it may be none."""
+STALE_AFTER: Final = 8
+"""It is given up, too, after so many views in a row that do not show more of it than those before."""
+
+LITTLE: Final = 0.15
+"""One of which no view has shown more than this V_f is given up after half as many views: it may be none."""
+
+CHANCES: Final = 2
+"""A fruit whose place is sure is looked for again when nothing else is left, until it was given up so often."""
 
 SCAN_PLACES: Final[tuple[tuple[float, float, float], ...]] = tuple(
     (0.83, y, z) for z in (0.45, 0.68) for y in (-0.6, -0.36, -0.12, 0.12, 0.36, 0.6)
@@ -44,7 +55,7 @@ SCAN_DEPTH: Final = 0.12
 """In [m]: what is nearer to the place belongs to the same cluster of leaves and fruits."""
 
 SURE_VIEWS: Final = 3
-"""A fruit that no view shows fully is listed when so many views have detected it."""
+"""A fruit that so many views have detected is sure, and listed also if none of them shows it fully."""
 
 SOLID_SHARE: Final = 0.6
 """Centres of two fruits are at least this share of the sum of their radii apart; nearer ones are one fruit."""
@@ -125,13 +136,14 @@ class Inspection:
     """What the robot looks at now; None before the first view."""
     is_over: bool = False
     """Whether nothing is left to look at."""
-    given_up: set[int] = field(default_factory=set)
-    """Tracks that are not looked at any more."""
+    given_up: dict[int, int] = field(default_factory=dict)
+    """How often tracks were given up, by their numbers."""
 
     def __post_init__(self) -> None:
         self._best: dict[int, SeenView] = {}
         self._unscanned = set(range(len(self.scan_places)))
-        self._views = self._lost = 0
+        self._views = self._lost = self._stale = 0
+        self._most = 0.0
 
     def take_in(self, fruits: FruitMap, view: MappedView) -> list[int]:
         """Takes in a view that the map has taken in; returns the ripe tracks that are fully seen by it first."""
@@ -163,6 +175,9 @@ class Inspection:
         self._unscanned = {k for k in self._unscanned if not self._shows(frame, k)}
         target = None if self.aim is None else self.aim.track
         self._lost = 0 if target is None or target in view.tracks else self._lost + 1
+        shown = 0.0 if target is None or target not in self._best else self._best[target].fraction
+        self._stale = 0 if shown > self._most + 0.02 else self._stale + 1
+        self._most = max(self._most, shown)
         self._views += 1
         return [
             number
@@ -189,11 +204,11 @@ class Inspection:
             # A fruit that turned up is worth more than the rest of the scan.
             return moves > 0 or not self._is_unscanned(self.aim)
         track = fruits.tracks.get(number)
-        if track is None or not track.is_ripe or self.is_full(number) or number in self.given_up:
+        if track is None or not track.is_ripe or self.is_full(number):
             return True
-        patience = LOST_AFTER if track.views >= SELDOM_SEEN else LOST_AFTER // 2
-        if moves >= max_moves or self._lost >= patience:
-            self.given_up.add(number)
+        share = 0.5 if self._most < LITTLE else 1.0
+        if moves >= max_moves or self._lost >= share * LOST_AFTER or self._stale >= share * STALE_AFTER:
+            self.given_up[number] = self.given_up.get(number, 0) + 1
             return True
         return False
 
@@ -212,25 +227,34 @@ class Inspection:
             self._unscanned -= {
                 k for k, p in enumerate(self.scan_places) if np.allclose(p, self.aim.position_w)
             }
-        self._lost = 0
-        full = [track for track in fruits.tracks.values() if self.is_full(track.number)]
-        open_tracks = [
-            track
-            for track in fruits.tracks.values()
-            if self._is_open(track) and not any(_are_one(track, other) for other in full)
-        ]
-        positions = np.array([track.position_w for track in open_tracks]).reshape(-1, 3)
-        fits = lattice.in_reach(torch.as_tensor(positions, dtype=torch.float32, device=lattice.device))
-        near = [track for track, fit in zip(open_tracks, fits.tolist(), strict=True) if fit]
-        if near:
-            track = min(near, key=lambda t: float(np.linalg.norm(t.position_w - camera_position)))
+        near = self._open(fruits, lattice)
+        sure = [t for t in near if _position_error(t) < SURE_ERROR and t.number not in self.given_up]
+        new = [t for t in near if t.number not in self.given_up]
+        if sure or (near and not self._unscanned):
+            track = min(
+                sure or new or near, key=lambda t: float(np.linalg.norm(t.position_w - camera_position))
+            )
             self.aim = Aim(track.position_w.copy(), track.number)
+            self._lost = self._stale = 0
+            self._most = self._best[track.number].fraction if track.number in self._best else 0.0
         elif self._unscanned:
             places = [np.array(self.scan_places[k]) for k in sorted(self._unscanned)]
             self.aim = Aim(min(places, key=lambda p: float(np.linalg.norm(p - camera_position))), None)
         else:
             self.aim, self.is_over = None, True
         return self.aim
+
+    def _open(self, fruits: FruitMap, lattice: ViewLattice) -> list[Track]:
+        """The fruits in reach that are worth a look."""
+        full = [track for track in fruits.tracks.values() if self.is_full(track.number)]
+        tracks = [
+            track
+            for track in fruits.tracks.values()
+            if self._is_open(track) and not any(_are_one(track, other) for other in full)
+        ]
+        positions = np.array([track.position_w for track in tracks]).reshape(-1, 3)
+        fits = lattice.in_reach(torch.as_tensor(positions, dtype=torch.float32, device=lattice.device))
+        return [track for track, fit in zip(tracks, fits.tolist(), strict=True) if fit]
 
     def fruits(self, fruits: FruitMap) -> list[InspectedFruit]:
         """The inspection list: every fruit that there more likely is than not, those that were fully seen
@@ -268,12 +292,16 @@ class Inspection:
         )
 
     def _is_open(self, track: Track) -> bool:
+        is_sure, best = _position_error(track) < SURE_ERROR, self._best.get(track.number)
+        chances = CHANCES if is_sure and best is not None and best.fraction > LITTLE else 1
+        # Three views make the place of a fruit sure; they do not agree about that of a sliver.
+        largest = LARGEST_ERROR if track.views < SURE_VIEWS else SURE_ERROR
         return (
             track.is_ripe
             and track.existence_log_odds > 0.0
-            and _position_error(track) < LARGEST_ERROR
+            and _position_error(track) < largest
             and not self.is_full(track.number)
-            and track.number not in self.given_up
+            and self.given_up.get(track.number, 0) < chances
         )
 
     def _is_unscanned(self, aim: Aim) -> bool:
@@ -299,7 +327,11 @@ class Inspection:
             if now is not None and (now not in kept or seen.sure_fraction > kept[now].sure_fraction):
                 kept[now] = seen
         self._best = kept
-        self.given_up = {now for number in self.given_up if (now := fruits.current(number)) is not None}
+        given_up: dict[int, int] = {}
+        for number, times in self.given_up.items():
+            if (now := fruits.current(number)) is not None:
+                given_up[now] = max(times, given_up.get(now, 0))
+        self.given_up = given_up
         if self.aim is not None and self.aim.track is not None:
             now = fruits.current(self.aim.track)
             if now is not None:

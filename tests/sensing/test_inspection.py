@@ -138,15 +138,29 @@ def test_a_fruit_listed_twice_is_listed_once() -> None:
     assert [fruit.number for fruit in inspection().fruits(fruits)] == [1, 2]
 
 
-def test_a_fruit_that_no_view_shows_is_given_up_and_not_looked_at_again(lattice: ViewLattice) -> None:
+def test_a_fruit_that_no_view_shows_is_given_up(lattice: ViewLattice) -> None:
     row, fruits = inspection(), map_of(track(0, (0.8, 0.3, 0.5)))
     assert row.next(fruits, HERE, lattice) is not None
-    for _ in range(LOST_AFTER):
+    for _ in range(LOST_AFTER // 2):  # Half as many, because no view has shown anything of it.
         assert not row.is_done(fruits, 1, 20)
         row.take_in(fruits, fruits.update(view_of(None)))
         fruits.tracks[0] = track(0, (0.8, 0.3, 0.5))
     assert row.is_done(fruits, 1, 20)
-    assert row.next(fruits, HERE, lattice) is None
+    assert row.next(fruits, HERE, lattice) is None and row.is_over
+
+
+def test_a_fruit_that_was_half_seen_gets_another_chance_when_nothing_else_is_left(
+    lattice: ViewLattice,
+) -> None:
+    row, fruits = inspection(), FruitMap()
+    row.take_in(fruits, fruits.update(view_of(np.array([0.75, 0.02, 0.5]), hidden=0.5)))
+    (number,) = fruits.tracks
+    fruits.tracks[99] = track(99, (0.8, 0.3, 0.5))
+    looked_at = []
+    while (aim := row.next(fruits, HERE, lattice)) is not None:
+        looked_at.append(aim.track)
+        assert row.is_done(fruits, 20, 20)
+    assert looked_at == [number, 99, number]
 
 
 def test_a_fruit_is_given_up_after_its_moves(lattice: ViewLattice) -> None:
@@ -183,6 +197,6 @@ def test_knowledge_of_a_track_goes_over_to_the_one_that_takes_it_in() -> None:
     (number,) = fruits.tracks
     # A second track at the same place, from a view of something else, is one with the first.
     fruits.tracks[7] = track(7, (0.751, 0.02, 0.5), deviation=0.01)
-    row.given_up.add(7)
+    row.given_up[7] = 1
     row.take_in(fruits, fruits.update(view_of(None)))
-    assert fruits.current(7) == number and row.is_full(number) and row.given_up == {number}
+    assert fruits.current(7) == number and row.is_full(number) and row.given_up == {number: 1}
