@@ -92,10 +92,6 @@ class Track:
     """Of being a fruit at all."""
     views: int = 0
     """Views that it was detected in."""
-    best_fraction: float = 0.0
-    """Largest V_f of any view."""
-    best_pose: Float64 | None = None
-    """Pose of the optical frame of that view. Shape (4, 4)."""
     apart_from: set[int] = field(default_factory=set)
     """Numbers of tracks that were detected beside it in one view: they are other fruits."""
 
@@ -216,9 +212,7 @@ class FruitMap:
             self._merge()
             kept = {number: self.current(number) for number in assigned}
             names = {number: number if now is None else now for number, now in kept.items()}
-        view = MappedView(measurement=measurement, tracks=tuple(names[number] for number in assigned))
-        self._keep_best(view)
-        return view
+        return MappedView(measurement=measurement, tracks=tuple(names[number] for number in assigned))
 
     def sphere_of(self, fruit: DetectedFruit, camera: Position) -> tuple[Float64, Float64]:
         """A detection as a measurement of centre and radius.
@@ -409,8 +403,6 @@ class FruitMap:
             first.existence_log_odds = max(first.existence_log_odds, second.existence_log_odds)
             first.views += second.views
             first.apart_from |= second.apart_from
-            if second.best_fraction > first.best_fraction:
-                first.best_fraction, first.best_pose = second.best_fraction, second.best_pose
             self._merged[b] = a
             del self.tracks[b]
 
@@ -424,16 +416,6 @@ class FruitMap:
             return False
         density = -0.5 * distance - 0.5 * float(np.linalg.slogdet(2.0 * np.pi * spread)[1])
         return bool(density > self._new_density())
-
-    def _keep_best(self, view: MappedView) -> None:
-        for index, number in enumerate(view.tracks):
-            track = self.tracks.get(number)
-            if track is None:
-                continue
-            value = float(view.measurement.fruits[index].visible_fraction)
-            if np.isfinite(value) and value > track.best_fraction:
-                track.best_fraction = value
-                track.best_pose = view.measurement.frame.T_world_camera
 
     # ------------------------------------------------------------------- division
 
