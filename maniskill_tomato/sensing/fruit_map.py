@@ -14,14 +14,13 @@ from dataclasses import dataclass, field
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
 from scipy.stats import chi2
 
 from maniskill_tomato.robot.d435 import CameraIntrinsics
 from maniskill_tomato.segmentation.masks import BinaryMask
 from maniskill_tomato.sensing.measurement import DetectedFruit, Measurement, Position
-from maniskill_tomato.sensing.visible_fraction.estimate import Float64, filled_depth, fruit_depth
+from maniskill_tomato.sensing.visible_fraction.estimate import Float64
 from maniskill_tomato.sensing.visible_fraction.sphere import SphereConfig, whole_silhouette
 
 GATE: Final = float(chi2.ppf(0.9995, 4))
@@ -576,28 +575,10 @@ def _fused_fraction(measurement: Measurement, index: int, track: Track) -> float
     if circle is None:
         return float("nan")
     mask = measurement.mask(index)
-    measured = np.where(np.isfinite(frame.depth_m) & (frame.depth_m > 0), frame.depth_m, 0.0).astype(
-        np.float64
-    )
-    own = fruit_depth(measured, mask)
-    depth, fruits = _fruit_depths(measurement, measured)
+    depth, fruits, owns = measurement.depth_by_fruits
+    own = owns[index]
     # Without depth nobody knows what is hidden: all of the outline that is not seen counts.
     farthest = own + SphereConfig().edge_step_m if np.isfinite(own) else np.inf
     whole, outside = whole_silhouette(mask, circle, depth, farthest, own, fruits)
     visible = np.count_nonzero(mask)
     return float(min(visible / (np.count_nonzero(whole) + outside), 1.0))
-
-
-def _fruit_depths(
-    measurement: Measurement, measured: NDArray[np.float64]
-) -> tuple[Float64, NDArray[np.bool_]]:
-    """Depth without holes, each detection at one depth, and the pixels of all detections. Shapes (H, W)."""
-    depth = filled_depth(measured)
-    fruits = np.zeros(depth.shape, np.bool_)
-    for k in range(len(measurement.fruits)):
-        mask = measurement.mask(k)
-        own = fruit_depth(measured, mask)
-        if np.isfinite(own):
-            depth[mask] = own
-        fruits |= mask
-    return depth, fruits
