@@ -1,5 +1,6 @@
 """The plants of N environments: grown, shown, placed, and asked for their fruits."""
 
+from collections.abc import Mapping
 from functools import lru_cache
 
 import numpy as np
@@ -45,10 +46,8 @@ class PlantBatch:
         self._fruit_centre_p = torch.zeros(n, 1, 3, device=device)
         self._fruit_organ = torch.zeros(n, 1, dtype=torch.int64, device=device)
         seed = spec.seed if isinstance(spec.seed, int) else SEED_SPLITS[spec.seed][0]
-        first = grow(spec, seed)
-        self.plants, self.ripe_fruits = [first] * n, [[]] * n
-        for i in range(n):
-            self.show(i, seed)
+        self.plants, self.ripe_fruits = [grow(spec, seed)] * n, [[]] * n
+        self.show(dict.fromkeys(range(n), seed))
 
     @property
     def seeds(self) -> list[int]:
@@ -65,20 +64,25 @@ class PlantBatch:
         """Rotation about the vertical, in [rad]. Shape (N,)."""
         return self._state.plant_pose[:, 2]
 
-    def show(self, env_index: int, seed: int) -> Plant:
-        """Gives an environment the plant of a seed, and returns it."""
-        plant = self.plants[env_index] = grow(self.spec, seed)
-        self._state.plant_seed[env_index] = seed
-        missing = len(plant.fruits) - self._fruit_centre_p.shape[1]
-        if missing > 0:
-            self._fruit_centre_p = pad(self._fruit_centre_p, (0, 0, 0, missing))
-            self._fruit_organ = pad(self._fruit_organ, (0, missing))
-        count = len(plant.fruits)
-        centres = np.array([fruit.centre for fruit in plant.fruits], dtype=np.float32).reshape(-1, 3)
-        self._fruit_centre_p[env_index, :count] = torch.as_tensor(centres, device=self._device)
-        self._fruit_organ[env_index, :count] = torch.tensor([fruit.organ_index for fruit in plant.fruits])
-        self.ripe_fruits[env_index] = [j for j, f in enumerate(plant.fruits) if f.ripeness == "ripe"]
-        return plant
+    def show(self, seeds: Mapping[int, int]) -> dict[int, Plant]:
+        """Gives environments the plants of seeds, by the environment's index, and returns the plants."""
+        shown = {env_index: grow(self.spec, seed) for env_index, seed in seeds.items()}
+        fruits = max((len(plant.fruits) for plant in shown.values()), default=0)
+        missing = max(fruits - self._fruit_centre_p.shape[1], 0)
+        self._fruit_centre_p = pad(self._fruit_centre_p, (0, 0, 0, missing))
+        self._fruit_organ = pad(self._fruit_organ, (0, missing))
+        centres = np.zeros((len(shown), self._fruit_centre_p.shape[1], 3), np.float32)
+        organs = np.zeros(centres.shape[:2], np.int64)
+        for k, (env_index, plant) in enumerate(shown.items()):
+            self.plants[env_index] = plant
+            self.ripe_fruits[env_index] = [j for j, f in enumerate(plant.fruits) if f.ripeness == "ripe"]
+            for j, fruit in enumerate(plant.fruits):
+                centres[k, j], organs[k, j] = fruit.centre, fruit.organ_index
+        rows = torch.tensor(list(shown), dtype=torch.int64, device=self._device)
+        self._fruit_centre_p[rows] = torch.as_tensor(centres, device=self._device)
+        self._fruit_organ[rows] = torch.as_tensor(organs, device=self._device)
+        self._state.plant_seed[rows] = torch.tensor(list(seeds.values()), device=self._device)
+        return shown
 
     def place(self, env_idx: Tensor, pose: Tensor) -> None:
         """Puts the plants of some environments somewhere else.

@@ -246,18 +246,19 @@ class World:
             return
         rngs = [self.rngs[i] for i in indices]
         if self.plant_batch.spec.changes:
-            for i, rng in zip(indices, rngs, strict=True):
-                seed = self.game.draw_plant(i, rng, options)
-                if self.swaps_plants:
-                    self.show_plant(i, seed)
+            drawn = {i: self.game.draw_plant(i, rng, options) for i, rng in zip(indices, rngs, strict=True)}
+            if self.swaps_plants:
+                self.show_plants(drawn)
         pose, noise = self._plant_pose.as_array(), self._plant_pose_noise
         self.place_plants(env_idx, np.stack([pose + noise * rng.uniform(-1.0, 1.0, 3) for rng in rngs]))
         self.game.begin(env_idx, rngs, options)
 
-    def show_plant(self, env_index: int, seed: int) -> None:
-        """Shows another plant in an environment."""
-        if seed != int(self.state.plant_seed[env_index]):
-            self.scene.replace_plant(env_index, self.plant_batch.show(env_index, seed))
+    def show_plants(self, seeds: Mapping[int, int]) -> None:
+        """Shows the plants of other seeds, by the index of the environment."""
+        shown = self.plant_batch.seeds
+        new = {i: seed for i, seed in seeds.items() if seed != shown[i]}
+        if new:
+            self.scene.replace_plants(self.plant_batch.show(new))
 
     def place_plants(self, env_idx: Tensor, poses: NDArray[np.float64]) -> None:
         """Puts plants at x, y [m] and yaw [rad]. Shape (b, 3)."""
@@ -481,8 +482,7 @@ class World:
         Raises:
             InvalidInputError: It does not fit.
         """
-        for i, seed in enumerate(saved["state"]["plant_seed"].tolist()):
-            self.show_plant(i, int(seed))
+        self.show_plants(dict(enumerate(saved["state"]["plant_seed"].tolist())))
         self.state.restore(saved["state"])
         self.seeds = [int(seed) for seed in saved["seeds"]]
         for rng, state in zip(self.rngs, saved["generators"], strict=True):

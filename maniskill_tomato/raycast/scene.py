@@ -3,10 +3,10 @@
 scene = RayScene(plants, intrinsics, robot_meshes=link_meshes())
 seen = scene.visibility(T_w_camera, target_fruit, T_w_plant, link_transforms(qpos))
 seen.visible_fraction, seen.any_visible
-scene.replace_plant(env_index, new_plant)
+scene.replace_plants({env_index: new_plant})
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Final
 
 import torch
@@ -96,17 +96,21 @@ class RayScene:
         """The plant that an environment shows."""
         return self._plants[env_index]
 
-    def replace_plant(self, env_index: int, plant: Plant) -> None:
-        """Shows another plant in one environment.
+    def replace_plants(self, plants: Mapping[int, Plant]) -> None:
+        """Shows other plants in some environments.
 
         Args:
-            env_index: Which environment, from 0 to N - 1.
-            plant: A plant object used lately is found again, a new one costs the time to sort its triangles.
+            plants: By the index of the environment, from 0 to N - 1. A plant object used lately is found again, a new
+                one costs the time to sort its triangles.
         """
-        if not 0 <= env_index < self.num_envs:
-            raise InvalidInputError(f"env_index must be from 0 to {self.num_envs - 1}, got {env_index}")
-        self._rays.show(env_index, plant)
-        self._plants[env_index] = plant
+        for env_index in plants:
+            if not 0 <= env_index < self.num_envs:
+                raise InvalidInputError(
+                    f"plants must be keyed by environments from 0 to {self.num_envs - 1}, got {env_index}"
+                )
+        self._rays.show(plants)
+        for env_index, plant in plants.items():
+            self._plants[env_index] = plant
 
     def visibility(
         self, T_w_camera: Tensor, target_fruit: Tensor, T_w_plant: Tensor, T_w_links: Tensor | None = None
@@ -131,37 +135,45 @@ class RayScene:
     def visible_fraction_from(
         self,
         T_w_camera: Tensor,
-        target_fruit: int,
+        target_fruit: Tensor | int,
         T_w_plant: Tensor,
         T_w_links: Tensor | None = None,
-        env_index: int = 0,
+        env_idx: Tensor | int = 0,
     ) -> Tensor:
-        """V_f of one fruit from K viewpoints, the same numbers that `visibility` gives one by one.
+        """V_f from K viewpoints, the same numbers that `visibility` gives one by one.
+
+        A number and a single pose of the plant are for all viewpoints.
 
         Args:
             T_w_camera: Poses of the optical frames, translation in [m]. Shape (K, 4, 4).
-            target_fruit: Index into the plant's `fruits`.
-            T_w_plant: Pose of the plant. Shape (4, 4).
+            target_fruit: Index into the plant's `fruits`. A number or shape (K,).
+            T_w_plant: Pose of the plant. Shape (4, 4) or (K, 4, 4).
             T_w_links: Poses of `iiwa14.LINK_NAMES` for each viewpoint; None for no robot. Shape (K, 9, 4, 4).
-            env_index: Which environment shows the plant.
+            env_idx: Which environment shows the plant. A number or shape (K,).
 
         Returns:
             V_f in [0, 1]. Shape (K,).
 
         Raises:
-            InvalidInputError: A shape does not fit, or the fruit or the environment does not exist.
+            InvalidInputError: A shape does not fit, or a fruit or an environment does not exist.
         """
         count = T_w_camera.shape[0] if T_w_camera.dim() == 3 else 0
         _check_shape("T_w_camera", T_w_camera, (count, 4, 4))
-        _check_shape("T_w_plant", T_w_plant, (4, 4))
+        _check_shape("T_w_plant", T_w_plant, (4, 4) if T_w_plant.dim() == 2 else (count, 4, 4))
         if T_w_links is not None:
             _check_shape("T_w_links", T_w_links, (count, *self._links_shape[1:]))
-        if not 0 <= env_index < self.num_envs:
-            raise InvalidInputError(f"env_index must be from 0 to {self.num_envs - 1}, got {env_index}")
-        fruits = len(self._plants[env_index].fruits)
-        if not 0 <= target_fruit < fruits:
-            raise InvalidInputError(f"target_fruit must be from 0 to {fruits - 1}, got {target_fruit}")
-        return self._rays.visible_fraction_from(T_w_camera, target_fruit, T_w_plant, T_w_links, env_index)
+        targets = torch.as_tensor(target_fruit, device=self._device)
+        environments = torch.as_tensor(env_idx, device=self._device)
+        for name, numbers in (("target_fruit", targets), ("env_idx", environments)):
+            _check_shape(name, numbers, (count,) if numbers.dim() else ())
+        pairs = torch.stack([environments.expand(count), targets.expand(count)], dim=-1)
+        for env, target in {(int(env), int(target)) for env, target in pairs.tolist()}:
+            if not 0 <= env < self.num_envs:
+                raise InvalidInputError(f"env_idx must be from 0 to {self.num_envs - 1}, got {env}")
+            fruits = len(self._plants[env].fruits)
+            if not 0 <= target < fruits:
+                raise InvalidInputError(f"target_fruit must be from 0 to {fruits - 1}, got {target}")
+        return self._rays.visible_fraction_from(T_w_camera, targets, T_w_plant, T_w_links, environments)
 
     def view_rays(
         self,

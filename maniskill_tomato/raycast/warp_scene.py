@@ -7,7 +7,7 @@ A query copies its arguments into tensors that recorded kernels read in place, r
 clones what they wrote. Each kind of query is recorded when it is first made.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Final
 
@@ -35,7 +35,7 @@ from maniskill_tomato.raycast.images import (
 )
 from maniskill_tomato.raycast.view_rays import NEAREST_DEPTH, RANGE, RAYS_PER_SIDE, ViewRays, ray_pattern
 from maniskill_tomato.raycast.visibility import Visibility, ray_lattice
-from maniskill_tomato.raycast.warp_meshes import LinkMeshes, LinkTriangles, PlantMeshCache, PlantMeshes
+from maniskill_tomato.raycast.warp_meshes import LinkMeshes, LinkTriangles, PlantMeshCache
 from maniskill_tomato.robot.d435 import CAMERA_FAR, CameraIntrinsics
 from maniskill_tomato.robot.iiwa14 import LINK_NAMES
 from maniskill_tomato.robot.spheres import sphere_table
@@ -88,16 +88,19 @@ class WarpScene:
         self._first_view = _Views(1, self._links.count, device)
         self._finish_work()
 
-    def show(self, env_index: int, plant: Plant) -> None:
-        """Shows another plant in one environment, once all queries under way are done."""
-        meshes = self._cache.get(plant)
+    def show(self, plants: Mapping[int, Plant]) -> None:
+        """Shows other plants in some environments, once all queries under way are done."""
+        if not plants:
+            return
+        meshes = {env: self._cache.get(plant) for env, plant in plants.items()}
         # A new mesh is built in Warp's stream, and an old one must outlive the casts still under way with it.
         self._finish_work()
-        self._shown[env_index] = meshes
-        if len(meshes.fruits) > self._fruit_meshes.shape[1]:
+        for env, shown in meshes.items():
+            self._shown[env] = shown
+        if max(len(shown.fruits) for shown in meshes.values()) > self._fruit_meshes.shape[1]:
             self._allocate_tables()
         else:
-            self._write_row(env_index, meshes)
+            self._write_rows(list(meshes))
 
     def visibility(
         self, T_w_camera: Tensor, target_fruit: Tensor, T_w_plant: Tensor, T_w_links: Tensor | None
@@ -111,22 +114,24 @@ class WarpScene:
     def visible_fraction_from(
         self,
         T_w_camera: Tensor,
-        target_fruit: int,
+        target_fruit: Tensor,
         T_w_plant: Tensor,
         T_w_links: Tensor | None,
-        env_index: int,
+        env_idx: Tensor,
     ) -> Tensor:
-        """See `RayScene.visible_fraction_from`."""
+        """See `RayScene.visible_fraction_from`; the numbers are tensors of shape () or (K,)."""
         if self._many_views is None:
             self._many_views = _Views(VIEWS_AT_ONCE, self._links.count, self._device)
         views, count = self._many_views, T_w_camera.shape[0]
         recorded = self._recorded(self._record_visibility, views)
-        views.environments.fill_(env_index)
+        targets, environments = target_fruit.expand(count), env_idx.expand(count)
+        T_w_plants = T_w_plant.expand(count, 4, 4)
         answers = torch.empty(count, device=self._device)
         for first in range(0, count, VIEWS_AT_ONCE):
             part = slice(first, min(first + VIEWS_AT_ONCE, count))
             links = None if T_w_links is None else T_w_links[part]
-            views.place(T_w_camera[part], target_fruit, T_w_plant, links)
+            views.environments[: part.stop - first] = environments[part]
+            views.place(T_w_camera[part], targets[part], T_w_plants[part], links)
             recorded.launch(part.stop - first)
             answers[part] = recorded.outputs[0][0, : part.stop - first]
         return answers
@@ -226,8 +231,7 @@ class WarpScene:
         self._fruit_meshes = torch.zeros((n, fruits), dtype=torch.int64, device=device)
         self._fruit_spheres = torch.zeros((n, fruits, 4), device=device)
         self._fruit_is_ripe = torch.zeros((n, fruits), dtype=torch.int32, device=device)
-        for env, meshes in enumerate(self._shown):
-            self._write_row(env, meshes)
+        self._write_rows(range(n))
         self._scene.plant_meshes = wp.from_torch(self._plant_meshes, dtype=wp.uint64)
         self._scene.fruit_counts = wp.from_torch(self._fruit_counts)
         self._scene.fruit_meshes = wp.from_torch(self._fruit_meshes, dtype=wp.uint64)
@@ -235,14 +239,24 @@ class WarpScene:
         self._scene.fruit_is_ripe = wp.from_torch(self._fruit_is_ripe)
         self._kept: dict[tuple[Any, ...], _Recorded] = {}
 
-    def _write_row(self, env: int, meshes: PlantMeshes) -> None:
-        count = len(meshes.fruits)
-        self._plant_meshes[env] = meshes.whole.id
-        self._fruit_counts[env] = count
-        self._fruit_meshes[env, :count] = torch.tensor([mesh.id for mesh in meshes.fruits])
-        self._fruit_spheres[env, :count] = torch.from_numpy(meshes.spheres)
-        self._fruit_is_ripe[env] = 0
-        self._fruit_is_ripe[env, :count] = torch.from_numpy(meshes.is_ripe)
+    def _write_rows(self, envs: Sequence[int]) -> None:
+        shown, fruits = [self._shown[env] for env in envs], self._fruit_meshes.shape[1]
+        ids = np.zeros((len(envs), fruits), np.int64)
+        spheres = np.zeros((len(envs), fruits, 4), np.float32)
+        is_ripe = np.zeros((len(envs), fruits), np.int32)
+        for k, meshes in enumerate(shown):
+            count = len(meshes.fruits)
+            ids[k, :count] = [mesh.id for mesh in meshes.fruits]
+            spheres[k, :count], is_ripe[k, :count] = meshes.spheres, meshes.is_ripe
+        rows = torch.tensor(list(envs), device=self._device)
+        for table, values in (
+            (self._plant_meshes, torch.tensor([meshes.whole.id for meshes in shown])),
+            (self._fruit_counts, torch.tensor([len(meshes.fruits) for meshes in shown], dtype=torch.int32)),
+            (self._fruit_meshes, torch.from_numpy(ids)),
+            (self._fruit_spheres, torch.from_numpy(spheres)),
+            (self._fruit_is_ripe, torch.from_numpy(is_ripe)),
+        ):
+            table[rows] = values.to(self._device)
 
     def _zeros(self, *shape: int, dtype: torch.dtype = torch.float32) -> Tensor:
         return torch.zeros(shape, dtype=dtype, device=self._device)
@@ -416,15 +430,18 @@ class _Views:
             T_w_links: Shape (K, 9, 4, 4), or (9, 4, 4) for one; None for no robot.
         """
         count = T_w_camera.shape[0] if T_w_camera.dim() == 3 else 1
-        whole = count == self.count
-        (self._camera_poses if whole else self._camera_poses[:count]).copy_(T_w_camera)
-        self._plant_poses.copy_(T_w_plant)
+        tables = self._camera_poses, self._plant_poses, self._targets, self._link_poses
+        cameras, plants, targets, links = (
+            tables if count == self.count else (table[:count] for table in tables)
+        )
+        cameras.copy_(T_w_camera)
+        plants.copy_(T_w_plant)
         if isinstance(target_fruit, int):
-            self._targets.fill_(target_fruit)
+            targets.fill_(target_fruit)
         else:
-            self._targets.copy_(target_fruit)
+            targets.copy_(target_fruit)
         if T_w_links is not None:
-            (self._link_poses if whole else self._link_poses[:count]).copy_(T_w_links)
+            links.copy_(T_w_links)
             self._robot_present = True
         elif self._robot_present:
             self._link_poses.copy_(self._links_away)

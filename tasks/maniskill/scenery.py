@@ -75,6 +75,8 @@ class PlantScene:
     """One kinematic actor for every organ of the plants, where pictures are made; the numbers of both otherwise.
 
     Without actors another plant takes an environment's place at once. The segmentation ids are the same either way.
+    Leaves and stems as one actor each were tried: the scene of a row was built in 19 ms instead of 24, a step and a
+    picture took as long as before, and leaves lost their ids.
     """
 
     def __init__(self, scene: ManiSkillScene, plant_batch: PlantBatch, *, with_actors: bool) -> None:

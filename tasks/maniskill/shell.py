@@ -147,8 +147,7 @@ class TomatoEnv(BaseEnv):  # type: ignore[misc]
         world = self.world
         self._hand_over_generators()
         if self._has_actors and world.plant_batch.spec.changes:
-            for i, rng in enumerate(world.rngs):
-                world.show_plant(i, world.game.draw_plant(i, rng, options))
+            world.show_plants({i: world.game.draw_plant(i, rng, options) for i, rng in enumerate(world.rngs)})
         world.swaps_plants = not self._has_actors
         self._plants = scenery.PlantScene(self.scene, world.plant_batch, with_actors=self._has_actors)
         world.first_organ_id = torch.tensor(

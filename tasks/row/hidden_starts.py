@@ -40,8 +40,38 @@ class Start:
     """Whether V_f is in the task's range; if not, no drawn start was and this is the nearest to it."""
 
 
+@dataclass(frozen=True, eq=False)
+class StartRequest:
+    """The environment that a start is drawn for."""
+
+    env_index: int
+    """Which environment."""
+    rng: np.random.RandomState
+    """Its generator."""
+    targets: Sequence[int]
+    """Indices of the fruits to choose from."""
+    target_positions: Tensor
+    """Their centres, world frame, in [m]. Shape (len(targets), 3)."""
+
+
+@dataclass(eq=False)
+class _Search:
+    """How far the drawing for one environment is."""
+
+    request: StartRequest
+    order: list[int]
+    """The targets in the order of their turns, as indices in the request's."""
+    turn: int = 0
+    """How many turns were taken."""
+    target: int = 0
+    """Whose candidates are looked from, as an index in the request's targets."""
+    cost: float = float("inf")
+    """How far V_f of the best start so far is off."""
+    best: Start | None = None
+
+
 class HardStarts:
-    """Draws starts for one environment at a time."""
+    """Draws starts, for many environments at once."""
 
     def __init__(self, task: GeneralTaskConfig, scene: RayScene, device: torch.device) -> None:
         """Keeps the ranges.
@@ -58,109 +88,129 @@ class HardStarts:
         self._mover = LookAtMover(device)
         self._ready = torch.tensor(READY_QPOS, dtype=torch.float64, device=device)
 
-    def draw(
-        self,
-        env_index: int,
-        rng: np.random.RandomState,
-        targets: Sequence[int],
-        target_positions: Tensor,
-        T_world_plant: Tensor,
-    ) -> Start:
-        """A start from which one of the targets is hidden, reached by the arm and free of contact.
+    def draw(self, requests: Sequence[StartRequest], T_world_plant: Tensor) -> list[Start]:
+        """A start for each environment from which one of its targets is hidden, reached by the arm and free of contact.
 
         Positions are uniform over the box; the camera looks at the target with the picture upright. Targets take
-        turns in random order until one has such a start.
+        turns in random order until one has such a start. An environment's draws do not depend on the others.
 
         Args:
-            env_index: Which environment.
-            rng: Its generator.
-            targets: Indices of the fruits to choose from.
-            target_positions: Their centres, world frame, in [m]. Shape (len(targets), 3).
-            T_world_plant: Pose of the plant. Shape (4, 4).
+            requests: The environments, b of them.
+            T_world_plant: Poses of all environments' plants. Shape (N, 4, 4).
 
         Raises:
             InvalidInputError: There are no targets, or the arm reaches no start for any.
         """
-        if not targets:
+        if not all(request.targets for request in requests):
             raise InvalidInputError("the plant has no ripe fruit to look for; choose another preset or seed")
-        best: tuple[float, Start] | None = None
-        order = rng.permutation(len(targets))
-        for k in range(max(len(targets), MAX_DRAWS)):
-            chosen = int(order[k % len(targets)])
-            positions = rng.uniform(self._low, self._high, (CANDIDATES, 3))
-            found = self._first_hard(
-                env_index, targets[chosen], target_positions[chosen], positions, T_world_plant
-            )
-            if found is not None and (best is None or found[0] < best[0]):
-                best = found
-            if best is not None and best[1].is_hard:
-                return best[1]
-        if best is None:
-            raise InvalidInputError(
-                f"the arm can look at none of the {len(targets)} ripe fruits from the box {self._task.start_box} [m] "
-                "in front of the plant without touching it; move the plant with plant_pose"
-            )
-        return best[1]
+        searches = [_Search(r, r.rng.permutation(len(r.targets)).tolist()) for r in requests]
+        open_searches = searches
+        while open_searches:
+            self._take_turns(open_searches, T_world_plant)
+            open_searches = [
+                s for s in open_searches if s.cost > 0.0 and s.turn < max(len(s.request.targets), MAX_DRAWS)
+            ]
+        for search in searches:
+            if search.best is None:
+                raise InvalidInputError(
+                    f"the arm can look at none of the {len(search.order)} ripe fruits from the box "
+                    f"{self._task.start_box} [m] in front of the plant without touching it; move the plant with "
+                    "plant_pose"
+                )
+        return [search.best for search in searches if search.best is not None]
 
-    def given(self, camera_position: object, target: int, target_position: Tensor) -> Start:
-        """The start at a camera position, looking at the target; upright if the arm can, else turned.
+    def given(
+        self, camera_positions: Sequence[object], targets: Sequence[int], target_positions: Tensor
+    ) -> list[Start]:
+        """Starts at camera positions, looking at the targets; upright if the arm can, else turned.
+
+        Args:
+            camera_positions: Of each environment, b of them: three numbers each, world frame, in [m].
+            targets: Indices in `Plant.fruits`.
+            target_positions: Their centres, world frame, in [m]. Shape (b, 3).
 
         Raises:
-            InvalidInputError: It is not three finite numbers, or the arm cannot look at the target from there.
+            InvalidInputError: One is not three finite numbers, or the arm cannot look at the target from there.
         """
-        try:
-            values = np.asarray(camera_position, dtype=np.float64)
-        except (TypeError, ValueError):
-            values = np.zeros(0)
-        if values.shape != (3,) or not np.isfinite(values).all():
-            raise InvalidInputError(
-                f"reset option camera_position must be three finite numbers (x, y, z [m]); got {camera_position!r}"
-            )
-        move = self._look(torch.as_tensor(values, device=self._device)[None], target_position, None)
-        if int(move.reach[0]) != Reach.REACHABLE:
-            raise InvalidInputError(
-                f"the arm cannot look at the target from the reset option camera_position {camera_position!r}; give "
-                "one inside its workspace"
-            )
-        return Start(target, move.qpos[0].float(), move.T_world_camera[0].float(), True)
+        positions = torch.as_tensor(
+            np.stack([_checked_position(position) for position in camera_positions]), device=self._device
+        )
+        move = self._look(positions, target_positions.double(), None)
+        for position, reach in zip(camera_positions, move.reach.tolist(), strict=True):
+            if reach != int(Reach.REACHABLE):
+                raise InvalidInputError(
+                    f"the arm cannot look at the target from the reset option camera_position {position!r}; give "
+                    "one inside its workspace"
+                )
+        qpos, poses = move.qpos.float(), move.T_world_camera.float()
+        return [Start(target, qpos[k], poses[k], True) for k, target in enumerate(targets)]
 
-    def _look(self, positions: Tensor, target_position: Tensor, rolls: int | None) -> LookAtMove:
+    def _look(self, positions: Tensor, targets: Tensor, rolls: int | None) -> LookAtMove:
         reference = self._ready.expand(len(positions), 7)
-        target = target_position.double().expand(len(positions), 3)
-        return self._mover.look_from(reference, positions, target, rolls, largest_joint_step=10.0)
+        return self._mover.look_from(reference, positions, targets, rolls, largest_joint_step=10.0)
 
-    def _first_hard(
-        self,
-        env_index: int,
-        target: int,
-        target_position: Tensor,
-        draws: NDArray[np.float64],
-        T_world_plant: Tensor,
-    ) -> tuple[float, Start] | None:
-        """The first candidate in range, or the one nearest to it, with how far V_f is off; None if none is reached."""
-        low, high = self._task.start_visibility
-        stem = T_world_plant[:3, 3].double()
-        positions = torch.as_tensor(draws, device=self._device)
-        positions = positions + torch.stack([stem[0], stem[1], torch.zeros_like(stem[2])])
-        far_enough = (positions - target_position.double()).norm(dim=-1) >= self._task.start_distance
-        look = self._look(positions[far_enough], target_position, 1)
+    def _take_turns(self, searches: Sequence[_Search], T_world_plant: Tensor) -> None:
+        """Draws candidates for the next target of each search, and looks from them until one is in range."""
+        draws, target_positions = [], []
+        for search in searches:
+            search.target = search.order[search.turn % len(search.order)]
+            search.turn += 1
+            draws.append(search.request.rng.uniform(self._low, self._high, (CANDIDATES, 3)))
+            target_positions.append(search.request.target_positions[search.target])
+        env_idx = torch.tensor([search.request.env_index for search in searches], device=self._device)
+        base = T_world_plant[env_idx, :3, 3].double()
+        base[:, 2] = 0.0
+        positions = torch.as_tensor(np.stack(draws), device=self._device) + base[:, None]
+        targets = torch.stack(target_positions).double()[:, None].expand_as(positions)
+        far_enough = (positions - targets).norm(dim=-1) >= self._task.start_distance
+        owner = far_enough.nonzero()[:, 0]
+        look = self._look(positions[far_enough], targets[far_enough], 1)
         good = look.reach == int(Reach.REACHABLE)
-        all_qpos, all_poses = look.qpos[good].float(), look.T_world_camera[good].float()
-        nearest: tuple[float, Start] | None = None
-        for i in range(0, len(all_qpos), AT_ONCE):
-            qpos, poses = all_qpos[i : i + AT_ONCE], all_poses[i : i + AT_ONCE]
-            fraction = self._scene.visible_fraction_from(
-                poses, target, T_world_plant, link_transforms(qpos), env_index
-            )
-            env_idx = torch.full((len(qpos),), env_index, device=self._device)
-            clearance = self._scene.clearance_at(qpos, T_world_plant.expand(len(qpos), 4, 4), env_idx)
-            excess = torch.maximum(low - fraction, fraction - high).clamp_min(0.0)
-            is_hard = (fraction >= low) & (fraction < high)
-            cost = torch.where(clearance > 0.0, torch.where(is_hard, 0.0, excess + 1e-6), torch.inf)
-            k = int(cost.argmin())  # The first of equal ones.
-            value = float(cost[k])
-            if value < (nearest[0] if nearest else float("inf")):
-                nearest = (value, Start(target, qpos[k], poses[k], value == 0.0))
-            if value == 0.0:
-                break
-        return nearest
+        qpos, poses = look.qpos[good].float(), look.T_world_camera[good].float()
+        counts = torch.bincount(owner[good], minlength=len(searches)).tolist()
+        ends = np.cumsum(counts).tolist()
+        left = {
+            k: list(range(end - count, end)) for k, (end, count) in enumerate(zip(ends, counts, strict=True))
+        }
+        while left := {k: rows for k, rows in left.items() if rows and searches[k].cost > 0.0}:
+            rows = [(k, row) for k, own in left.items() for row in own[:AT_ONCE]]
+            chosen = torch.tensor([row for _, row in rows], device=self._device)
+            self._try([searches[k] for k, _ in rows], qpos[chosen], poses[chosen], T_world_plant)
+            left = {k: own[AT_ONCE:] for k, own in left.items()}
+
+    def _try(self, owners: Sequence[_Search], qpos: Tensor, poses: Tensor, T_world_plant: Tensor) -> None:
+        """Looks from candidates, and keeps for each search the first in range or the one nearest to it.
+
+        Args:
+            owners: Whose candidates they are, C of them.
+            qpos: In [rad]. Shape (C, 7).
+            poses: Of the optical frame. Shape (C, 4, 4).
+            T_world_plant: Of all environments. Shape (N, 4, 4).
+        """
+        low, high = self._task.start_visibility
+        env_idx = torch.tensor([s.request.env_index for s in owners], device=self._device)
+        targets = torch.tensor([s.request.targets[s.target] for s in owners], device=self._device)
+        plants = T_world_plant[env_idx]
+        fraction = self._scene.visible_fraction_from(poses, targets, plants, link_transforms(qpos), env_idx)
+        clearance = self._scene.clearance_at(qpos, plants, env_idx)
+        excess = torch.maximum(low - fraction, fraction - high).clamp_min(0.0)
+        is_hard = (fraction >= low) & (fraction < high)
+        costs = torch.where(clearance > 0.0, torch.where(is_hard, 0.0, excess + 1e-6), torch.inf).tolist()
+        for k, (search, cost) in enumerate(zip(owners, costs, strict=True)):
+            if cost < search.cost:  # The first of equal ones stays.
+                search.cost = cost
+                target = search.request.targets[search.target]
+                search.best = Start(target, qpos[k], poses[k], cost == 0.0)
+
+
+def _checked_position(camera_position: object) -> NDArray[np.float64]:
+    """The reset option `camera_position`. Shape (3,)."""
+    try:
+        values = np.asarray(camera_position, dtype=np.float64)
+    except (TypeError, ValueError):
+        values = np.zeros(0)
+    if values.shape != (3,) or not np.isfinite(values).all():
+        raise InvalidInputError(
+            f"reset option camera_position must be three finite numbers (x, y, z [m]); got {camera_position!r}"
+        )
+    return values

@@ -23,7 +23,7 @@ from maniskill_tomato.sensing.simulated_camera import Perception
 from maniskill_tomato.tasks import MAX_ROW_STEPS
 from maniskill_tomato.tasks.arm_moves import Plan
 from maniskill_tomato.tasks.row.episode_selection import EpisodeChoice
-from maniskill_tomato.tasks.row.hidden_starts import HardStarts, Start
+from maniskill_tomato.tasks.row.hidden_starts import HardStarts, Start, StartRequest
 from maniskill_tomato.tasks.row.row_config import CameraConfig, GeneralTaskConfig
 from maniskill_tomato.tasks.row.senses import ViewMeasurement, ViewPoses, make_senses
 from maniskill_tomato.tasks.row.target_sequence import TargetSequence, Transits, with_transits
@@ -107,10 +107,7 @@ class SearchGame:
         listed = [e for e in episodes if e is not None]
         if listed:
             world.place_plants(env_idx, np.array([e.plant_pose for e in listed]))
-        starts = [
-            self._start(i, rng, episode, options)
-            for i, rng, episode in zip(indices, rngs, episodes, strict=True)
-        ]
+        starts = self._draw_starts(indices, rngs, episodes, options)
         self.soft_starts += sum(not start.is_hard for start in starts)
         world.set_target(env_idx, [start.target for start in starts])
         poses = torch.stack([start.T_world_camera for start in starts]).double()
@@ -137,31 +134,48 @@ class SearchGame:
         state.fraction_before = torch.where(started, first, state.fraction_before)
         state.fraction_after = torch.where(started, first, state.fraction_after)
 
-    def _candidates(self, env_index: int) -> list[int]:
-        """The fruits that can become targets."""
+    def _candidates(self, indices: Sequence[int]) -> list[list[int]]:
+        """The fruits of some environments that can become targets."""
         if self.sequence is not None:
-            return self.sequence.in_reach(env_index)
-        plant, ripe = (
-            self._world.plant_batch.plants[env_index],
-            self._world.plant_batch.ripe_fruits[env_index],
-        )
-        return [j for j in ripe if j < plant.middle_fruits] if isinstance(plant, Row) else ripe
-
-    def _start(
-        self, env_index: int, rng: np.random.RandomState, episode: Episode | None, options: Mapping[str, Any]
-    ) -> Start:
+            return self.sequence.in_reach(indices)
         plant_batch = self._world.plant_batch
-        targets = [episode.target] if episode is not None else self._candidates(env_index)
-        camera_position = options.get("camera_position", None)
-        if camera_position is None and episode is not None:
-            camera_position = episode.camera_position
+        candidates = []
+        for i in indices:
+            plant, ripe = plant_batch.plants[i], plant_batch.ripe_fruits[i]
+            middle = plant.middle_fruits if isinstance(plant, Row) else len(plant.fruits)
+            candidates.append([j for j in ripe if j < middle])
+        return candidates
+
+    def _draw_starts(
+        self,
+        indices: Sequence[int],
+        rngs: Sequence[np.random.RandomState],
+        episodes: Sequence[Episode | None],
+        options: Mapping[str, Any],
+    ) -> list[Start]:
+        """Starts of some environments: the options', those of the list's episodes, or drawn ones."""
+        world, plant_batch = self._world, self._world.plant_batch
+        listed = [episode for episode in episodes if episode is not None]
         if "target" in options:
-            targets = [self._world.checked_target(env_index, options["target"])]
-        positions = plant_batch.fruit_positions_w(env_index, targets)
-        if camera_position is not None:
-            k = int(rng.randint(len(targets))) if len(targets) > 1 else 0
-            return self._starts.given(camera_position, targets[k], positions[k])
-        return self._starts.draw(env_index, rng, targets, positions, plant_batch.T_world_plant[env_index])
+            targets = [[world.checked_target(i, options["target"])] for i in indices]
+        else:
+            targets = [[episode.target] for episode in listed] or self._candidates(indices)
+        positions: Sequence[object] = [episode.camera_position for episode in listed]
+        if options.get("camera_position") is not None:
+            positions = [options["camera_position"]] * len(indices)
+        if positions:
+            chosen = [
+                t[int(rng.randint(len(t))) if len(t) > 1 else 0] for t, rng in zip(targets, rngs, strict=True)
+            ]
+            centres = [
+                plant_batch.fruit_positions_w(i, [fruit])[0] for i, fruit in zip(indices, chosen, strict=True)
+            ]
+            return self._starts.given(positions, chosen, torch.stack(centres))
+        requests = [
+            StartRequest(i, rng, t, plant_batch.fruit_positions_w(i, t))
+            for i, rng, t in zip(indices, rngs, targets, strict=True)
+        ]
+        return self._starts.draw(requests, plant_batch.T_world_plant)
 
     def _forget(self, env_idx: Tensor) -> None:
         """Begins with other targets. Shape (b,)."""

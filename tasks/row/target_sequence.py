@@ -1,5 +1,6 @@
 """One target of a row after the other: which are in reach, which is next, and how the arm gets there."""
 
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import Final, Literal, get_args
 
@@ -45,21 +46,22 @@ class TargetSequence:
         self._lattice = lattice
         self._planner = TransitPlanner(world.device)
 
-    def in_reach(self, env_index: int) -> list[int]:
-        """The ripe fruits that the arm can look at."""
+    def in_reach(self, indices: Sequence[int]) -> list[list[int]]:
+        """The ripe fruits of some environments that the arm can look at."""
         plant_batch = self._world.plant_batch
-        ripe = [j for j in plant_batch.ripe_fruits[env_index] if j < MAX_TARGETS]
-        reachable = self._lattice.reachable(plant_batch.fruit_positions_w(env_index, ripe))
-        shares = reachable.float().mean(dim=-1).tolist()
-        return [j for j, share in zip(ripe, shares, strict=True) if share >= REACHABLE_SHARE]
+        ripe = [[j for j in plant_batch.ripe_fruits[i] if j < MAX_TARGETS] for i in indices]
+        centres = [plant_batch.fruit_positions_w(i, own) for i, own in zip(indices, ripe, strict=True)]
+        shares = self._lattice.reachable(torch.cat(centres)).float().mean(dim=-1).tolist()
+        near = iter(share >= REACHABLE_SHARE for share in shares)
+        return [[j for j in own if next(near)] for own in ripe]
 
     def begin(self, env_idx: Tensor) -> None:
         """Begins rows whose first targets are chosen. Shape (b,)."""
-        state = self._world.state
+        state, indices = self._world.state, env_idx.tolist()
         state.open_targets[env_idx] = False
-        for i in env_idx.tolist():
-            state.open_targets[i, self.in_reach(i)] = True
-            state.open_targets[i, int(state.target[i])] = True
+        for i, near in zip(indices, self.in_reach(indices), strict=True):
+            state.open_targets[i, near] = True
+        state.open_targets[env_idx, state.target[env_idx]] = True
         state.target_count[env_idx] = state.open_targets[env_idx].sum(-1)
         state.seen_count[env_idx] = 0
         state.target_moves[env_idx] = 0

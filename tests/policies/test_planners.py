@@ -114,13 +114,13 @@ class FreeWorld(Truth):
         self, T_world_camera: Tensor, env_index: int = 0, qpos: Tensor | None = None
     ) -> Tensor:
         return self._scene.visible_fraction_from(
-            T_world_camera, self._fruit, self._T_world_plant, env_index=env_index
+            T_world_camera, self._fruit, self._T_world_plant, env_idx=env_index
         )
 
     def reset(self, *, seed: int, options: Any = None) -> tuple[Tensor, dict[str, Tensor]]:
         rng = np.random.default_rng(seed)
         plant = self._plants[int(rng.integers(len(self._plants)))]
-        self._scene.replace_plant(0, plant)
+        self._scene.replace_plants({0: plant})
         ripe = [i for i, f in enumerate(plant.fruits) if f.ripeness == "ripe" and 0.4 < f.centre[2] < 1.2]
         while True:
             self._fruit = int(rng.choice(ripe))
@@ -470,10 +470,11 @@ def test_the_oracle_says_where_nothing_can_be_seen() -> None:
     assert search.solve(torch.tensor([0.2, 0.0, 0.8]), torch.tensor([0.85, 0.0, 0.9]), most_moves=4) is None
 
 
-def test_no_planner_needs_fewer_moves_than_the_oracle(world: FreeWorld) -> None:
-    episodes = range(4)
+@pytest.mark.parametrize(("count", "fewest"), [(4, 3), pytest.param(8, 6, marks=pytest.mark.slow)])
+def test_no_planner_needs_fewer_moves_than_the_oracle(world: FreeWorld, count: int, fewest: int) -> None:
+    episodes = range(count)
     oracle = run(world, Oracle(OracleSearch(world, reachable=anywhere)), episodes)
-    assert sum(e.success for e in oracle) >= 3
+    assert sum(e.success for e in oracle) >= fewest
     planners = [
         RandomViewpoint(),
         FixedSweep(),

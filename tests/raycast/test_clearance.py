@@ -95,7 +95,7 @@ def test_clearance_follows_a_replaced_plant() -> None:
     rng = np.random.default_rng(0)
     q = joints(rng)[:1]
     before = scene.clearance_at(q, T[1:])
-    scene.replace_plant(0, plants()[1])
+    scene.replace_plants({0: plants()[1]})
     after = scene.clearance_at(q, T[1:])
     assert float(after[0]) == pytest.approx(slow_clearance(q[0], q[0], T[1], plants()[1]), abs=2e-5)
     assert not torch.equal(before, after)

@@ -238,7 +238,7 @@ def test_a_new_plant_is_seen_also_when_it_has_more_fruits(device: str) -> None:
 
     seen = targets_seen(0)
     assert seen >= 6 and float(scene.visible_fraction_from(pose, 0, plant_pose)) == 1.0
-    scene.replace_plant(0, two)
+    scene.replace_plants({0: two})
     assert targets_seen(1) == seen and float(scene.visible_fraction_from(pose, 1, plant_pose)) == 1.0
     # This fruit lies 31 degrees to the left, in the image still, and the pattern ends before.
     assert targets_seen(0) == 0 and float(scene.visible_fraction_from(pose, 0, plant_pose)) == 1.0
@@ -267,7 +267,7 @@ def test_many_views_at_once_have_the_visible_fractions_of_single_views(device: s
         centre = torch.from_numpy(plants[env_index].fruits[target].centre) + T_world_plant[:3, 3].cpu()
         cameras = random_cameras(centre, count).to(device)
         for given in (None, links):
-            at_once = scene.visible_fraction_from(cameras, target, T_world_plant, given, env_index=env_index)
+            at_once = scene.visible_fraction_from(cameras, target, T_world_plant, given, env_idx=env_index)
             for k in (0, VIEWS_AT_ONCE - 1, VIEWS_AT_ONCE, count - 1):
                 single = scene.visibility(
                     cameras[k : k + 1].expand(2, 4, 4),
@@ -280,12 +280,41 @@ def test_many_views_at_once_have_the_visible_fractions_of_single_views(device: s
     assert scene.visible_fraction_from(cameras[:0], 0, T_world_plant).shape == (0,)
 
 
+def test_views_of_several_environments_at_once_have_the_visible_fractions_of_each_alone(device: str) -> None:
+    plants = [generate_plant("three_tomatoes", seed, "training") for seed in (1, 2)]
+    scene = RayScene(plants, color_intrinsics(), device=device)
+    poses = torch.eye(4).repeat(2, 1, 1)
+    poses[:, :3, 3] = torch.tensor([[0.8, 0.1, 0.0], [0.9, -0.2, 0.05]])
+    centres = [
+        torch.from_numpy(plants[env].fruits[fruit].centre) + poses[env, :3, 3]
+        for env, fruit in ((0, 2), (1, 0))
+    ]
+    cameras = torch.cat([random_cameras(centre, 20) for centre in centres]).to(device)
+    env_idx = torch.tensor([0, 1] * 20).sort().values.to(device)
+    fruits = torch.where(env_idx == 0, 2, 0)
+    mixed = torch.randperm(40, generator=torch.Generator().manual_seed(2)).to(device)
+    poses = poses.to(device)
+    seen = scene.visible_fraction_from(
+        cameras[mixed], fruits[mixed], poses[env_idx[mixed]], env_idx=env_idx[mixed]
+    )
+    alone = torch.cat(
+        [
+            scene.visible_fraction_from(cameras[:20], 2, poses[0], env_idx=0),
+            scene.visible_fraction_from(cameras[20:], 0, poses[1], env_idx=1),
+        ]
+    )
+    assert torch.equal(seen, alone[mixed])
+    assert 0.05 < float(seen.mean()) < 0.95
+
+
 def test_views_that_do_not_exist_are_refused() -> None:
     scene = RayScene([ball_plant([(0.5, 0, 0)])], WIDE)
     pose = torch.eye(4)
     with pytest.raises(InvalidInputError, match=r"target_fruit must be from 0 to 0, got 1"):
         scene.visible_fraction_from(pose[None], 1, pose)
-    with pytest.raises(InvalidInputError, match=r"env_index must be from 0 to 0, got 2"):
-        scene.visible_fraction_from(pose[None], 0, pose, env_index=2)
-    with pytest.raises(InvalidInputError, match=r"T_w_plant must have shape \(4, 4\)"):
-        scene.visible_fraction_from(pose[None], 0, pose[None])
+    with pytest.raises(InvalidInputError, match=r"env_idx must be from 0 to 0, got 2"):
+        scene.visible_fraction_from(pose[None], 0, pose, env_idx=2)
+    with pytest.raises(InvalidInputError, match=r"T_w_plant must have shape \(1, 4, 4\)"):
+        scene.visible_fraction_from(pose[None], 0, pose.expand(2, 4, 4))
+    with pytest.raises(InvalidInputError, match=r"target_fruit must have shape \(1,\)"):
+        scene.visible_fraction_from(pose[None], torch.zeros(2, dtype=torch.int64), pose)

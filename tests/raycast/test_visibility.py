@@ -466,13 +466,13 @@ def test_a_replaced_plant_is_seen_in_its_environment_only(device: str) -> None:
         return scene.visibility(eye, torch.tensor(targets, device=device), eye).visible_fraction.tolist()
 
     assert fractions(0, 0) == [1.0, 1.0]
-    scene.replace_plant(1, hidden)
+    scene.replace_plants({1: hidden})
     assert fractions(0, 0) == [1.0, 0.0]
-    scene.replace_plant(0, many)
+    scene.replace_plants({0: many})
     assert scene.plant(0) is many
     assert fractions(2, 0) == [1.0, 0.0]
-    scene.replace_plant(0, hidden)
-    scene.replace_plant(1, free)
+    scene.replace_plants({0: hidden})
+    scene.replace_plants({1: free})
     assert fractions(0, 0) == [0.0, 1.0]
 
 
@@ -482,7 +482,7 @@ def test_plants_no_longer_shown_are_let_go() -> None:
     for _ in range(10):
         plant = make_plant([(ahead(), "ripe")])
         shown.append(weakref.ref(plant))
-        scene.replace_plant(0, plant)
+        scene.replace_plants({0: plant})
         del plant
     gc.collect()
     assert [ref() is not None for ref in shown] == [False] * 7 + [True] * 3
@@ -512,8 +512,8 @@ def test_input_that_cannot_be_used_is_refused_with_a_reason() -> None:
     for wrong in (-1, 1):
         with pytest.raises(InvalidInputError, match=rf"target_fruit\[0\] must be from 0 to 0.*got {wrong}"):
             scene.visibility(eye, torch.tensor([wrong]), eye)
-    with pytest.raises(InvalidInputError, match="env_index must be from 0 to 0, got 1"):
-        scene.replace_plant(1, plant)
+    with pytest.raises(InvalidInputError, match="plants must be keyed by environments from 0 to 0, got 1"):
+        scene.replace_plants({1: plant})
 
 
 @pytest.mark.gpu

@@ -27,7 +27,7 @@ def test_visible_fraction_position_and_radius_are_near_the_truth() -> None:
     for episode in (episodes[i] for i in (21, 34, 55)):
         plant = ROW_PLANT.grow(episode.plant_seed)
         scene = scene or RayScene([plant], color_intrinsics(320, 240), rays_per_side=48)
-        scene.replace_plant(0, plant)
+        scene.replace_plants({0: plant})
         camera, detector = SimulatedCamera(scene), FruitDetector(None)
         fruit = plant.fruits[episode.target]
         centre = torch.as_tensor(np.asarray(fruit.centre, np.float64))[None]

@@ -14,7 +14,6 @@ from typing import Any, Literal
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from torchvision.ops import box_iou
 
 from maniskill_tomato.errors import InvalidInputError, MissingPackageError
 from maniskill_tomato.segmentation.datasets.annotations import (
@@ -93,6 +92,8 @@ def without_narrow(found: Instances, truth: ImageTruth, threshold: float = 0.5) 
         truth: The fruits in it.
         threshold: Least intersection over union with a fruit of a narrow detection that stays.
     """
+    from torchvision.ops import box_iou  # Not needed by those who import this module for its masks.
+
     sides = (found.boxes[:, 2:] - found.boxes[:, :2]).min(axis=1, initial=np.inf)
     fruits = torch.from_numpy(truth.boxes[~truth.ignored])
     overlaps = box_iou(torch.from_numpy(found.boxes).double(), fruits).numpy()
