@@ -355,7 +355,8 @@ class CameraPerception:
             search.fraction = search.map.fraction(view.measurement, index, search.target)
         if search.centre is not None and np.linalg.norm(towards - search.centre) <= RECENTRE:
             return False
-        search.centre = np.array(towards, dtype=np.float64)
+        # Whole millimetres: the errors of rounding of a fit do not shift the memory's voxels.
+        search.centre = np.round(np.array(towards, dtype=np.float64), 3)
         return view is not None
 
     def _new_map(self) -> FruitMap:
