@@ -356,7 +356,7 @@ class CameraPerception:
         if search.centre is not None and np.linalg.norm(towards - search.centre) <= RECENTRE:
             return False
         # Whole millimetres: the errors of rounding of a fit do not shift the memory's voxels.
-        search.centre = np.round(np.array(towards, dtype=np.float64), 3)
+        search.centre = np.round(1000.0 * np.asarray(towards, dtype=np.float64)) / 1000.0
         return view is not None
 
     def _new_map(self) -> FruitMap:
