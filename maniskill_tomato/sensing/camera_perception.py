@@ -28,10 +28,6 @@ MAP_NOISE: Final = 0.03
 RECENTRE: Final = CELL_SIZE / 4
 """Memory and rays are centred anew when the target turns out to be farther than this from their centre, in [m]."""
 
-CENTRE_DECIMALS: Final = 4
-"""The centre is a place of this many decimals in [m], so that rounding of the last digit of a joint does not move all
-voxels of a memory."""
-
 SCAN_DEPTH: Final = 0.5
 """How far in front of the camera a robot looks that has seen no fruit yet, in [m]."""
 
@@ -378,7 +374,8 @@ class CameraPerception:
             search.fraction = search.map.fraction(view.measurement, index, search.target)
         if search.centre is not None and np.linalg.norm(towards - search.centre) <= RECENTRE:
             return False
-        search.centre = np.array([round(float(value), CENTRE_DECIMALS) for value in towards])
+        # Whole millimetres: the errors of rounding of a fit do not shift the memory's voxels.
+        search.centre = np.round(1000.0 * np.asarray(towards, dtype=np.float64)) / 1000.0
         return view is not None
 
     def _new_map(self) -> FruitMap:

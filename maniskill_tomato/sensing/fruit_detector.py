@@ -120,13 +120,17 @@ def _fruit(
     ray = frame.intrinsics.ray_directions(pixel)
     rotation = frame.T_world_camera[:3, :3]
     centre = _centre(estimate, view, mask, ray)
+    if centre is None:
+        # Where neither it nor what is round it has depth, its size tells how far away it is.
+        distance = USUAL_RADIUS * frame.intrinsics.fx / (0.5 * max(crop.shape))
+        centre = ray * distance
     return DetectedFruit(
         category=category,
         score=score,
         corner=(top, left),
         crop=crop,
         visible_fraction=estimate.visible_fraction,
-        centre_w=None if centre is None else rotation @ centre + frame.T_world_camera[:3, 3],
+        centre_w=rotation @ centre + frame.T_world_camera[:3, 3],
         radius_m=estimate.radius_m,
         is_depth_measured=bool(np.isfinite(fruit_depth(view.depth_m, mask))),
         direction_w=rotation @ (ray / np.linalg.norm(ray)),

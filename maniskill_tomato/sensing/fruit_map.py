@@ -233,12 +233,10 @@ class FruitMap:
         lateral = few * (c.lateral_error_m * np.exp(c.lateral_growth * hidden)) ** 2
         along = few * (c.depth_error_m * np.exp(c.depth_growth * hidden)) ** 2
         radius = few * (c.radius_error_m * np.exp(c.radius_growth * hidden)) ** 2
-        if not fruit.is_depth_measured:
-            along, radius = UNMEASURED_DEPTH**2, c.radius_spread_m**2 + radius
         centre, radius_m = fruit.centre_w, fruit.radius_m
-        if centre is None:
-            # Nearer than the depth camera measures: somewhere in front of the lens.
-            centre, along = camera + NEAR_CENTRE * fruit.direction_w, NEAR_CENTRE**2
+        if not fruit.is_depth_measured:
+            along = max(UNMEASURED_DEPTH, UNMEASURED_SHARE * float(np.linalg.norm(centre - camera))) ** 2
+            radius += c.radius_spread_m**2
         if not np.isfinite(radius_m):
             radius_m, radius = c.usual_radius_m, c.radius_spread_m**2
         away = (centre - camera) / max(float(np.linalg.norm(centre - camera)), 1e-9)
@@ -268,6 +266,8 @@ class FruitMap:
         if np.isfinite(fused):
             # What is not known of the radius counts as far as something hides the outline.
             radius = 2.0 * float(np.sqrt(track.covariance[3, 3])) / track.radius_m * fused * (1.0 - fused)
+            if not fruit.is_depth_measured:
+                radius += _outline_error(measurement, track) * fused
             parts.append((fused, float(np.hypot(fraction_error(fused, c.fused_error), radius))))
         if not parts:
             return Fraction(value=0.0, error=1.0, single=single, fused=fused)
@@ -459,11 +459,11 @@ class FruitMap:
         return parts if len(parts) > 1 else None
 
 
-NEAR_CENTRE: Final = 0.1
-"""How far from the camera the centre of a fruit without depth is taken to be, in [m]."""
-
 UNMEASURED_DEPTH: Final = 0.1
-"""Standard deviation of a depth that is not the fruit's own but of what is seen round it, in [m]."""
+"""Least standard deviation of a distance that was not measured on the fruit itself, in [m]."""
+
+UNMEASURED_SHARE: Final = 0.2
+"""The same as a share of the distance: sizes of fruits differ by 0.14, and part of the fruit may be hidden."""
 
 FARTHEST_RAY: Final = 4.0
 """A track's detections have their middle at most so many radii beside its centre."""
@@ -566,6 +566,15 @@ def _covered(mask: BinaryMask, circle: tuple[float, float, float]) -> float:
     u, v = np.meshgrid(np.arange(left, right) + 0.5, np.arange(top, bottom) + 0.5)
     disc = (u - x) ** 2 + (v - y) ** 2 < radius**2
     return float(np.count_nonzero(mask[top:bottom, left:right] & disc) / (np.pi * radius**2))
+
+
+def _outline_error(measurement: Measurement, track: Track) -> float:
+    """Standard error of the size of a track's outline in a view, as a share of its area."""
+    away = track.position_w - measurement.camera_position
+    distance = float(np.linalg.norm(away))
+    towards = away / distance
+    along = float(np.sqrt(towards @ track.covariance[:3, :3] @ towards))
+    return 2.0 * along / distance
 
 
 def _fused_fraction(measurement: Measurement, index: int, track: Track) -> float:

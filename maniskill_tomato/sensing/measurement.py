@@ -33,12 +33,12 @@ class DetectedFruit:
     """Visible pixels in the smallest box that holds them."""
     visible_fraction: float
     """V_f as estimated; NaN where the estimator failed."""
-    centre_w: Position | None
-    """Centre in the world frame, in [m]; None where the picture has no depth of the fruit. Shape (3,)."""
+    centre_w: Position
+    """Centre in the world frame, in [m]; without depth, as far away as a usual fruit of its size. Shape (3,)."""
     radius_m: float
     """Radius in [m]; NaN where it is not known."""
     is_depth_measured: bool
-    """Whether its depth was measured; if not, it is that of what is seen round it."""
+    """Whether its depth was measured; if not, it is that of what is seen round it, or follows from its size."""
     direction_w: Position
     """Unit vector from the camera through the middle of the visible pixels, world frame. Shape (3,)."""
     redness: float = float("nan")

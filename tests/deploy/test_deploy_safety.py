@@ -1,5 +1,6 @@
 """The envelope: what is refused and why, and that nothing outside it reaches an arm."""
 
+from dataclasses import FrozenInstanceError, replace
 from typing import Any
 
 import mujoco
@@ -8,6 +9,7 @@ import pytest
 import torch
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
+from scipy.optimize import brentq
 
 from maniskill_tomato.deploy.clock import SimulatedClock
 from maniskill_tomato.deploy.collision import Box, CollisionChecker
@@ -15,7 +17,7 @@ from maniskill_tomato.deploy.deploy_errors import DeviceTimeoutError, FaultError
 from maniskill_tomato.deploy.guarded_arm import GuardedArm
 from maniskill_tomato.deploy.interface import Arm, ArmState, JointMove
 from maniskill_tomato.deploy.plant_points import sphere_distances
-from maniskill_tomato.deploy.safety import Safety, SafetyConfig, joint_path
+from maniskill_tomato.deploy.safety import Refusal, Safety, SafetyConfig, joint_path
 from maniskill_tomato.errors import InvalidInputError
 from maniskill_tomato.robot.d435 import T_flange_camera_color_optical
 from maniskill_tomato.robot.iiwa14 import JOINT_AXES, JOINT_ORIGINS, JOINT_UPPER, READY_QPOS
@@ -78,9 +80,21 @@ def test_each_check_refuses_with_its_reason(
     assert refusal is not None and refusal.reason == reason, refusal
 
 
-def test_ages_at_the_bound_are_accepted() -> None:
-    config = SafetyConfig(max_state_age=0.5, max_frame_age=8.0)
+def test_what_is_at_its_bound_is_accepted() -> None:
+    config = SafetyConfig(max_state_age=0.5, max_frame_age=8.0, speed_fraction=0.25, max_speed_fraction=0.25)
     assert Safety(config).check(move(READY_QPOS), state(), 10.5, 2.5) is None
+    assert Safety(config).check(move(READY_QPOS, 0.25), state(), 10.0, 10.0) is None
+    config = SafetyConfig(max_joint_step=0.5, max_flange_step=2.0)
+    assert Safety(config).check(move(turned(j1=0.5)), state(turned(j1=0.0)), 10.0) is None
+
+
+def test_ages_count_from_the_stamps_and_are_named() -> None:
+    safety = Safety(SafetyConfig(max_frame_age=8.0))
+    refusal = safety.check(move(READY_QPOS), state(stamp=2.0), 4.25)
+    assert str(refusal) == "stale_state: the arm's state is 2.250 s old, it must be from 0 to 0.5 s"
+    refusal = safety.check(move(READY_QPOS), state(stamp=13.0), 13.0, 2.5)
+    assert str(refusal) == "stale_frame: the picture is 10.500 s old, it must be from 0 to 8.0 s"
+    assert safety.check(move(READY_QPOS), state(stamp=13.0), 13.0, 12.5) is None
 
 
 @pytest.mark.parametrize("sign", [-1.0, 1.0])
@@ -105,7 +119,7 @@ def test_an_arm_outside_the_workspace_may_come_in() -> None:
 
 
 def test_the_first_place_outside_and_in_a_zone_is_named() -> None:
-    goal = turned(j2=0.1)
+    goal = turned(j2=0.14)
     way = np.array([plain_flange(joints) for joints in joint_path(READY_QPOS, goal, 0.02)])
     fourth = "(" + ", ".join(f"{v:.3f}" for v in way[4]) + ") m"
     between = float(way[3, 0] + way[4, 0]) / 2
@@ -133,10 +147,54 @@ def test_a_contact_is_named_with_its_distance_and_the_share_of_the_move_before_i
     assert 0.1 < share < 0.95
     assert safety.check(move(turned(j2=0.3 * (share - 0.02))), state(), 10.0) is None
     assert safety.check(move(turned(j2=0.3 * (share + 0.02))), state(), 10.0) is not None
-    # In ten samples the share is a whole number of tenths.
-    coarse = Safety(SafetyConfig(obstacles=(wall,), obstacle_clearance=0.02, path_step=0.0301))
-    refusal = coarse.check(move(goal), state(), 10.0)
-    assert refusal is not None and "0% of the move" in refusal.detail
+
+
+@pytest.mark.parametrize("samples", [6, 7, 8, 9, 10, 11])
+def test_the_share_of_the_move_is_that_of_the_first_posture_in_contact(samples: int) -> None:
+    start, goal = READY_QPOS, turned(j2=0.5)
+    ahead = float(plain_flange(start)[0]) + 0.18
+    wall = Box(low=(ahead, -1.0, 0.0), high=(ahead + 0.08, 1.0, 2.0))
+    safety = Safety(SafetyConfig(obstacles=(wall,), max_flange_step=1.0, path_step=0.5001 / samples))
+    postures = [start + k / samples * (goal - start) for k in range(samples + 1)]
+    first = next(k for k in range(1, samples + 1) if safety.stands_in_collision(postures[k], None))
+    assert 1 < first < samples
+    refusal = safety.check(move(goal), state(start), 10.0)
+    assert refusal is not None and f"after {first / samples:.0%} of the move" in refusal.detail
+
+
+@pytest.mark.parametrize("distance", [0.2914, 0.2916])
+def test_a_contact_is_measured_in_millimetres(distance: float) -> None:
+    """The 0.4 mm are far enough from a half that one thousandth more or less shows."""
+    goal = turned(j1=0.01)
+
+    def wall(ahead: float) -> Box:
+        return Box(low=(ahead, -1.0, 0.0), high=(ahead + 0.08, 1.0, 2.0))
+
+    def contact(ahead: float) -> float:
+        checker = CollisionChecker(obstacles=(wall(ahead),), obstacle_clearance=0.5)
+        found = checker.nearest(goal[None])
+        assert found is not None and found.second == "obstacle 0"
+        return found.distance
+
+    ahead = float(plain_flange(goal)[0]) + 0.3
+    ahead += distance - contact(ahead)
+    assert contact(ahead) == pytest.approx(distance, abs=2e-5)
+    safety = Safety(SafetyConfig(obstacles=(wall(ahead),), obstacle_clearance=0.3))
+    refusal = safety.check(move(goal), state(), 10.0)
+    assert refusal is not None
+    assert f"within {distance * 1e3:.0f} mm of obstacle 0 after 100% of the move" in refusal.detail
+
+
+def test_an_arm_that_touches_something_may_leave_it_in_one_step_and_not_reach_it_in_one() -> None:
+    clear, touching = READY_QPOS, turned(j2=0.09)
+    ahead = float(plain_flange(clear)[0]) + 0.09
+    wall = Box(low=(ahead, -1.0, 0.0), high=(ahead + 0.08, 1.0, 2.0))
+    safety = Safety(SafetyConfig(obstacles=(wall,), obstacle_clearance=0.02, path_step=0.1))
+    assert not safety.stands_in_collision(clear, None)
+    assert safety.stands_in_collision(touching, None)
+    assert safety.check(move(clear), state(touching), 10.0) is None
+    refusal = safety.check(move(touching), state(clear), 10.0)
+    assert refusal is not None and refusal.reason == "obstacle"
 
 
 def test_a_posture_stands_in_collision_with_itself_or_with_enough_points_of_the_plant(safety: Safety) -> None:
@@ -222,6 +280,90 @@ def test_the_plant_that_was_seen_is_kept_clear_of(safety: Safety) -> None:
     # Out of the leaves it may go: the same points at the start, and the move leads away.
     inside = turned(j1=0.15)
     assert safety.check(move(turned(j1=-0.2)), state(inside), 10.0, points_w=cluster) is None
+
+
+def test_so_many_points_as_are_needed_refuse_a_move_and_one_less_does_not(safety: Safety) -> None:
+    goal = turned(j1=0.3)
+    on_the_way = np.repeat(plain_flange(turned(j1=0.15))[None], 20, axis=0)
+    far = on_the_way + [0.0, 0.0, 0.6]
+    for needed, checked in ((6, safety), (2, Safety(SafetyConfig(plant_points_needed=2)))):
+        for count, others in ((needed, 0), (needed, 5), (needed - 1, 0), (needed - 1, 5)):
+            points = np.concatenate([on_the_way[:count], far[:others]])
+            refusal = checked.check(move(goal), state(), 10.0, points_w=points)
+            assert (refusal is not None) == (count == needed), (needed, count, others)
+            assert refusal is None or f"{needed} points of the plant" in refusal.detail
+            assert checked.stands_in_collision(turned(j1=0.15), points) == (count == needed)
+
+
+def test_a_plant_that_is_approached_but_not_reached_refuses_nothing(safety: Safety) -> None:
+    goal = turned(j2=0.2)
+    beyond = np.repeat(plain_flange(turned(j2=0.4))[None], 20, axis=0)
+    nearest = sphere_distances(joint_path(READY_QPOS, goal, 0.02), beyond)[:, 0]
+    assert (np.diff(nearest) < -1e-3).all() and nearest[-1] > 0.05
+    assert safety.check(move(goal), state(), 10.0, points_w=beyond) is None
+    near = Safety(SafetyConfig(plant_clearance=float(nearest[-1]) + 1e-3))
+    refusal = near.check(move(goal), state(), 10.0, points_w=beyond)
+    assert refusal is not None and refusal.reason == "plant"
+    # The same at the end of a single step.
+    before = joint_path(READY_QPOS, goal, 0.02)[-2]
+    once = Safety(replace(near.config, path_step=0.03))
+    refusal = once.check(move(goal), state(before), 10.0, points_w=beyond)
+    assert refusal is not None and refusal.reason == "plant"
+
+
+@pytest.mark.parametrize(("clearance", "distance"), [(0.2994, 0.2914), (0.2996, 0.2916)])
+def test_a_plant_is_measured_in_millimetres(clearance: float, distance: float) -> None:
+    """The 0.4 mm are far enough from a half that one thousandth more or less shows."""
+    goal = turned(j2=0.1)
+    way = joint_path(READY_QPOS, goal, 0.02)
+
+    def point(reach: float) -> Any:
+        return plain_flange(goal)[None] + [reach, 0.0, 0.0]
+
+    def nearest(reach: float) -> float:
+        return float(sphere_distances(way, point(reach))[1:].min())
+
+    reach: Any = brentq(lambda reach: nearest(reach) - distance, 0.2, 0.6)
+    points = np.repeat(point(reach), 20, axis=0)
+    refusal = Safety(SafetyConfig(plant_clearance=clearance)).check(
+        move(goal), state(), 10.0, points_w=points
+    )
+    assert refusal is not None and refusal.detail == (
+        f"20 points of the plant would be nearer than {clearance * 1e3:.0f} mm to the arm's spheres, "
+        f"the nearest {distance * 1e3:.0f} mm"
+    )
+
+
+def test_the_farthest_place_from_the_start_is_the_flange_step() -> None:
+    """Nearly a full turn with a growing radius: the ends are near each other, the farthest place lies between."""
+    start, goal = turned(j1=-2.8), turned(j1=2.8, j2=0.3)
+    way = np.array([plain_flange(joints) for joints in joint_path(start, goal, 0.02)])
+    away = np.linalg.norm(way - way[0], axis=1)
+    assert away.max() > away[-1] + 0.1
+    everywhere = Box(low=(-2.0, -2.0, -2.0), high=(2.0, 2.0, 2.0))
+    config = SafetyConfig(max_joint_step=6.0, workspace=everywhere, forbidden=())
+    refusal = Safety(replace(config, max_flange_step=0.1)).check(move(goal), state(start), 10.0)
+    assert refusal is not None and refusal.reason == "flange_step"
+    assert f"the flange would get {away.max():.3f} m away" in refusal.detail
+    for slack, reason in ((1e-6, None), (-1e-6, "flange_step")):
+        bound = replace(config, max_flange_step=float(away.max()) + slack)
+        refusal = Safety(bound).check(move(goal), state(start), 10.0)
+        assert (refusal and refusal.reason) == reason
+
+
+def test_a_joint_path_is_a_straight_line_of_the_fewest_steps() -> None:
+    rng = np.random.default_rng(0)
+    for _ in range(50):
+        start, end = rng.uniform(-2.0, 2.0, (2, 7))
+        step = float(rng.uniform(0.02, 1.0))
+        path = joint_path(start, end, step)
+        count = len(path) - 1
+        expected = [start + k / count * (end - start) for k in range(count + 1)]
+        np.testing.assert_allclose(path, expected, rtol=0.0, atol=1e-14)
+        largest = np.abs(end - start).max()
+        assert largest / count <= step and (count == 1 or largest / (count - 1) > step)
+    for end in (READY_QPOS, turned(j4=1e-3)):
+        np.testing.assert_allclose(joint_path(READY_QPOS, end, 0.02), [READY_QPOS, end], rtol=0.0, atol=1e-14)
 
 
 def test_the_camera_is_where_the_calibration_puts_it() -> None:
@@ -314,6 +456,53 @@ def test_the_safety_configuration_refuses_what_makes_no_sense() -> None:
             SafetyConfig(**wrong)
     with pytest.raises(InvalidInputError, match="low must lie below high"):
         Box(low=(0.0, 0.0, 0.0), high=(1.0, 0.0, 1.0))
+
+
+@pytest.mark.parametrize(
+    ("name", "accepted", "refused"),
+    [
+        ("joint_margin", (0.0, 0.5), (-0.01, 0.51)),
+        ("table_clearance", (0.0, 0.5), (-0.01, 0.51)),
+        ("self_clearance", (0.0, 0.5), (-0.01, 0.51)),
+        ("obstacle_clearance", (0.0, 0.5), (-0.01, 0.51)),
+        ("plant_clearance", (-0.05, 0.3, None), (-0.06, 0.31)),
+        ("max_speed_fraction", (0.1, 0.3), (0.09, 0.31, 0.0)),
+        ("path_step", (1e-6, 0.1), (-1e-6, 0.0, 0.11)),
+        ("plant_points_needed", (1, 1000), (0, -1)),
+    ],
+)
+def test_the_numbers_of_the_envelope_have_their_ranges(
+    name: str, accepted: tuple[Any, ...], refused: tuple[Any, ...]
+) -> None:
+    for value in accepted:
+        config: dict[str, Any] = {name: value}
+        assert getattr(SafetyConfig(**config), name) == value
+    for value in refused:
+        config = {name: value}
+        with pytest.raises(InvalidInputError, match=name):
+            SafetyConfig(**config)
+
+
+def test_the_default_envelope_is_the_documented_one() -> None:
+    """The base's zone is |x|, |y| < 0.3 m, z < 0.25 m (Eq. 5-4); the rest is `docs/deploy.md`."""
+    config = SafetyConfig()
+    assert config.forbidden == (Box(low=(-0.3, -0.3, -1.0), high=(0.3, 0.3, 0.25)),)
+    assert config.workspace == Box(low=(-0.9, -0.9, 0.15), high=(0.9, 0.9, 1.35))
+    assert (config.speed_fraction, config.max_speed_fraction) == (0.1, 0.3)
+    assert (config.joint_margin, config.max_joint_step, config.max_flange_step) == (0.03, 1.5, 0.35)
+    assert (config.max_state_age, config.max_frame_age, config.path_step) == (0.5, 10.0, 0.02)
+    assert (config.self_clearance, config.table_clearance, config.obstacle_clearance) == (0.005, 0.03, 0.05)
+    assert (config.plant_clearance, config.plant_points_needed) == (0.0, 6)
+    assert (config.table_height, config.obstacles, config.arrival_tolerance) == (0.0, (), 0.01)
+
+
+def test_neither_an_envelope_nor_a_refusal_can_be_changed() -> None:
+    with pytest.raises(FrozenInstanceError):
+        SafetyConfig().max_joint_step = 9.0  # type: ignore[misc]
+    refusal = Refusal(reason="table", detail="too low")
+    with pytest.raises(FrozenInstanceError):
+        refusal.reason = "plant"  # type: ignore[misc]
+    assert str(refusal) == "table: too low"
 
 
 class SpyArm(Arm):

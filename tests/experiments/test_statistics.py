@@ -53,6 +53,8 @@ def test_wilson_intervals_agree_with_published_values() -> None:
         wilson_interval(5, 4)
     with pytest.raises(InvalidInputError):
         wilson_interval(0, 0)
+    with pytest.raises(InvalidInputError):
+        wilson_interval(-1, 4)
     # One success in one trial: (p + z^2 / 2n) / (1 + z^2 / n) -+ ... is from 1 / (1 + z^2) to 1.
     assert wilson_interval(1, 1) == pytest.approx((1 / (1 + 1.959964**2), 1.0), abs=1e-6)
 
@@ -84,6 +86,7 @@ def test_sign_flip_counts_every_flip_of_a_few_differences() -> None:
     differences = np.array([1.0, 2.0, -1.0, 3.0, 2.0, 4.0, -2.0, 1.0])
     assert sign_flip_p(differences) == pytest.approx(exact_sign_flip_p(differences), abs=1e-12)
     assert sign_flip_p([5.0]) == 1.0
+    assert sign_flip_p([5.0, 0.0, 2.0]) == 0.5  # Of the sums 7, 3, -3 and -7 two are as far from zero.
 
 
 def test_sign_flip_estimates_the_share_of_many_differences() -> None:
@@ -191,6 +194,19 @@ def test_paired_test_counts_and_directions() -> None:
     assert (turned.only_a, turned.only_b) == (1, 30)
 
 
+def test_the_seed_alone_decides_what_is_drawn_and_is_0_unless_given() -> None:
+    rng = np.random.default_rng(4)
+    a, b = rng.normal(0.3, 1.0, (2, 40))
+    won = a > 0.0
+    for drawn in (
+        lambda **seed: mean_interval(a, **seed),
+        lambda **seed: interquartile_interval([a, b], **seed),
+        lambda **seed: sign_flip_p(a, **seed),
+        lambda **seed: paired_test(won, a, won, b, **seed),
+    ):
+        assert drawn() == drawn(seed=0) != drawn(seed=1)
+
+
 def test_false_alarms_of_the_paired_test_on_moves_are_as_rare_as_the_p_value_says() -> None:
     rng = np.random.default_rng(3)
     p = [sign_flip_p(rng.normal(size=40), seed=i) for i in range(60)]
@@ -203,6 +219,10 @@ def test_bad_input_is_refused() -> None:
         mean_interval([])
     with pytest.raises(InvalidInputError, match="one or more numbers"):
         mean_interval([[1.0, 2.0], [3.0, 4.0]])
+    with pytest.raises(InvalidInputError, match="one or more numbers"):
+        mean_interval(3.0)
+    with pytest.raises(InvalidInputError, match="one value or more"):
+        interquartile_band(np.empty((0, 4)))
     with pytest.raises(InvalidInputError, match="0 or more"):
         mcnemar_p(-1, 2)
     with pytest.raises(InvalidInputError, match="0 or more"):
@@ -214,5 +234,7 @@ def test_bad_input_is_refused() -> None:
 def test_an_interval_is_written_with_its_ends_where_it_has_them() -> None:
     whole = Interval(estimate=0.975, low=0.95, high=0.99)
     assert interval_text(whole, 100.0, "{:.1f}", " %") == "97.5 [95.0, 99.0] %"
+    half = Interval(estimate=1.5, low=1.0, high=2.0)
+    assert interval_text(half, 3.0, "{:.2f}", " moves") == "4.50 [3.00, 6.00] moves"
     assert interval_text(Interval(estimate=3.0, low=None, high=None), 2.0, "{:.2f}", " moves") == "6.00 moves"
     assert interval_text(None, 100.0, "{:.1f}", " %") == "not evaluated"

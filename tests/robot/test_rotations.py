@@ -1,7 +1,9 @@
 """Roll, pitch and yaw of rotations, against SciPy's and values worked out by hand."""
 
+import itertools
 import math
 
+import numpy as np
 import pytest
 import torch
 from scipy.spatial.transform import Rotation
@@ -9,7 +11,8 @@ from torch import Tensor
 from torch.testing import assert_close
 
 from maniskill_tomato.errors import InvalidInputError
-from maniskill_tomato.robot.rotations import matrix_to_rpy
+from maniskill_tomato.robot.d435 import T_flange_camera_color_optical
+from maniskill_tomato.robot.rotations import FORWARD_RPY, matrix_to_rpy
 
 HALF_PI = math.pi / 2
 
@@ -49,6 +52,43 @@ def test_full_turns_follow_the_reference() -> None:
     rpy = torch.tensor([0.3, 0.4, -3.0], dtype=torch.float64)
     turned = rpy + torch.tensor([4 * math.pi, 0.0, 2 * math.pi], dtype=torch.float64)
     assert_close(matrix_to_rpy(rpy_to_matrix(rpy), turned), turned)
+
+
+def test_of_all_angles_that_give_the_matrix_the_nearest_to_the_reference_are_taken() -> None:
+    rpy = random_rpy(200, seed=6)
+    references = 3.0 * random_rpy(200, seed=7)
+    back = matrix_to_rpy(rpy_to_matrix(rpy), references)
+    turns = 2 * math.pi * np.array(list(itertools.product(range(-3, 4), repeat=3)))
+    gaps = []
+    for (roll, pitch, yaw), reference, found in zip(
+        rpy.numpy(), references.numpy(), back.numpy(), strict=True
+    ):
+        triples = np.array([[roll, pitch, yaw], [roll + math.pi, math.pi - pitch, yaw + math.pi]])
+        candidates = (triples[:, None] + turns).reshape(-1, 3)
+        distances = np.linalg.norm(candidates - reference, axis=1)
+        np.testing.assert_allclose(found, candidates[distances.argmin()], rtol=0.0, atol=1e-9)
+        gaps.append(np.diff(np.sort(distances)[:2]))
+    assert min(gaps) > 1e-4, "two of them are equally near, so that rounding decides"
+
+
+def test_the_camera_looks_forward_with_its_picture_upright_at_the_nominal_angles() -> None:
+    flange = rpy_to_matrix(torch.tensor(FORWARD_RPY)).numpy()
+    camera = flange @ T_flange_camera_color_optical[:3, :3]
+    np.testing.assert_allclose(camera[:, 2], [1.0, 0.0, 0.0], atol=1e-6)
+    np.testing.assert_allclose(camera[:, 1], [0.0, 0.0, -1.0], atol=1e-6)
+
+
+def test_matrices_and_references_are_broadcast_against_each_other() -> None:
+    rpy = 0.4 * random_rpy(6, seed=8)
+    matrices, references = (
+        rpy_to_matrix(rpy).reshape(2, 1, 3, 3, 3),
+        2.0 * random_rpy(5, seed=9).reshape(5, 1, 3),
+    )
+    back = matrix_to_rpy(matrices, references)
+    assert back.shape == (2, 5, 3, 3)
+    for i, j, k in itertools.product(range(2), range(5), range(3)):
+        assert_close(back[i, j, k], matrix_to_rpy(matrices[i, 0, k], references[j, 0]))
+    assert matrix_to_rpy(matrices[0, 0, 0], references).shape == (5, 1, 3)
 
 
 @pytest.mark.parametrize("pole", [HALF_PI, -HALF_PI])
