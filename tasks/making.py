@@ -126,6 +126,25 @@ def option_names(env_id: str) -> frozenset[str]:
     return frozenset(field.name for field in fields(kind))
 
 
+def check_other_tasks(env_id: str, names: Iterable[str]) -> None:
+    """Refuses options that only other tasks take.
+
+    Args:
+        env_id: The task.
+        names: Of options that it does not take.
+
+    Raises:
+        InvalidInputError: One of them is another task's.
+    """
+    for name in names:
+        takers = [other for other in TASK_IDS if name in option_names(other)]
+        if takers and env_id not in takers:
+            raise InvalidInputError(
+                f"{env_id} has no {name}=, which is an option of {' and '.join(takers)}; "
+                f"it takes {', '.join(sorted(option_names(env_id)))}"
+            )
+
+
 def default_control(env_id: str) -> Control:
     """What an action of a task is unless somebody says otherwise."""
     return "viewpoint" if env_id in TASK_IDS[:2] else "look_at"
