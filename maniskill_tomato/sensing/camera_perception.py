@@ -28,6 +28,9 @@ MAP_NOISE: Final = 0.03
 RECENTRE: Final = CELL_SIZE / 4
 """Memory and rays are centred anew when the target turns out to be farther than this from their centre, in [m]."""
 
+SAME_POSE: Final = 1e-3
+"""Entries of the camera's pose (in [m] for its place) differ by less than this in views from the same place."""
+
 SCAN_DEPTH: Final = 0.5
 """How far in front of the camera a robot looks that has seen no fruit yet, in [m]."""
 
@@ -217,7 +220,13 @@ class CameraPerception:
         if self._true_association:
             shown = measurement.frame.shown_fruit
             identities = [shown(measurement.mask(k)) for k in range(len(measurement.fruits))]
-        view = search.map.update(measurement, identities)
+        pose, last = measurement.frame.T_world_camera, search.views[-1] if search.views else None
+        if last is not None and np.allclose(
+            pose, last.measurement.frame.T_world_camera, rtol=0.0, atol=SAME_POSE
+        ):
+            view = search.map.again(measurement, last)
+        else:
+            view = search.map.update(measurement, identities)
         first = not search.views
         search.views = [*(_slimmed(earlier) for earlier in search.views or []), view]
         if search.target is not None:

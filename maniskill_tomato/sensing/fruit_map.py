@@ -197,8 +197,7 @@ class FruitMap:
             if number is None:
                 number, self._next = self._next, self._next + 1
             if number in self.tracks:
-                track = self.tracks[number]
-                self._correct(track, *self.sphere_of(fruit, camera))
+                self._correct(self.tracks[number], *self.sphere_of(fruit, camera))
             else:
                 self.tracks[number] = self._born(number, *self.sphere_of(fruit, camera))
             self._count(self.tracks[number], fruit)
@@ -212,6 +211,30 @@ class FruitMap:
             kept = {number: self.current(number) for number in assigned}
             names = {number: number if now is None else now for number, now in kept.items()}
         return MappedView(measurement=measurement, tracks=tuple(names[number] for number in assigned))
+
+    def again(self, measurement: Measurement, last: MappedView) -> MappedView:
+        """A second picture from the place of the last view, which tells nothing more of the tracks that there are.
+
+        The same leaves stand in front of the same fruits, so that its errors are those of the last view.
+
+        Args:
+            measurement: The picture's detections.
+            last: The view.
+
+        Returns:
+            The picture with the track of the detection that each overlaps with, `NO_TRACK` where there is none.
+        """
+        measurement = self._divided(measurement)
+        before = [last.measurement.mask(k) for k in range(len(last.tracks))]
+        tracks = []
+        for k in range(len(measurement.fruits)):
+            mask = measurement.mask(k)
+            overlaps = [np.count_nonzero(mask & m) / np.count_nonzero(mask | m) for m in before]
+            best = int(np.argmax(overlaps)) if overlaps else None
+            same = best is not None and overlaps[best] > SAME_OVERLAP
+            number = self.current(last.tracks[best]) if best is not None and same else None
+            tracks.append(NO_TRACK if number is None else number)
+        return MappedView(measurement=measurement, tracks=tuple(tracks))
 
     def sphere_of(self, fruit: DetectedFruit, camera: Position) -> tuple[Float64, Float64]:
         """A detection as a measurement of centre and radius.
@@ -464,6 +487,12 @@ UNMEASURED_DEPTH: Final = 0.1
 
 UNMEASURED_SHARE: Final = 0.2
 """The same as a share of the distance: sizes of fruits differ by 0.14, and part of the fruit may be hidden."""
+
+NO_TRACK: Final = -1
+"""Stands for the track of a detection that has none."""
+
+SAME_OVERLAP: Final = 0.5
+"""Intersection over union of the masks of one fruit in two pictures from the same place."""
 
 FARTHEST_RAY: Final = 4.0
 """A track's detections have their middle at most so many radii beside its centre."""

@@ -104,8 +104,9 @@ def test_a_planner_finds_the_tomato_and_the_run_ends_with_success() -> None:
 def test_a_view_that_never_gets_better_ends_with_the_budget() -> None:
     result, _ = go(profile("depth_noise = 0.0"), open_policy("stay", env_id=TASK))
     assert (result.reason, result.moves, result.is_fault, result.success) == ("budget", 6, False, False)
-    # The map's sphere, by which V_f is judged, changes a little with every look.
-    assert max(result.visible_fractions) - min(result.visible_fractions) < 0.02
+    # The first move turns the camera to where the target was measured; from then on every picture is the same.
+    assert len(set(result.visible_fractions[1:])) == 1
+    assert result.visible_fractions[0] == pytest.approx(result.visible_fractions[1], abs=0.005)
 
 
 @pytest.mark.parametrize(
@@ -136,6 +137,7 @@ def test_without_depth_the_arm_goes_back_once_and_no_farther() -> None:
     # Three attempts at one view fail, then there is depth again: the run goes on from the view before.
     covered, _ = go(profile(faults % ", camera_reads = 3", "threshold = 0.99"))
     assert not covered.is_fault and covered.moves == 6
+    # The same picture, by a map that knows one view more.
     assert covered.visible_fractions[1] == pytest.approx(covered.visible_fractions[3], abs=0.01)
 
 

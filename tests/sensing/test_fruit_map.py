@@ -12,7 +12,7 @@ from maniskill_tomato.robot.look_at import look_at_pose
 from maniskill_tomato.segmentation.instances import Instances
 from maniskill_tomato.segmentation.masks import BinaryMask
 from maniskill_tomato.sensing.fruit_detector import FruitDetector
-from maniskill_tomato.sensing.fruit_map import FruitMap, MapConfig, outline
+from maniskill_tomato.sensing.fruit_map import NO_TRACK, FruitMap, MapConfig, outline
 from maniskill_tomato.sensing.measurement import DetectedFruit, Measurement
 from maniskill_tomato.sensing.posed_frame import PosedFrame
 
@@ -342,3 +342,18 @@ def test_the_redness_of_a_detection_is_that_of_its_visible_pixels() -> None:
     assert seen.redness == pytest.approx((180 - 60) / (180 + 60))
     (blind,) = DETECTOR.measure(frame).fruits
     assert np.isnan(blind.redness)
+
+
+def test_the_same_picture_again_tells_nothing_more() -> None:
+    fruits = FruitMap()
+    measured = DETECTOR.measure(cast(CAMERAS[0], [FRUIT]))
+    first = fruits.update(measured)
+    track = fruits.tracks[only(fruits)]
+    mean, covariance, existence = track.mean.copy(), track.covariance.copy(), track.existence_log_odds
+    again = fruits.again(measured, first)
+    assert again.tracks == (track.number,) and track.views == 1
+    np.testing.assert_array_equal(track.mean, mean)
+    np.testing.assert_array_equal(track.covariance, covariance)
+    assert track.existence_log_odds == existence
+    elsewhere = DETECTOR.measure(cast(CAMERAS[0], [NEIGHBOUR + [0.0, 0.06, 0.0]]))
+    assert fruits.again(elsewhere, first).tracks == (NO_TRACK,)
