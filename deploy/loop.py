@@ -193,7 +193,7 @@ class Loop:
         self._way_back = joints
         self._moves += look.cost
         if look.go_to is not None:
-            self._send(replace(step, detail=look.detail), self._checked(step, look.go_to))
+            self._send(replace(step, detail=look.detail), self._straight(step, look.go_to))
             return
         with self._times.timed("policy"):
             action = decide(self._policy, self._belief)
@@ -227,13 +227,11 @@ class Loop:
         )
         return look, step
 
-    def _checked(self, step: Step, joints: Float64) -> Choice:
-        """A move to given joint positions."""
-        move = JointMove(joint_positions=joints, speed_fraction=self._arm.safety.config.speed_fraction)
+    def _straight(self, step: Step, joints: Float64) -> Choice:
+        """A move to given joint positions, checked."""
         with self._times.timed("safety"):
             state, points = self._arm.read(), self._points.points_w
-            refusal = self._arm.safety.check(move, state, self._clock.now(), step.frame.stamp, points)
-        return Choice(move=move, refusal=refusal)
+            return self._chooser.go_to(joints, state, self._clock.now(), step.frame.stamp, points)
 
     def _chosen(self, step: Step) -> Choice:
         """The policy's move, solved and checked."""

@@ -129,7 +129,7 @@ class WholeRow:
                 return End(reason="success", detail=f"nothing is worth another move after {moves}")
             self._mapper.turn_to(0, aim.track, aim.position_w)
             self._is_new, self._refused, self._turned_at = True, 0, moves
-            if moves < self._row_moves:
+            if moves + TRANSIT_MOVES <= self._row_moves:
                 self._plan_way(T_world_camera, joints, aim.position_w)
         if moves >= self._row_moves:
             return End(reason="budget", detail=f"all {self._row_moves} moves are made")
@@ -146,7 +146,7 @@ class WholeRow:
         goal = torch.as_tensor(target)
         places = self._lattice.positions(goal.float()[None])[0].double()
         position = torch.as_tensor(T_world_camera[:3, 3])
-        transit = self._planner.to_first_view(torch.as_tensor(joints), position, places, goal)
+        transit = self._planner.to_first_view(torch.tensor(joints), position, places, goal)
         if transit is not None:
             c = self._safety
             pieces = cut_way(transit.waypoints.numpy(), WITHIN * c.max_joint_step, WITHIN * c.max_flange_step)
