@@ -29,7 +29,7 @@ class Look:
     """Why the run is over."""
     go_to: Float64 | None = None
     """Where the arm goes without the policy being asked, joint positions in [rad]. Shape (7,)."""
-    cost: int = 1
+    cost: int = 0
     """Moves that count when the arm goes there."""
     is_new_target: bool = False
     """Whether the policy begins anew."""

@@ -36,11 +36,11 @@ BAR: Final = 40
 """Height of the caption below it, in [px]."""
 COLUMNS: Final = 6
 """Of the pictures in `report.png`."""
-SCALE: Final = 640.0
+SCALE: Final = 820.0
 """Of the front view, in [px/m]."""
 LEFT, TOP = 0.9, 0.95
 """Its upper left corner: y and z in the base frame, in [m]."""
-FRONT_SIZE: Final = (1160, 530)
+FRONT_SIZE: Final = (1486, 680)
 """Width and height, in [px]."""
 
 Picture = NDArray[np.uint8]
@@ -133,7 +133,9 @@ def write_page(
             section(
                 "The row",
                 paragraph(outcome),
-                figure(overview_file, "The row seen from the robot; ring: fully seen, line: the camera's way"),
+                figure(
+                    overview_file, "The row seen from the robot; ring: fully seen, line: the camera's way"
+                ),
             ),
             section("Fruits", table([*head, *(["True V_f", "Off [mm]"] if has_truth else [])], rows)),
             section("Pictures", f'<div class="pairs">{"".join(shown)}</div>') if shown else "",
@@ -183,7 +185,13 @@ def _front_view(fruits: Sequence[InspectedFruit], cameras: Sequence[Float64]) ->
     for fruit in fruits:
         centre, radius = place(fruit.position_w), round(fruit.radius_m * SCALE)
         cv2.circle(picture, centre, radius, rgb(TOMATO if fruit.is_ripe else LEAF), -1, cv2.LINE_AA)
-        cv2.circle(picture, centre, radius + 3, rgb(INK if fruit.is_fully_seen else MUTED), 2 if fruit.is_fully_seen else 1)
+        cv2.circle(
+            picture,
+            centre,
+            radius + 3,
+            rgb(INK if fruit.is_fully_seen else MUTED),
+            2 if fruit.is_fully_seen else 1,
+        )
         write_text(picture, str(fruit.number), (centre[0] - 6, centre[1] + 4), 0.36)
     return picture
 

@@ -191,13 +191,14 @@ class Loop:
             self._go_back(step)
             return
         self._way_back = joints
-        self._moves += look.cost
         if look.go_to is not None:
+            self._moves += look.cost
             self._send(replace(step, detail=look.detail), self._straight(step, look.go_to))
             return
         with self._times.timed("policy"):
             action = decide(self._policy, self._belief)
         step = replace(step, action=(float(action[0]), float(action[1]), float(action[2])))
+        self._moves += 1
         self._send(step, self._chosen(step))
 
     def _look(self, frame: Frame, joints: Float64) -> tuple[Look, Step]:
@@ -247,9 +248,7 @@ class Loop:
             own_goal = self._chooser.own_goal(request)
         with self._times.timed("safety"):
             state = self._arm.read()
-            return self._chooser.choose(
-                request, own_goal, state, self._clock.now(), step.frame.stamp, points
-            )
+            return self._chooser.choose(request, own_goal, state, self._clock.now(), step.frame.stamp, points)
 
     def _send(self, step: Step, chosen: Choice) -> None:
         """Has a move carried out, or counts it as refused."""

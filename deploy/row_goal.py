@@ -3,7 +3,8 @@
 `sensing.inspection` says what to look at next, in the simulator too. Where the camera cannot look at it from where it
 stands, the arm goes by its ready posture (`robot.transit`), in pieces that `safety` allows. A fresh picture is taken
 before every piece; only what it shows of the plant is kept, for the collision check. A piece that is refused ends the
-transit, and the fruit is given up.
+transit, and the fruit is given up. Where it is the first piece, leaves stand about the arm: it goes back to the view
+before, up to `RETREATS` times, and tries from there.
 """
 
 import logging
@@ -32,6 +33,9 @@ ARRIVED: Final = 0.02
 
 STUCK: Final = 3
 """The run ends after so many times `LoopConfig.refused_after` refused moves in a row; a fruit is given up after one."""
+
+RETREATS: Final = 2
+"""Views that the arm goes back by to begin a transit."""
 
 WITHIN: Final = 0.95
 """Pieces of a transit take this share of the steps that `safety` allows."""
@@ -63,8 +67,9 @@ class WholeRow:
         self._way: deque[Float64] = deque()
         self._sent: Float64 | None = None
         self._on_the_way: Sighting | None = None
-        self._turned_at = self._refused = 0
-        self._is_new = self._gives_up = False
+        self._trail: list[Float64] = []
+        self._turned_at = self._refused = self._retreats = 0
+        self._is_new = self._gives_up = self._is_first_piece = self._retreating = self._replans = False
 
     def fruits(self) -> list[InspectedFruit]:
         """The inspection list so far."""
@@ -75,6 +80,7 @@ class WholeRow:
         if self._sent is not None:
             is_there = np.abs(joints - self._sent).max() < ARRIVED
             self._sent = None
+            self._is_first_piece = self._retreating = False
             if is_there:
                 self._way.popleft()
             else:
@@ -86,7 +92,8 @@ class WholeRow:
         view = self._perception.sighting(moved or self._is_new)
         self._on_the_way = view
         if self._way and end is None:
-            return self._piece(view, moves, cost=TRANSIT_MOVES)
+            self._is_first_piece = not self._retreating
+            return self._piece(view, moves, cost=1 if self._retreating else TRANSIT_MOVES)
         is_new, self._is_new = self._is_new, False
         return Look(view=view, moves_left=self._moves_left(moves), end=end, is_new_target=is_new)
 
@@ -94,7 +101,10 @@ class WholeRow:
         """A refused piece ends a transit; too many moves in a row, and the fruit is given up, at last the row."""
         self._refused += 1
         if self._sent is not None:
+            can_retreat = self._is_first_piece and self._retreats < RETREATS and len(self._trail) > 1
             self._break_off()
+            if can_retreat:
+                self._gives_up, self._retreating = False, True
         elif self._refused >= self._loop.refused_after:
             self._gives_up = True
         if in_a_row < STUCK * self._loop.refused_after:
@@ -109,6 +119,8 @@ class WholeRow:
             return False
         moved = self._perception.take(frame, T_world_camera)
         self.view_joints.append(joints.copy())
+        if not self._trail or np.abs(joints - self._trail[-1]).max() >= STILL:
+            self._trail.append(joints.copy())
         self._refused = 0
         view = self._mapper.last_view(0)
         assert view is not None
@@ -123,14 +135,21 @@ class WholeRow:
             inspection.given_up.add(aim.track)
         is_done = aim is None or inspection.is_done(fruits, moves - self._turned_at, self.max_moves)
         if is_done or self._gives_up:
-            self._gives_up = False
+            self._gives_up = self._retreating = self._replans = False
             aim = inspection.next(fruits, T_world_camera[:3, 3], self._lattice)
             if aim is None:
                 return End(reason="success", detail=f"nothing is worth another move after {moves}")
             self._mapper.turn_to(0, aim.track, aim.position_w)
-            self._is_new, self._refused, self._turned_at = True, 0, moves
-            if moves + TRANSIT_MOVES <= self._row_moves:
-                self._plan_way(T_world_camera, joints, aim.position_w)
+            self._is_new, self._turned_at = True, moves
+            self._refused = self._retreats = 0
+            self._plan_way(T_world_camera, joints, aim.position_w, moves)
+        elif self._retreating:
+            self._trail.pop()
+            self._way.append(self._trail[-1])
+            self._retreats, self._replans = self._retreats + 1, True
+        elif self._replans and aim is not None:
+            self._replans = False
+            self._plan_way(T_world_camera, joints, aim.position_w, moves)
         if moves >= self._row_moves:
             return End(reason="budget", detail=f"all {self._row_moves} moves are made")
         return None
@@ -141,8 +160,10 @@ class WholeRow:
 
     # ----------------------------------------------------------------- transits
 
-    def _plan_way(self, T_world_camera: Float64, joints: Float64, target: Float64) -> None:
-        """A transit, if the camera cannot look at the target from where it stands."""
+    def _plan_way(self, T_world_camera: Float64, joints: Float64, target: Float64, moves: int) -> None:
+        """A transit, if the camera cannot look at the target from where it stands and moves are left for it."""
+        if moves + TRANSIT_MOVES > self._row_moves:
+            return
         goal = torch.as_tensor(target)
         places = self._lattice.positions(goal.float()[None])[0].double()
         position = torch.as_tensor(T_world_camera[:3, 3])
