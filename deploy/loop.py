@@ -230,9 +230,11 @@ class Loop:
 
     def _straight(self, step: Step, joints: Float64) -> Choice:
         """A move to given joint positions, checked."""
+        move = JointMove(joint_positions=joints, speed_fraction=self._arm.safety.config.speed_fraction)
         with self._times.timed("safety"):
             state, points = self._arm.read(), self._points.points_w
-            return self._chooser.go_to(joints, state, self._clock.now(), step.frame.stamp, points)
+            refusal = self._arm.safety.check(move, state, self._clock.now(), step.frame.stamp, points)
+        return Choice(move=move, refusal=refusal)
 
     def _chosen(self, step: Step) -> Choice:
         """The policy's move, solved and checked."""

@@ -145,42 +145,12 @@ class MoveChooser:
             if self._safety.check(move, state, now, frame_stamp, points_w) is None:
                 _logger.info("the move is made in another posture, because %s", refusal or "out of reach")
                 return Choice(move=move, refusal=None)
-        if own is None:
-            return Choice(move=None, refusal=None)
-        return self._round(own, refusal, state, now, frame_stamp, points_w)
-
-    def go_to(
-        self, joints: Float64, state: ArmState, now: float, frame_stamp: float, points_w: Float64
-    ) -> Choice:
-        """The straight move to given joint positions, or a way round to them.
-
-        Args:
-            joints: In [rad]. Shape (7,).
-            state: Where the arm is.
-            now: The time, in [s].
-            frame_stamp: When the picture was taken, in [s].
-            points_w: What was seen of the plant, base frame, in [m]. Shape (P, 3).
-        """
-        move = JointMove(joint_positions=joints, speed_fraction=self._safety.config.speed_fraction)
-        refusal = self._safety.check(move, state, now, frame_stamp, points_w)
-        return self._round(move, refusal, state, now, frame_stamp, points_w)
-
-    def _round(
-        self,
-        move: JointMove,
-        refusal: Refusal | None,
-        state: ArmState,
-        now: float,
-        frame_stamp: float,
-        points_w: Float64,
-    ) -> Choice:
-        """The move, or a way round where it would collide."""
-        if refusal is not None and refusal.reason in COLLISIONS:
-            way = self._detours.plan(state, move.joint_positions, now, frame_stamp, points_w)
+        if own is not None and refusal is not None and refusal.reason in COLLISIONS:
+            way = self._detours.plan(state, own.joint_positions, now, frame_stamp, points_w)
             if way is not None:
                 _logger.info("the move is made in %d parts, because %s", len(way), refusal)
                 return Choice(move=way[0], refusal=None, then=tuple(way[1:]))
-        return Choice(move=move, refusal=refusal)
+        return Choice(move=own, refusal=refusal)
 
 
 class Postures:

@@ -178,7 +178,8 @@ class ImagePerception:
         self._perception.recall(observer, torch.zeros(1, dtype=torch.int64))
 
     def _posed(self, frame: Frame, T_world_camera: Float64) -> PosedFrame:
-        robot_mask, fruits, numbers = None, None, ()
+        robot_mask, fruits = None, None
+        numbers: tuple[int, ...] = ()
         if frame.truth is not None:
             # With a segmenter only the twin's judgement of itself asks for these.
             fruits, numbers = _true_fruits(frame.truth)
