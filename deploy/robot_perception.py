@@ -9,7 +9,7 @@ import numpy as np
 import torch
 
 from maniskill_tomato.deploy.deploy_errors import PerceptionError, ProfileError
-from maniskill_tomato.deploy.interface import Float64, Frame
+from maniskill_tomato.deploy.interface import Float64, Frame, FrameTruth
 from maniskill_tomato.errors import TomatoError
 from maniskill_tomato.raycast.images import ROBOT_LABEL
 from maniskill_tomato.raycast.view_rays import ViewRays
@@ -32,6 +32,9 @@ Sight = Literal["images", "rays"]
 TRUE_MASKS: Final = "ground_truth"
 """Name of the segmenter that takes the masks that only a simulated camera knows."""
 
+
+UNRIPE_CATEGORY: Final = "tomato_unripe"
+"""What fruits are called that only a simulated camera tells from ripe ones."""
 
 PLACE_ERROR: Final = 0.01
 """Standard deviation of each coordinate of a target's position that a profile gives, in [m]."""
@@ -118,14 +121,16 @@ class ImagePerception:
         self._perception.begin(0, target_position, place_error=PLACE_ERROR)
         self._chooses = target_position is None
 
+    def begin_row(self) -> CameraPerception:
+        """Forgets all views and has no target; returns what the row's fruits are mapped with."""
+        self._perception = CameraPerception(1, self._detector)
+        self._chooses = False
+        return self._perception
+
     def look(self, frame: Frame, T_world_camera: Float64) -> Sighting | None:
         """The sighting by masks and depth; see `Perception`."""
         perception = self._perception
-        try:
-            measured = self._detector.measure(self._posed(frame, T_world_camera))
-        except TomatoError as error:
-            raise PerceptionError(f"the picture cannot be segmented: {error}") from error
-        moved = perception.add(0, measured)
+        moved = self.take(frame, T_world_camera)
         if self._chooses:
             perception.choose(0, FULL_VISIBILITY)
             if perception.target(0) is None:
@@ -133,6 +138,27 @@ class ImagePerception:
             if perception.target(0) is None:
                 return None
             self._chooses, moved = False, True
+        return self.sighting(moved)
+
+    def take(self, frame: Frame, T_world_camera: Float64) -> bool:
+        """Takes a picture into the map; whether the target turned out to stand elsewhere.
+
+        Raises:
+            PerceptionError: The picture cannot be used.
+        """
+        try:
+            measured = self._detector.measure(self._posed(frame, T_world_camera))
+        except TomatoError as error:
+            raise PerceptionError(f"the picture cannot be segmented: {error}") from error
+        return self._perception.add(0, measured)
+
+    def sighting(self, moved: bool) -> Sighting:
+        """What the last picture that was taken in told of the target.
+
+        Args:
+            moved: Whether the memory of earlier views must be made anew.
+        """
+        perception = self._perception
         return Sighting(
             rays=perception.rays(),
             visible_fraction=float(perception.visible_fraction[0]),
@@ -153,12 +179,11 @@ class ImagePerception:
 
     def _posed(self, frame: Frame, T_world_camera: Float64) -> PosedFrame:
         robot_mask, fruits = None, None
-        if self._knows_truth and frame.truth is not None:
-            labels = frame.truth.labels
-            robot_mask = np.asarray(labels == ROBOT_LABEL)
-            ripe = frame.truth.ripe_labels
-            masks = labels[None] == np.array(ripe, labels.dtype)[:, None, None]
-            fruits = Instances.from_masks(masks, categories=(RIPE_CATEGORIES[0],) * len(ripe))
+        numbers: tuple[int, ...] = ()
+        if frame.truth is not None:
+            # With a segmenter only the twin's judgement of itself asks for these.
+            fruits, numbers = _true_fruits(frame.truth)
+            robot_mask = np.asarray(frame.truth.labels == ROBOT_LABEL) if self._knows_truth else None
         return PosedFrame(
             depth_m=frame.depth,
             intrinsics=frame.intrinsics,
@@ -166,7 +191,19 @@ class ImagePerception:
             rgb=frame.color,
             robot_mask=robot_mask,
             true_fruits=fruits,
+            true_numbers=numbers,
         )
+
+
+def _true_fruits(truth: FrameTruth) -> tuple[Instances, tuple[int, ...]]:
+    """The fruits in a picture and which they are, as far as the camera says."""
+    shown = set(np.unique(truth.labels).tolist())
+    ripe = [label for label in truth.ripe_labels if label in shown]
+    others = [label for label in truth.fruit_labels if label in shown and label not in truth.ripe_labels]
+    labels = np.array([*ripe, *others], truth.labels.dtype)
+    categories = (RIPE_CATEGORIES[0],) * len(ripe) + (UNRIPE_CATEGORY,) * len(others)
+    numbers = tuple(truth.fruit_labels.index(label) for label in labels) if truth.fruit_labels else ()
+    return Instances.from_masks(truth.labels[None] == labels[:, None, None], categories=categories), numbers
 
 
 class TruthPerception:
@@ -266,12 +303,12 @@ class RobotBelief:
             sighting: What the picture told.
             moves_left: Moves until the run ends.
         """
-        if not self._has_views:
+        if sighting.recall is not None:
+            sighting.recall(self._observer)
+        elif not self._has_views:
             target = torch.as_tensor(sighting.target_position, dtype=torch.float32)[None]
             self._observer.begin(torch.zeros(1, dtype=torch.int64), target)
-            self._has_views = True
-        elif sighting.recall is not None:
-            sighting.recall(self._observer)
+        self._has_views = True
         T_world_flange, T_world_camera = self._poses(joint_positions)
         self._rpy = matrix_to_rpy(T_world_flange[:, :3, :3], self._rpy)
         viewpoint = torch.cat([T_world_flange[:, :3, 3], self._rpy], dim=-1)

@@ -7,12 +7,13 @@ When there is no such part either, the inspection is over.
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import Final
+from typing import Final, TypeVar
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from maniskill_tomato.segmentation.masks import BinaryMask
 from maniskill_tomato.sensing.fruit_map import FruitMap, MappedView, Track
 from maniskill_tomato.sensing.measurement import Position
 from maniskill_tomato.sensing.posed_frame import PosedFrame
@@ -61,6 +62,7 @@ SOLID_SHARE: Final = 0.6
 """Centres of two fruits are at least this share of the sum of their radii apart; nearer ones are one fruit."""
 
 Float64 = NDArray[np.float64]
+_Pixel = TypeVar("_Pixel", bound=np.generic)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -79,6 +81,8 @@ class SeenView:
     """Pose of the optical frame. Shape (4, 4)."""
     picture: NDArray[np.uint8] | None
     """What is round the fruit; None from a camera without colours. Shape (H, W, 3)."""
+    mask: BinaryMask
+    """Visible pixels of the fruit in that cut-out. Shape (H, W)."""
     shown_fruit: int | None
     """Which fruit of the plant it is, where a simulated camera tells."""
 
@@ -170,6 +174,7 @@ class Inspection:
                     picture=None
                     if frame.rgb is None
                     else _cut_out(frame.rgb, fruit.corner, fruit.crop.shape),
+                    mask=_cut_out(mask, fruit.corner, fruit.crop.shape),
                     shown_fruit=frame.shown_fruit(mask),
                 )
         self._unscanned = {k for k in self._unscanned if not self._shows(frame, k)}
@@ -348,8 +353,8 @@ def _position_error(track: Track) -> float:
     return float(np.sqrt(np.trace(track.covariance[:3, :3]) / 3.0))
 
 
-def _cut_out(rgb: NDArray[np.uint8], corner: tuple[int, int], size: tuple[int, ...]) -> NDArray[np.uint8]:
+def _cut_out(picture: NDArray[_Pixel], corner: tuple[int, int], size: tuple[int, ...]) -> NDArray[_Pixel]:
     """A square about a detection, twice as large as that, within the picture."""
     half = max(size)
     row, column = corner[0] + size[0] // 2, corner[1] + size[1] // 2
-    return rgb[max(row - half, 0) : row + half, max(column - half, 0) : column + half].copy()
+    return picture[max(row - half, 0) : row + half, max(column - half, 0) : column + half].copy()

@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import Final, Literal, get_args
+from typing import Literal, get_args
 
 import numpy as np
 import torch
@@ -20,9 +20,6 @@ from maniskill_tomato.tasks.world_state import MAX_TARGETS
 Transits = Literal["none", "target", "refused", "both"]
 """When the arm goes by its ready posture (`robot.transit`): never; to the next target, if it cannot look at it from
 where it stands; where a move is refused, if another posture reaches the place; or both."""
-
-STAND_OFF: Final = 0.3
-"""Places for the first view of a target are at least this far from it, in [m]."""
 
 
 class TargetSequence:
@@ -108,14 +105,12 @@ class TargetSequence:
         """
         if self.transits not in ("target", "both"):
             return None
-        qpos = self._world.state.qpos[env_index]
-        if self._planner.can_turn(qpos, known_target):
-            return None
-        position = self._world.T_w_camera[env_index, :3, 3]
-        places = self._lattice.positions(known_target[None])[0]
-        places = places[(places - position).norm(dim=-1).argsort()]
-        away = (places - known_target).norm(dim=-1)
-        return self._planner.plan(qpos, places[away >= STAND_OFF], known_target)
+        return self._planner.to_first_view(
+            self._world.state.qpos[env_index],
+            self._world.T_w_camera[env_index, :3, 3],
+            self._lattice.positions(known_target[None])[0],
+            known_target,
+        )
 
     def ways_of_refused(self, plan: Plan, action: Tensor, known_target: Tensor) -> Plan:
         """The plan with transits where a look-at move is refused and another posture reaches the place.

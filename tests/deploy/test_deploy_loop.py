@@ -278,9 +278,19 @@ def test_a_neighbour_does_not_pass_for_a_target_that_is_not_found(seed: int) -> 
 
 def test_without_a_given_target_the_largest_fruit_in_the_picture_is_taken() -> None:
     text = TEXT.format(twin="", loop="").replace('source = "twin"', 'source = "seen"')
-    result, workcell = go(parse_profile(text, Path("seen.toml")), open_policy("nbv", env_id=TASK))
+    kept = KeptSteps()
+    seen = parse_profile(text, Path("seen.toml"))
+    result, workcell = go(seen, open_policy("nbv", env_id=TASK), recorders=[kept])
     assert not result.is_fault and result.reason in ("success", "budget", "refused")
     assert result.visible_fractions[0] > 0.0
+    # What the twin tells of V_f is that of the fruit that was chosen, not of the episode's.
+    episode, last = load_episode("held_out", EPISODE), kept.steps[-1]
+    T = episode.T_world_plant.double().numpy()
+    centres = np.array([f.centre for f in episode.plant.fruits]) @ T[:3, :3].T + T[:3, 3]
+    chosen = int(np.linalg.norm(centres - last.target_position, axis=1).argmin())
+    assert np.linalg.norm(centres[chosen] - last.target_position) < 0.015
+    truth = workcell.twin().visible_fractions([chosen], last.joint_positions)[0]
+    assert result.true_visible_fraction == pytest.approx(truth, abs=1e-6)
 
 
 @pytest.mark.parametrize(
