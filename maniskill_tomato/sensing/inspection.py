@@ -213,9 +213,13 @@ class Inspection:
             return True
         share = 0.5 if self._most < LITTLE else 1.0
         if moves >= max_moves or self._lost >= share * LOST_AFTER or self._stale >= share * STALE_AFTER:
-            self.given_up[number] = self.given_up.get(number, 0) + 1
+            self.give_up(number)
             return True
         return False
+
+    def give_up(self, number: int) -> None:
+        """Gives a track up, for example because the arm gets no nearer to it; see `CHANCES`."""
+        self.given_up[number] = self.given_up.get(number, 0) + 1
 
     def next(self, fruits: FruitMap, camera_position: Position, lattice: ViewLattice) -> Aim | None:
         """Chooses what to look at next, and keeps it as `aim`.
