@@ -132,7 +132,7 @@ class WholeRow:
         inspection, fruits = self._inspection, self._mapper.map(0)
         aim = inspection.aim
         if self._gives_up and aim is not None and aim.track is not None:
-            inspection.given_up.add(aim.track)
+            inspection.give_up(aim.track)
         is_done = aim is None or inspection.is_done(fruits, moves - self._turned_at, self.max_moves)
         if is_done or self._gives_up:
             self._gives_up = self._retreating = self._replans = False
