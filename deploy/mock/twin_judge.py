@@ -1,19 +1,17 @@
 """The twin judges an inspection list by what its plants truly are."""
 
 from collections.abc import Sequence
-from typing import Any, Final
+from typing import Any
 
 import numpy as np
 import torch
 
 from maniskill_tomato.deploy.interface import Float64
 from maniskill_tomato.deploy.mock.twin_world import TwinWorld
+from maniskill_tomato.plants.organs import Plant
 from maniskill_tomato.sensing.inspection import InspectedFruit
+from maniskill_tomato.sensing.inspection_judge import NO_FRUIT, JudgedFruit, judge_fruits
 from maniskill_tomato.sensing.view_lattice import ViewLattice
-
-NEAREST_FRUIT: Final = 0.03
-"""A listed fruit whose best view does not tell which it is counts as the nearest one, if that is nearer than this, in
-[m]."""
 
 
 def judge(
@@ -38,19 +36,21 @@ def judge(
     T_world_plant = world.episode.T_world_plant.double().numpy()
     centres = np.array([fruit.centre for fruit in plant.fruits], dtype=np.float64)
     centres = centres @ T_world_plant[:3, :3].T + T_world_plant[:3, 3]
-    entries = [_judged(world, fruit, view_joints, centres) for fruit in fruits]
+
+    def fraction(fruit: int, view: int) -> float:
+        return world.visible_fractions([fruit], view_joints[view])[0]
+
+    judged = judge_fruits(fruits, plant, centres, fraction)
     ripe = [j for j, fruit in enumerate(plant.fruits) if fruit.ripeness == "ripe"]
     reached = ViewLattice().in_reach(torch.as_tensor(centres[ripe], dtype=torch.float32)).tolist()
     in_reach = {j for j, fits in zip(ripe, reached, strict=True) if fits}
     seen: set[int] = set()
     right: dict[int, float] = {}
-    for fruit, entry in zip(fruits, entries, strict=True):
-        number = entry["true_fruit"]
-        if not fruit.is_ripe or number is None or entry["true_ripeness"] != "ripe":
-            continue
-        right.setdefault(number, entry["true_position_error_m"])
-        if fruit.is_fully_seen and entry["true_visible_fraction"] > threshold:
-            seen.add(number)
+    for fruit in judged:
+        if fruit.is_ripe and fruit.is_truly_ripe:
+            right.setdefault(fruit.fruit, fruit.position_error_m)
+            if fruit.is_fully_seen and fruit.true_fraction > threshold:
+                seen.add(fruit.fruit)
     wanted, listed = in_reach | seen, sum(fruit.is_ripe for fruit in fruits)
     totals = {
         "true_ripe_in_reach": len(wanted),
@@ -59,23 +59,14 @@ def judge(
         "true_precision": round(len(right) / listed, 4) if listed else None,
         "true_position_error_median_m": round(float(np.median(list(right.values()))), 5) if right else None,
     }
-    return entries, totals
+    return [_entry(fruit, plant) for fruit in judged], totals
 
 
-def _judged(
-    world: TwinWorld, fruit: InspectedFruit, view_joints: Sequence[Float64], centres: Float64
-) -> dict[str, Any]:
-    best = fruit.best
-    number = None if best is None else best.shown_fruit
-    away = np.linalg.norm(centres - fruit.position_w, axis=1)
-    if number is None and away.min() < NEAREST_FRUIT:
-        number = int(away.argmin())
-    fraction = 0.0
-    if number is not None and best is not None:
-        fraction = world.visible_fractions([number], view_joints[best.view])[0]
+def _entry(fruit: JudgedFruit, plant: Plant) -> dict[str, Any]:
+    is_any = fruit.fruit != NO_FRUIT
     return {
-        "true_fruit": number,
-        "true_ripeness": None if number is None else world.episode.plant.fruits[number].ripeness,
-        "true_visible_fraction": round(fraction, 4),
-        "true_position_error_m": None if number is None else round(float(away[number]), 5),
+        "true_fruit": fruit.fruit if is_any else None,
+        "true_ripeness": plant.fruits[fruit.fruit].ripeness if is_any else None,
+        "true_visible_fraction": round(fruit.true_fraction, 4),
+        "true_position_error_m": fruit.position_error_m if is_any else None,
     }

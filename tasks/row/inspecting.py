@@ -1,41 +1,17 @@
 """A row that a robot inspects with its camera alone: what it senses, what it looks at next, and how that is judged."""
 
-from dataclasses import dataclass
-
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
 from maniskill_tomato.errors import InvalidInputError
 from maniskill_tomato.robot.kinematics import link_transforms
 from maniskill_tomato.sensing.inspection import InspectedFruit, Inspection
+from maniskill_tomato.sensing.inspection_judge import JudgedFruit, judge_fruits
 from maniskill_tomato.sensing.view_lattice import ViewLattice
-from maniskill_tomato.tasks.row.senses import NO_FRUIT, CameraSenses, ViewMeasurement, ViewPoses
+from maniskill_tomato.tasks.row.senses import CameraSenses, ViewMeasurement, ViewPoses
 from maniskill_tomato.tasks.row.target_sequence import TargetSequence, Transits
 from maniskill_tomato.tasks.world import World
-
-NEAREST_FRUIT = 0.03
-"""A listed fruit that no view tells is the nearest one of the plant, if that is nearer than this, in [m]."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class JudgedFruit:
-    """One fruit of an inspection list beside the truth."""
-
-    fruit: int
-    """Which fruit of the plant it is, as an index in `Plant.fruits`; -1 if none."""
-    is_ripe: bool
-    """What the list says."""
-    is_truly_ripe: bool
-    is_fully_seen: bool
-    """What the list says."""
-    true_fraction: float
-    """V_f of the fruit in the view that showed most of it; 0 if there was none."""
-    position_error_m: float
-    """Distance of the listed centre from the true one, in [m]; -1 for no fruit."""
-    radius_error_m: float
-    """Listed radius less the true one, in [m]; 0 for no fruit."""
 
 
 class InspectingSenses(CameraSenses):
@@ -134,42 +110,14 @@ class InspectingSenses(CameraSenses):
         """The inspection list so far beside the truth."""
         world, plant = self._world, self._world.plant_batch.plants[env_index]
         centres = world.plant_batch.fruit_positions_w(env_index, list(range(len(plant.fruits))))
-        true_centres = centres.double().cpu().numpy()
-        return [self._judged_fruit(env_index, fruit, true_centres) for fruit in self.listed(env_index)]
+        T_w_plant = world.plant_batch.T_world_plant[env_index]
 
-    def _judged_fruit(
-        self, env_index: int, fruit: InspectedFruit, centres: NDArray[np.float64]
-    ) -> JudgedFruit:
-        world, plant, best = self._world, self._world.plant_batch.plants[env_index], fruit.best
-        number = NO_FRUIT if best is None or best.shown_fruit is None else best.shown_fruit
-        away = np.linalg.norm(centres - fruit.position_w, axis=1)
-        if number == NO_FRUIT and away.min() < NEAREST_FRUIT:
-            number = int(away.argmin())
-        if number == NO_FRUIT:
-            return JudgedFruit(
-                fruit=number,
-                is_ripe=fruit.is_ripe,
-                is_truly_ripe=False,
-                is_fully_seen=fruit.is_fully_seen,
-                true_fraction=0.0,
-                position_error_m=-1.0,
-                radius_error_m=0.0,
-            )
-        fraction = 0.0
-        if best is not None:
-            pose = torch.as_tensor(best.T_world_camera, dtype=torch.float32, device=world.device)[None]
-            links = link_transforms(self._view_qpos[env_index][best.view][None])
-            T_w_plant = world.plant_batch.T_world_plant[env_index]
-            fraction = float(world.scene.visible_fraction_from(pose, number, T_w_plant, links, env_index)[0])
-        return JudgedFruit(
-            fruit=number,
-            is_ripe=fruit.is_ripe,
-            is_truly_ripe=plant.fruits[number].ripeness == "ripe",
-            is_fully_seen=fruit.is_fully_seen,
-            true_fraction=round(fraction, 5),
-            position_error_m=round(float(away[number]), 5),
-            radius_error_m=round(fruit.radius_m - plant.fruits[number].radius, 5),
-        )
+        def fraction(fruit: int, view: int) -> float:
+            T_w_links = link_transforms(self._view_qpos[env_index][view][None])
+            poses = world.camera_poses(T_w_links)
+            return float(world.scene.visible_fraction_from(poses, fruit, T_w_plant, T_w_links, env_index)[0])
+
+        return judge_fruits(self.listed(env_index), plant, centres.double().cpu().numpy(), fraction)
 
 
 class InspectedSequence(TargetSequence):

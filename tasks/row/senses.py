@@ -14,6 +14,7 @@ from torch import Tensor
 
 from maniskill_tomato.errors import InvalidInputError
 from maniskill_tomato.raycast.view_rays import ViewRays
+from maniskill_tomato.sensing.inspection_judge import NO_FRUIT
 from maniskill_tomato.sensing.observation import ViewpointObserver
 from maniskill_tomato.sensing.perception_kinds import RENDERED, Perception
 from maniskill_tomato.sensing.posed_frame import PosedFrame
@@ -25,9 +26,6 @@ from maniskill_tomato.tasks.world_state import NOISE_SEEDS
 
 VIEWS_A_SEED = 256
 """Views of an episode are fewer than this."""
-
-NO_FRUIT = -1
-"""Stands for a fruit where there is none."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
