@@ -133,7 +133,11 @@ class WholeRow:
         aim = inspection.aim
         if self._gives_up and aim is not None and aim.track is not None:
             inspection.give_up(aim.track)
-        is_done = aim is None or inspection.is_done(fruits, moves - self._turned_at, self.max_moves)
+        # A place to scan counts as done after any move, one on the way to it too.
+        is_on_its_way = self._retreating or (self._replans and aim is not None and aim.track is None)
+        is_done = not is_on_its_way and (
+            aim is None or inspection.is_done(fruits, moves - self._turned_at, self.max_moves)
+        )
         if is_done or self._gives_up:
             self._gives_up = self._retreating = self._replans = False
             aim = inspection.next(fruits, T_world_camera[:3, 3], self._lattice)

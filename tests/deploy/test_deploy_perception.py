@@ -27,6 +27,8 @@ from maniskill_tomato.sensing.simulated_camera import SimulatedCamera
 
 SEEDS = (4, 9)
 MOVES = ((0.4, 0.3, 0.2), (0.5, -0.2, 0.6), (-0.3, 0.6, 0.3))
+RED = np.full((240, 320, 3), (200, 40, 30), np.uint8)
+"""The picture that all frames have: its fruits are as red as ripe ones."""
 NO_RAYS = ViewRays(torch.zeros(1, 256, 3), torch.zeros(1, 256), torch.zeros(1, 256, dtype=torch.int8))
 
 
@@ -40,7 +42,7 @@ def robot_frame(frame: PosedFrame, number: int) -> Frame:
     categories = enumerate(frame.true_fruits.categories)
     ripe = tuple(FIRST_ORGAN_LABEL + k for k, category in categories if category == "tomato_ripe")
     return Frame(
-        color=np.zeros((*labels.shape, 3), np.uint8),
+        color=RED,
         depth=frame.depth_m,
         intrinsics=frame.intrinsics,
         stamp=float(number),
@@ -83,8 +85,7 @@ def test_the_same_frames_give_the_same_observation_in_the_simulator_and_on_the_r
     episodes = [load_episode("held_out", seed) for seed in SEEDS]
     n, mount = len(episodes), torch.tensor(T_flange_camera_color_optical, dtype=torch.float32)
     scene = RayScene([e.plant for e in episodes], color_intrinsics(320, 240), robot_meshes=link_meshes())
-    width, height = 320, 240
-    camera = SimulatedCamera(scene, picture=lambda k: np.zeros((height, width, 3), np.uint8))
+    camera = SimulatedCamera(scene, picture=lambda k: RED)
     segmenter = None if masks == "true" else FrameSegmenter()
     targets = torch.stack([e.target_position for e in episodes])
     T_world_plant = torch.stack([e.T_world_plant for e in episodes])
