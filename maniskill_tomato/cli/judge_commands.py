@@ -80,7 +80,7 @@ class JudgeOcclusion:
 
 @dataclass(frozen=True, kw_only=True)
 class JudgeSegmenter:
-    """Judge a segmenter on annotated images: precision, recall, AP (Eq. 4-1 to 4-3), COCO's AP, curves and pictures."""
+    """Judge a segmenter on annotated images: precision, recall, AP (Eq. 4-1 to 4-3), COCO's AP and AR, pictures."""
 
     data: str
     """Folder of annotated images, or FOLDER:SPLIT for one list of it (`photos:val` for its val.txt)."""
@@ -94,7 +94,7 @@ class JudgeSegmenter:
     """Rendered fruits narrower than this share of the image's longer side are set aside; by default 12 px of 640; 0:
     the tiniest alone."""
     out: Path = Path("runs/segmenter-evaluation")
-    """Folder of metrics.json, precision_recall.png and pictures.jpg."""
+    """Folder of metrics.json, precision_recall.png, overlaps.png and pictures.jpg."""
 
     def run(self) -> None:
         """Evaluates and prints the figures."""
@@ -105,7 +105,7 @@ class JudgeSegmenter:
         from maniskill_tomato.files import write_atomically
         from maniskill_tomato.segmentation.datasets.annotations import SMALLEST_SHARE
         from maniskill_tomato.segmentation.datasets.reading import read_place
-        from maniskill_tomato.segmentation.metrics.detector_evaluation import evaluate_segmenter
+        from maniskill_tomato.segmentation.metrics.detector_evaluation import coco_table, evaluate_segmenter
         from maniskill_tomato.segmentation.segmenter import open_for_files
 
         segmenter = open_for_files(self.segmenter, 0.02, self.thorough)
@@ -117,7 +117,9 @@ class JudgeSegmenter:
         described = {"segmenter": self.segmenter, "thorough": self.thorough, "data": self.data, **metrics}
         write_atomically(self.out / "metrics.json", json.dumps(described, indent=1).encode())
         for name, value in metrics.items():
-            print(f"{name:24} {value:.4g}")
+            if not name.startswith("coco_"):
+                print(f"{name:24} {value:.4g}")
+        print(coco_table(metrics))
 
 
 @dataclass(frozen=True, kw_only=True)

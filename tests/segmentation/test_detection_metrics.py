@@ -168,6 +168,32 @@ def test_precision_and_recall_agree_with_a_plain_loop_over_pixels(overlap: str) 
         np.testing.assert_allclose(curve.precision, np.cumsum(hits) / np.arange(1, len(hits) + 1))
 
 
+def test_loose_boxes_cost_precision_and_recall_at_the_overlaps_that_they_miss_and_only_in_their_size() -> (
+    None
+):
+    """A box 22 px wide on a fruit of 16 px has an overlap of 16 / 22 = 0.727: found at five of COCO's ten overlaps."""
+    score = DetectionScore()
+    fruits = [[10.0, 10, 26, 26], [30, 30, 80, 80]]
+    score.add(found_boxes([[10, 10, 32, 26], [30, 30, 80, 80]], [0.9, 0.8]), true_boxes(fruits))
+    metrics = score.coco_metrics()
+    assert (metrics["AP_small"], metrics["AR_small"]) == pytest.approx((0.5, 0.5))
+    assert (metrics["AP_medium"], metrics["AR_medium"]) == pytest.approx((1, 1))
+    assert metrics["AP_large"] == metrics["AR_large"] == -1, "there is no large fruit"
+    assert metrics["AR100"] == pytest.approx(0.75)
+    precision = score.precision_by_overlap()
+    assert precision.keys() == {"all", "small", "medium"}
+    np.testing.assert_allclose(precision["small"], [1] * 5 + [0] * 5)
+    np.testing.assert_allclose(precision["medium"], 1)
+    assert precision["all"].mean() == pytest.approx(metrics["AP"])
+
+
+def test_without_detections_precision_is_zero_at_every_overlap_and_without_fruits_there_is_none() -> None:
+    score = DetectionScore()
+    assert score.precision_by_overlap() == {}
+    score.add(found_boxes([], []), true_boxes([[0, 0, 10, 10]]))
+    assert not score.precision_by_overlap()["all"].any()
+
+
 def test_detections_beyond_coco_s_hundred_count_in_the_curve() -> None:
     """A fruit that the 151st detection of an image finds: COCO looks at a hundred of them, Eq. 4-2 at all."""
     score = DetectionScore()

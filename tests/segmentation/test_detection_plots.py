@@ -8,7 +8,7 @@ import pytest
 from numpy.typing import NDArray
 
 from maniskill_tomato.errors import InvalidInputError
-from maniskill_tomato.segmentation.metrics.detection_plots import COLOURS, plot_losses
+from maniskill_tomato.segmentation.metrics.detection_plots import COLOURS, plot_losses, plot_overlaps
 
 HISTORY = [
     {
@@ -52,6 +52,15 @@ def test_a_training_without_validation_has_one_row_and_runs_have_their_colours(t
     assert coloured(loss, COLOURS[1]) > 50
     # Equal curves: the second run's lies on the first's.
     assert coloured(centre, COLOURS[1]) > 50
+
+
+def test_boxes_and_masks_have_a_panel_each_with_a_curve_for_every_size(tmp_path: Path) -> None:
+    falling = np.linspace(0.9, 0.1, 10)
+    boxes = {"all": falling, "small": falling / 2}
+    plot_overlaps({"box": boxes, "mask": {"all": falling}}, tmp_path / "overlaps.png")
+    ((box, mask),) = panels(tmp_path / "overlaps.png", 1, 2)
+    assert coloured(box, COLOURS[0]) > 50 and coloured(box, COLOURS[1]) > 50
+    assert coloured(mask, COLOURS[0]) > 50 and coloured(mask, COLOURS[1]) == 0
 
 
 @pytest.mark.parametrize("histories", [{}, {"run": []}])

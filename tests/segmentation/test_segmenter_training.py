@@ -1,6 +1,7 @@
 """Mask R-CNN, YOLO's files and the two commands, on drawn pictures."""
 
 import json
+import re
 import sys
 from dataclasses import replace
 from pathlib import Path
@@ -243,7 +244,13 @@ def test_judging_finds_a_perfect_segmenter_perfect(
     metrics = json.loads((tmp_path / "out" / "metrics.json").read_text())
     assert metrics["fruits"] == 6 and metrics["box_AP50"] == 1 and metrics["mask_AP50"] == 1
     assert metrics["coco_mask_AP50"] == pytest.approx(1)
-    picture = cv2.imread(str(tmp_path / "out" / "precision_recall.png"))
-    assert picture is not None and picture.std() > 5
+    assert metrics["coco_box_AP"] == metrics["coco_box_AR100"] == pytest.approx(1)
+    for name in ("precision_recall.png", "overlaps.png"):
+        picture = cv2.imread(str(tmp_path / "out" / name))
+        assert picture is not None and picture.std() > 5
     assert (tmp_path / "out" / "pictures.jpg").is_file()
-    assert "box_AP50" in capsys.readouterr().out
+    out = capsys.readouterr().out
+    assert "box_AP50" in out
+    header, *rows = out[out.index("COCO ") :].splitlines()[:3]
+    assert re.split(r"  +", header)[1:5] == ["AP50", "AP50-95", "AP75", "AR"]
+    assert [row.split()[:5] for row in rows] == [[kind, *["1.000"] * 4] for kind in ("box", "mask")]

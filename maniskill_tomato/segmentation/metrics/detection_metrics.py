@@ -27,8 +27,18 @@ from maniskill_tomato.segmentation.masks import EncodedMask
 
 Overlap = Literal["box", "mask"]
 
-COCO_NAMES = ("AP", "AP50", "AP75", "AP_small", "AP_medium", "AP_large", "AR1", "AR10", "AR100")
-"""What COCO reports first: mean AP over overlaps 0.5 to 0.95, at 0.5, at 0.75, by size; mean recall."""
+COCO_SIZES = ("small", "medium", "large")
+"""COCO's sizes: areas below 32 x 32 px, up to 96 x 96 px, and above."""
+
+COCO_NAMES = (
+    *("AP", "AP50", "AP75", *(f"AP_{size}" for size in COCO_SIZES)),
+    *("AR1", "AR10", "AR100", *(f"AR_{size}" for size in COCO_SIZES)),
+)
+"""What COCO reports: mean AP over overlaps 0.5 to 0.95 (AP50-95), AP at 0.5, at 0.75, and AP50-95 by size; mean recall
+over the same overlaps with 1, 10 and 100 detections an image, and with 100 by size."""
+
+COCO_OVERLAPS = tuple(round(0.5 + 0.05 * step, 2) for step in range(10))
+"""Least intersections over union of a found fruit that COCO averages over."""
 
 COCO_LIMITS = (1, 10, 100, 100_000)
 """Detections an image that count: COCO's own for its figures, and all of them for the curve."""
@@ -209,6 +219,22 @@ class DetectionScore:
             judged.accumulate()
             judged.summarize()
         return {name: float(value) for name, value in zip(COCO_NAMES, judged.stats, strict=False)}
+
+    def precision_by_overlap(self) -> dict[str, NDArray[np.float64]]:
+        """COCO's AP at each of `COCO_OVERLAPS`, of all fruits and of each size that occurs; it falls with loose boxes.
+
+        Raises:
+            MissingPackageError: pycocotools is not installed.
+        """
+        if not self._detections:
+            return {"all": np.zeros(len(COCO_OVERLAPS))} if self.fruits else {}
+        judged = self._evaluated()
+        with contextlib.redirect_stdout(io.StringIO()):
+            judged.accumulate()
+        # Overlap, recall, category, size, limit on detections.
+        precision = judged.eval["precision"][:, :, 0, :, COCO_LIMITS.index(100)].mean(axis=1)
+        found = dict(zip(("all", *COCO_SIZES), precision.T, strict=True))
+        return {name: values for name, values in found.items() if values[0] >= 0}
 
     def _entry(self, image: int, box: NDArray[Any], mask: NDArray[np.bool_] | None) -> dict[str, Any]:
         entry: dict[str, Any] = {"image_id": image, "category_id": 1}

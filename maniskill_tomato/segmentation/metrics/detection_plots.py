@@ -8,10 +8,11 @@ from typing import Any
 import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
+from numpy.typing import NDArray
 
 from maniskill_tomato.errors import InvalidInputError
 from maniskill_tomato.files import write_atomically
-from maniskill_tomato.segmentation.metrics.detection_metrics import PrecisionRecall
+from maniskill_tomato.segmentation.metrics.detection_metrics import COCO_OVERLAPS, PrecisionRecall
 
 COLOURS = ("#d9822b", "#2f6fb7", "#2f6b42", "#b8392a")
 """Of the runs in a figure; the first two are those of Fig. 4-9 to 4-19."""
@@ -30,10 +31,32 @@ def plot_precision_recall(curves: Mapping[str, PrecisionRecall], path: Path) -> 
         precision = np.concatenate([curve.precision[:1], curve.precision])
         envelope = np.maximum.accumulate(precision[::-1])[::-1]
         axes.plot(recall, precision, color=colour, alpha=0.35, linewidth=1)
-        axes.plot(recall, envelope, color=colour, label=f"{name}, AP {curve.average_precision:.4f}")
+        axes.plot(recall, envelope, color=colour, label=f"{name}, AP50 {curve.average_precision:.4f}")
     axes.set(xlabel="recall", ylabel="precision", xlim=(0, 1), ylim=(0, 1.02))
     axes.grid(alpha=0.3)
     axes.legend(loc="lower left")
+    _write(figure, path)
+
+
+def plot_overlaps(precision: Mapping[str, Mapping[str, NDArray[np.float64]]], path: Path) -> None:
+    """AP over the overlap that is asked for, one panel for boxes and one for masks, with a curve for each size.
+
+    Args:
+        precision: Of boxes or masks, what `DetectionScore.precision_by_overlap` gives.
+        path: The picture.
+
+    Raises:
+        CheckpointError: The file cannot be written.
+    """
+    figure = Figure(figsize=(4.2 * len(precision), 3.6), layout="constrained")
+    panels = figure.subplots(1, len(precision), squeeze=False)[0]
+    for axes, (overlap, sizes) in zip(panels, precision.items(), strict=True):
+        for (size, values), colour in zip(sizes.items(), COLOURS, strict=False):
+            label = f"{size}, AP50-95 {values.mean():.3f}"
+            axes.plot(COCO_OVERLAPS, values, "o-", color=colour, markersize=3, label=label)
+        axes.set(xlabel=f"least overlap of the {overlap}", ylabel="AP", ylim=(0, 1.02))
+        axes.grid(alpha=0.3)
+        axes.legend(loc="lower left", fontsize=8)
     _write(figure, path)
 
 

@@ -1,7 +1,7 @@
 """Evaluation of a segmenter on annotated images: metrics, curves, pictures."""
 
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -12,13 +12,14 @@ from maniskill_tomato.segmentation.datasets.picture_files import write_picture
 from maniskill_tomato.segmentation.drawing import contact_sheet, draw_instances
 from maniskill_tomato.segmentation.instances import Image
 from maniskill_tomato.segmentation.metrics.detection_metrics import (
+    COCO_SIZES,
     DetectionScore,
     Overlap,
     PrecisionRecall,
     image_truth,
     without_narrow,
 )
-from maniskill_tomato.segmentation.metrics.detection_plots import plot_precision_recall
+from maniskill_tomato.segmentation.metrics.detection_plots import plot_overlaps, plot_precision_recall
 from maniskill_tomato.segmentation.segmenter import Segmenter
 
 PICTURES = 16
@@ -37,8 +38,8 @@ def evaluate_segmenter(
 ) -> dict[str, float]:
     """Runs a segmenter over images and compares with their annotation; all fruits count, ripe or not.
 
-    Writes `precision_recall.png` (Fig. 4-20, 4-24) and `pictures.jpg` (Fig. 4-21 to 4-27). Masks are compared if every
-    image has them.
+    Writes `precision_recall.png` (Fig. 4-20, 4-24), `overlaps.png` (AP over the overlap, by size) and `pictures.jpg`
+    (Fig. 4-21 to 4-27). Masks are compared if every image has them.
 
     Args:
         segmenter: What to judge.
@@ -50,8 +51,8 @@ def evaluate_segmenter(
 
     Returns:
         `box_AP50` and `mask_AP50` (Eq. 4-3 at an overlap of 0.5), precision and recall at `WORKING_SCORE`, COCO's
-        metrics as `coco_box_...` and `coco_mask_...`, counts, seconds an image; in rendered images with rows behind
-        also `front_box_AP50` and `front_mask_AP50`, of the fruits of the row in front alone.
+        metrics as `coco_box_...` and `coco_mask_...` (`COCO_NAMES`), counts, seconds an image; in rendered images with
+        rows behind also `front_box_AP50` and `front_mask_AP50`, of the fruits of the row in front alone.
 
     Raises:
         InvalidInputError: There is no image, or one cannot be read.
@@ -103,5 +104,20 @@ def evaluate_segmenter(
         }
     metrics["median_seconds"] = float(np.median(seconds))
     plot_precision_recall(curves, out / "precision_recall.png")
+    plot_overlaps({k: score.precision_by_overlap() for k, score in scores.items()}, out / "overlaps.png")
     write_picture(out / "pictures.jpg", contact_sheet(drawn))
     return metrics
+
+
+def coco_table(metrics: Mapping[str, float]) -> str:
+    """COCO's metrics among those of `evaluate_segmenter` as a table: one line for boxes, one for masks."""
+    columns = {"AP50": "AP50", "AP50-95": "AP", "AP75": "AP75", "AR": "AR100"}
+    columns |= {f"{kind} {size}": f"{kind}_{size}" for size in COCO_SIZES for kind in ("AP", "AR")}
+    lines = [f"{'COCO':6}" + "".join(f"{name:>11}" for name in columns)]
+    for overlap in ("box", "mask"):
+        values = [metrics.get(f"coco_{overlap}_{key}") for key in columns.values()]
+        if None not in values:
+            # COCO gives -1 where there is no fruit of a size.
+            shown = ["-" if value is None or value < 0 else f"{value:.3f}" for value in values]
+            lines.append(f"{overlap:6}" + "".join(f"{text:>11}" for text in shown))
+    return "\n".join(lines)
