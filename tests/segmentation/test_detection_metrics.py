@@ -173,7 +173,7 @@ def test_loose_boxes_cost_precision_and_recall_at_the_overlaps_that_they_miss_an
 ):
     """A box 22 px wide on a fruit of 16 px has an overlap of 16 / 22 = 0.727: found at five of COCO's ten overlaps."""
     score = DetectionScore()
-    fruits = [[10.0, 10, 26, 26], [30, 30, 80, 80]]
+    fruits = [[10.0, 10.0, 26.0, 26.0], [30.0, 30.0, 80.0, 80.0]]
     score.add(found_boxes([[10, 10, 32, 26], [30, 30, 80, 80]], [0.9, 0.8]), true_boxes(fruits))
     metrics = score.coco_metrics()
     assert (metrics["AP_small"], metrics["AR_small"]) == pytest.approx((0.5, 0.5))
