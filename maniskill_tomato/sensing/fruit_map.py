@@ -222,19 +222,24 @@ class FruitMap:
             last: The view.
 
         Returns:
-            The picture with the track of the detection that each overlaps with, `NO_TRACK` where there is none.
+            The picture with the track of the detection that each overlaps with, else with the one that it is assigned
+            to; `NO_TRACK` where there is none.
         """
         measurement = self._divided(measurement)
         before = [last.measurement.mask(k) for k in range(len(last.tracks))]
-        tracks = []
+        tracks: list[int | None] = []
         for k in range(len(measurement.fruits)):
             mask = measurement.mask(k)
             overlaps = [np.count_nonzero(mask & m) / np.count_nonzero(mask | m) for m in before]
             best = int(np.argmax(overlaps)) if overlaps else None
             same = best is not None and overlaps[best] > SAME_OVERLAP
-            number = self.current(last.tracks[best]) if best is not None and same else None
-            tracks.append(NO_TRACK if number is None else number)
-        return MappedView(measurement=measurement, tracks=tuple(tracks))
+            tracks.append(self.current(last.tracks[best]) if best is not None and same else None)
+        for k, assigned in enumerate(self._assigned(measurement)):
+            if tracks[k] is None and assigned not in tracks:
+                tracks[k] = assigned
+        return MappedView(
+            measurement=measurement, tracks=tuple(NO_TRACK if number is None else number for number in tracks)
+        )
 
     def sphere_of(self, fruit: DetectedFruit, camera: Position) -> tuple[Float64, Float64]:
         """A detection as a measurement of centre and radius.

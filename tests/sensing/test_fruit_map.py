@@ -357,3 +357,6 @@ def test_the_same_picture_again_tells_nothing_more() -> None:
     assert track.existence_log_odds == existence
     elsewhere = DETECTOR.measure(cast(CAMERAS[0], [NEIGHBOUR + [0.0, 0.06, 0.0]]))
     assert fruits.again(elsewhere, first).tracks == (NO_TRACK,)
+    # A detection that the last picture lacked is found again by its place.
+    missed = fruits.again(DETECTOR.measure(cast(CAMERAS[0], [])), first)
+    assert fruits.again(measured, missed).tracks == (track.number,)
