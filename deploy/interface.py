@@ -86,6 +86,24 @@ class FrameTruth:
     """Labels of the ripe fruits, the target's among them."""
     rays: ViewRays
     """What the task's pattern of rays about the target meets."""
+    fruit_labels: tuple[int, ...] = ()
+    """Labels of all fruits in the order of `Plant.fruits`; empty where that is not known."""
+    ripe_fractions: tuple[float, ...] = ()
+    """V_f of the ripe fruits by ray casting, in the order of `ripe_labels`; empty where that is not known."""
+
+    def shown_label(self, mask: NDArray[np.bool_]) -> int | None:
+        """Label of the ripe fruit that half of a mask or more shows; None if there is none. Shape (H, W)."""
+        shown, counts = np.unique(self.labels[mask], return_counts=True)
+        if not len(shown) or 2 * counts.max() < counts.sum():
+            return None
+        label = int(shown[counts.argmax()])
+        return label if label in self.ripe_labels else None
+
+    def fraction(self, label: int) -> float | None:
+        """V_f of a ripe fruit; None where that is not known."""
+        if label not in self.ripe_labels or not self.ripe_fractions:
+            return None
+        return self.ripe_fractions[self.ripe_labels.index(label)]
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

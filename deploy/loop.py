@@ -2,8 +2,8 @@
 
     capture -> perceive -> observe -> policy -> kinematics -> safety -> arm -> settle -> capture
 
-A move that the kinematics or `safety` refuses counts as a move, as in the simulated task. The policy sees that the
-camera has not moved and tries something else.
+What a look means says the run's `Goal`: one fruit, or all of a row. A move that the kinematics or `safety` refuses
+counts as a move, as in the simulated task. The policy sees that the camera has not moved and tries something else.
 """
 
 import logging
@@ -26,8 +26,9 @@ from maniskill_tomato.deploy.deploy_errors import (
     PerceptionError,
     RefusedError,
 )
+from maniskill_tomato.deploy.goal import Goal, Look, OneFruit
 from maniskill_tomato.deploy.interface import Float64, Frame, JointMove
-from maniskill_tomato.deploy.move_choice import MoveChooser, MoveRequest
+from maniskill_tomato.deploy.move_choice import Choice, MoveChooser, MoveRequest
 from maniskill_tomato.deploy.plant_points import PlantPoints
 from maniskill_tomato.deploy.robot_perception import RobotBelief
 from maniskill_tomato.deploy.run_records import Mode, Proposal, Recorder, RunResult, Step
@@ -102,6 +103,7 @@ class Loop:
         mode: Mode = "dry_run",
         recorders: Sequence[Recorder] = (),
         confirm: Callable[[Proposal], bool] = lambda proposal: False,
+        goal: Goal | None = None,
     ) -> None:
         """Puts the stages together.
 
@@ -112,6 +114,7 @@ class Loop:
             mode: What happens before a move.
             recorders: Keep every step.
             confirm: Asked in the mode `confirm`.
+            goal: What the run is after; None for the profile's target.
 
         Raises:
             ProfileError: The profile names a target that there is not.
@@ -119,15 +122,15 @@ class Loop:
         profile = workcell.profile
         self._arm, self._camera, self._clock = workcell.guarded_arm, workcell.camera, workcell.clock
         self._capture = Capture(workcell.camera, profile.capture, workcell.clock)
-        self._perception, self._policy, self._stops = workcell.perception, policy, stops
-        self._config, self._mode = profile.loop, mode
+        self._policy, self._stops = policy, stops
+        self._goal = goal or OneFruit(workcell.perception, profile.loop, workcell.target_position())
+        self._settle, self._mode = profile.loop.settle, mode
         self._recorders, self._confirm = recorders, confirm
-        self._perception.begin(workcell.target_position())
-        self._robot_belief = RobotBelief(profile.T_flange_camera, profile.loop.max_moves)
+        self._robot_belief = RobotBelief(profile.T_flange_camera, self._goal.max_moves)
         self._chooser = MoveChooser(self._arm.safety, profile.T_flange_camera)
         self._points = PlantPoints(profile.T_flange_camera)
         self._fractions: list[float] = []
-        self._moves = self._refused = self._refused_in_a_row = self._lost_in_a_row = 0
+        self._moves = self._refused = self._refused_in_a_row = 0
         self._settled_at = self._clock.now()
         self._way_back: Float64 | None = None
         self._true_fraction: float | None = None
@@ -176,61 +179,65 @@ class Loop:
     def _one_look(self) -> None:
         self._check_stops()
         self._times.begin_step()
-        config = self._config
         with self._times.timed("capture"):
             self._camera.begin_view()
             frame = self._capture.take(self._settled_at, may_be_blind=self._way_back is not None)
             joints = self._arm.read().joint_positions
-        blind = self._capture.is_blind(frame)
-        step = self._look(frame, joints)
-        view = step.view
-        if view.visible_fraction > config.threshold:
-            self._end(step, "success", f"V_f = {view.visible_fraction:.2f} after {self._moves} moves")
-        if self._moves >= config.max_moves:
-            self._end(step, "budget", f"V_f = {view.visible_fraction:.2f} after all {config.max_moves} moves")
-        self._lost_in_a_row = 0 if view.target_seen else self._lost_in_a_row + 1
-        if self._lost_in_a_row >= config.lost_after:
-            self._end(
-                step, "target_lost", f"{self._lost_in_a_row} looks in a row showed nothing of the target"
-            )
-        if blind:
+        look, step = self._look(frame, joints)
+        if look.end is not None:
+            self._end(step, look.end.reason, look.end.detail)
+        if self._capture.is_blind(frame):
             self._moves += 1
             self._go_back(step)
             return
         self._way_back = joints
+        if look.go_to is not None:
+            self._moves += look.cost
+            self._send(replace(step, detail=look.detail), self._straight(step, look.go_to))
+            return
         with self._times.timed("policy"):
             action = decide(self._policy, self._belief)
         step = replace(step, action=(float(action[0]), float(action[1]), float(action[2])))
         self._moves += 1
-        self._act(step, frame)
+        self._send(step, self._chosen(step))
 
-    def _look(self, frame: Frame, joints: Float64) -> Step:
+    def _look(self, frame: Frame, joints: Float64) -> tuple[Look, Step]:
         T_world_camera = self._robot_belief.camera_pose(joints)
         with self._times.timed("perceive"):
-            view = self._perception.look(frame, T_world_camera)
-        if view is None:
+            look = self._goal.look(frame, T_world_camera, joints, self._moves)
+        if look is None:
             raise _End("no_target", "the first picture shows no ripe fruit; start where one is in view")
-        with self._times.timed("observe"):
-            moves_left = self._config.max_moves - self._moves
-            self._belief = self._robot_belief.observe(joints, view, moves_left)
+        view = look.view
+        if look.go_to is None:
+            with self._times.timed("observe"):
+                self._belief = self._robot_belief.observe(joints, view, look.moves_left)
         with self._times.timed("plant points"):
             self._points.add(frame, T_world_camera, joints)
-        if not self._fractions:
+        if look.is_new_target:
             self._policy.begin(self._belief, torch.zeros(1, dtype=torch.int64))
         self._fractions.append(view.visible_fraction)
-        self._true_fraction = None if frame.truth is None else frame.truth.visible_fraction
-        return Step(
+        self._true_fraction = look.true_fraction
+        step = Step(
             number=len(self._fractions) - 1,
             frame=frame,
             view=view,
             joint_positions=joints,
             T_world_camera=T_world_camera,
             target_position=view.target_position,
-            moves_left=moves_left,
+            moves_left=look.moves_left,
         )
+        return look, step
 
-    def _act(self, step: Step, frame: Frame) -> None:
-        """Solves the move, has it checked and carried out, or counts it as refused."""
+    def _straight(self, step: Step, joints: Float64) -> Choice:
+        """A move to given joint positions, checked."""
+        move = JointMove(joint_positions=joints, speed_fraction=self._arm.safety.config.speed_fraction)
+        with self._times.timed("safety"):
+            state, points = self._arm.read(), self._points.points_w
+            refusal = self._arm.safety.check(move, state, self._clock.now(), step.frame.stamp, points)
+        return Choice(move=move, refusal=refusal)
+
+    def _chosen(self, step: Step) -> Choice:
+        """The policy's move, solved and checked."""
         assert step.action is not None
         request = MoveRequest(
             joint_positions=step.joint_positions,
@@ -243,7 +250,10 @@ class Loop:
             own_goal = self._chooser.own_goal(request)
         with self._times.timed("safety"):
             state = self._arm.read()
-            chosen = self._chooser.choose(request, own_goal, state, self._clock.now(), frame.stamp, points)
+            return self._chooser.choose(request, own_goal, state, self._clock.now(), step.frame.stamp, points)
+
+    def _send(self, step: Step, chosen: Choice) -> None:
+        """Has a move carried out, or counts it as refused."""
         if chosen.move is None:
             self._refuse(step, "out of reach")
             return
@@ -253,7 +263,7 @@ class Loop:
             self._refuse(step, str(chosen.refusal))
             return
         try:
-            sent = self._arm.command(chosen.move, frame.stamp, points)
+            sent = self._arm.command(chosen.move, step.frame.stamp, self._points.points_w)
         except RefusedError as error:
             self._refuse(step, str(error))
             return
@@ -300,7 +310,7 @@ class Loop:
             try:
                 while not self._arm.wait(WAIT_SLICE):
                     self._check_stops()
-                self._clock.sleep(self._config.settle)
+                self._clock.sleep(self._settle)
             except (_End, DeployError) as error:
                 if isinstance(error, RefusedError):
                     error = FaultError(f"the arm broke its move off: {error}")
@@ -336,10 +346,9 @@ class Loop:
         self._refused_in_a_row += 1
         _logger.info("move %d refused: %s", self._moves, why)
         self._record(replace(step, outcome="refused", detail=why))
-        if self._refused_in_a_row >= self._config.refused_after:
-            raise _End(
-                "refused", f"{self._refused_in_a_row} moves in a row were refused, the last one: {why}"
-            )
+        end = self._goal.refused(self._refused_in_a_row, why)
+        if end is not None:
+            raise _End(end.reason, end.detail)
 
     # ------------------------------------------------------------------- ends
 

@@ -3,7 +3,7 @@
 import json
 import logging
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -16,14 +16,16 @@ from numpy.typing import NDArray
 from maniskill_tomato import __version__
 from maniskill_tomato.deploy.clock import Clock
 from maniskill_tomato.deploy.deploy_errors import ProfileError, RecordingError
+from maniskill_tomato.deploy.goal import Goal
 from maniskill_tomato.deploy.loop import TASK, Loop, default_policy
 from maniskill_tomato.deploy.profile import Profile
 from maniskill_tomato.deploy.recording import McapRecorder
 from maniskill_tomato.deploy.run_records import Mode, Proposal, Recorder, RunResult, Step
-from maniskill_tomato.deploy.workcell import make_workcell
+from maniskill_tomato.deploy.workcell import Workcell, make_workcell
 from maniskill_tomato.errors import TomatoError
 from maniskill_tomato.files import write_atomically
 from maniskill_tomato.policies.opening import open_policy
+from maniskill_tomato.policies.protocol import Policy
 from maniskill_tomato.report_design import INK, rgb
 
 TILE: Final = (320, 240)
@@ -80,6 +82,29 @@ def run(
         PolicyError: The policy cannot be used.
         RecordingError: The folder or the recording cannot be begun.
     """
+    sheet = ContactSheet()
+    result, facts = run_goal(config, prepare(config, clock), None, [sheet], confirm, keyboard)
+    return kept_result(result, lambda: write_report(config.out, result, facts, sheet))
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Prepared:
+    """A run whose devices are not opened yet."""
+
+    workcell: Workcell
+    policy: Policy
+    mode: Mode
+    facts: dict[str, Any]
+    """For the result."""
+
+
+def prepare(config: RunConfig, clock: Clock | None = None) -> Prepared:
+    """Opens the policy and makes the devices of a profile, without touching any.
+
+    Raises:
+        DeployError: The profile cannot be used, or the camera is not calibrated and the arm shall move.
+        PolicyError: The policy cannot be used.
+    """
     profile = config.profile
     name = default_policy() if config.policy is None else config.policy
     policy = open_policy(name, env_id=TASK, seed=config.seed)
@@ -102,21 +127,50 @@ def run(
         "simulated": workcell.simulated,
         "version": __version__,
     }
+    return Prepared(workcell=workcell, policy=policy, mode=mode, facts=facts)
+
+
+def run_goal(
+    config: RunConfig,
+    prepared: Prepared,
+    goal: Goal | None,
+    recorders: Sequence[Recorder],
+    confirm: Callable[[Proposal], bool] = lambda proposal: False,
+    keyboard: bool = False,
+) -> tuple[RunResult, dict[str, Any]]:
+    """Connects, runs and disconnects.
+
+    Args:
+        config: What to run.
+        prepared: From `prepare`.
+        goal: What the run is after; None for the profile's target.
+        recorders: Keep every step, beside the recording.
+        confirm: Asked before every move in the mode `confirm`.
+        keyboard: Whether keys in a terminal stop the run.
+
+    Returns:
+        How it ended, and what a result tells beside that.
+    """
+    profile, workcell = config.profile, prepared.workcell
     stops = workcell.listen(config.out, keyboard)
-    sheet = ContactSheet()
     with ExitStack() as stack:
         arm = stack.enter_context(workcell.arm)
         camera = stack.enter_context(workcell.camera)
-        devices = {"arm": arm.describe(), "camera": camera.describe()}
-        recorders: list[Recorder] = [sheet]
+        facts = {**prepared.facts, "devices": {"arm": arm.describe(), "camera": camera.describe()}}
+        every = list(recorders)
         if config.record:
             mount = profile.T_flange_camera.tolist()
-            info = {**facts, "profile_text": profile.text, "T_flange_camera": mount, "devices": devices}
-            recorders.append(stack.enter_context(McapRecorder(config.out / RECORDING, info)))
+            info = {**facts, "profile_text": profile.text, "T_flange_camera": mount}
+            every.append(stack.enter_context(McapRecorder(config.out / RECORDING, info)))
         stack.enter_context(stops)
-        result = Loop(workcell, policy, stops, mode, recorders, confirm).run()
+        loop = Loop(workcell, prepared.policy, stops, prepared.mode, every, confirm, goal)
+        return loop.run(), facts
+
+
+def kept_result(result: RunResult, write: Callable[[], None]) -> RunResult:
+    """Writes a report; the result, which becomes a fault where the disk does not take it."""
     try:
-        write_report(config.out, result, {**facts, "devices": devices}, sheet)
+        write()
     except RecordingError as error:
         _logger.error("%s", error)
         if not result.is_fault:
@@ -124,15 +178,13 @@ def run(
     return result
 
 
-class ContactSheet:
-    """A recorder that keeps a small picture of every look."""
+class StepFacts:
+    """A recorder that keeps what a result tells of every look."""
 
     def __init__(self) -> None:
-        self.tiles: list[NDArray[np.uint8]] = []
         self.steps: list[dict[str, Any]] = []
 
     def step(self, step: Step) -> None:
-        self.tiles.append(_tile(step))
         self.steps.append(
             {
                 "number": step.number,
@@ -148,6 +200,18 @@ class ContactSheet:
     def event(self, stamp: float, text: str) -> None:
         pass
 
+
+class ContactSheet(StepFacts):
+    """Keeps a small picture of every look too."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.tiles: list[NDArray[np.uint8]] = []
+
+    def step(self, step: Step) -> None:
+        super().step(step)
+        self.tiles.append(_tile(step))
+
     def picture(self, title: str) -> NDArray[np.uint8]:
         """All looks side by side under a title. Shape (H, W, 3)."""
         if not self.tiles:
@@ -157,7 +221,7 @@ class ContactSheet:
         columns = min(COLUMNS, len(self.tiles))
         rows = math.ceil(len(self.tiles) / columns)
         sheet = np.full((BAR + rows * (height + 8), columns * (width + 8) + 8, 3), 255, dtype=np.uint8)
-        _write(sheet, title, (10, 22), 0.55)
+        write_text(sheet, title, (10, 22), 0.55)
         for k, tile in enumerate(self.tiles):
             top, left = BAR + (k // columns) * (height + 8), 8 + (k % columns) * (width + 8)
             sheet[top : top + tile.shape[0], left : left + tile.shape[1]] = tile
@@ -170,21 +234,48 @@ def write_report(out: Path, result: RunResult, facts: dict[str, Any], sheet: Con
     Raises:
         RecordingError: The disk does not take them.
     """
-    content = {**result.to_json(), **facts, "steps": sheet.steps}
-    for name in ("seconds", "device_seconds", "visible_fraction", "best_visible_fraction"):
-        content[name] = round(content[name], 4)
-    if result.true_visible_fraction is not None:
-        content["true_visible_fraction"] = round(result.true_visible_fraction, 4)
+    content = {**result_facts(result), **facts, "steps": sheet.steps}
     title = (
         f"{facts.get('profile')}, seed {facts.get('seed')}, {facts.get('policy_name')}: {result.reason}, "
         f"V_f {result.visible_fraction:.2f} after {result.moves} moves"
     )
-    ok, picture = cv2.imencode(".png", sheet.picture(title)[..., ::-1])
+    write_files(out, {"result.json": as_json(content), "report.png": as_png(sheet.picture(title))})
+
+
+def result_facts(result: RunResult) -> dict[str, Any]:
+    """A result in plain numbers, rounded."""
+    content = result.to_json()
+    for name in ("seconds", "device_seconds", "visible_fraction", "best_visible_fraction"):
+        content[name] = round(content[name], 4)
+    if result.true_visible_fraction is not None:
+        content["true_visible_fraction"] = round(result.true_visible_fraction, 4)
+    return content
+
+
+def as_json(content: dict[str, Any]) -> bytes:
+    """A JSON file's content."""
+    return (json.dumps(content, indent=2) + "\n").encode()
+
+
+def as_png(picture: NDArray[np.uint8]) -> bytes:
+    """A PNG file's content. Shape (H, W, 3)."""
+    ok, encoded = cv2.imencode(".png", picture[..., ::-1])
+    if not ok:
+        raise RecordingError(f"a picture of shape {picture.shape} cannot be packed as PNG")
+    return encoded.tobytes()
+
+
+def write_files(out: Path, files: Mapping[str, bytes]) -> None:
+    """Writes files of a report.
+
+    Raises:
+        RecordingError: The disk does not take them.
+    """
     try:
-        write_atomically(out / "result.json", (json.dumps(content, indent=2) + "\n").encode())
-        if ok:
-            write_atomically(out / "report.png", picture.tobytes())
-    except TomatoError as error:
+        for name, content in files.items():
+            (out / name).parent.mkdir(parents=True, exist_ok=True)
+            write_atomically(out / name, content)
+    except (TomatoError, OSError) as error:
         raise RecordingError(f"cannot write the report into {out}: {error.__cause__ or error}") from error
 
 
@@ -204,11 +295,11 @@ def _tile(step: Step) -> NDArray[np.uint8]:
         cv2.drawMarker(small, (u, v), MARK, cv2.MARKER_CROSS, 9, 1)
     tile = np.full((small.shape[0] + BAR, small.shape[1], 3), 255, dtype=np.uint8)
     tile[: small.shape[0]] = small
-    _write(tile, f"{step.number}: V_f {step.view.visible_fraction:.2f}", (4, small.shape[0] + 14), 0.42)
+    write_text(tile, f"{step.number}: V_f {step.view.visible_fraction:.2f}", (4, small.shape[0] + 14), 0.42)
     what = step.outcome if not step.detail else f"{step.outcome}: {step.detail}"
-    _write(tile, what[:48], (4, small.shape[0] + 29), 0.36)
+    write_text(tile, what[:48], (4, small.shape[0] + 29), 0.36)
     return tile
 
 
-def _write(image: NDArray[np.uint8], text: str, at: tuple[int, int], size: float) -> None:
+def write_text(image: NDArray[np.uint8], text: str, at: tuple[int, int], size: float) -> None:
     cv2.putText(image, text, at, cv2.FONT_HERSHEY_SIMPLEX, size, rgb(INK), 1, cv2.LINE_AA)

@@ -64,7 +64,8 @@ class TargetConfig:
     """Which fruit to look for."""
 
     source: Literal["seen", "given", "twin"] = "seen"
-    """The largest ripe fruit of the first picture; `position`; or that of the twin's episode."""
+    """The largest sure ripe fruit that the first picture does not show fully, as with `target="any"` in the simulated
+    task; `position`; or the fruit of the twin's episode."""
     position: tuple[float, float, float] | None = None
     """With `given`: its centre in the base frame, in [m]."""
 

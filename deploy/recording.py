@@ -293,6 +293,8 @@ def _truth(frame: Frame) -> dict[str, Any]:
         "target_position": truth.target_position.tolist(),
         "visible_fraction": truth.visible_fraction,
         "ripe_labels": list(truth.ripe_labels),
+        "fruit_labels": list(truth.fruit_labels),
+        "ripe_fractions": list(truth.ripe_fractions),
         "rays": {
             "direction_c": pack(truth.rays.direction_c.numpy()),
             "distance": pack(truth.rays.distance.numpy()),

@@ -1,6 +1,7 @@
 """The robot's frames through `sensing`: what a picture tells about the target."""
 
 import importlib
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, Final, Literal, Protocol
 
@@ -8,7 +9,7 @@ import numpy as np
 import torch
 
 from maniskill_tomato.deploy.deploy_errors import PerceptionError, ProfileError
-from maniskill_tomato.deploy.interface import Float64, Frame
+from maniskill_tomato.deploy.interface import Float64, Frame, FrameTruth
 from maniskill_tomato.errors import TomatoError
 from maniskill_tomato.raycast.images import ROBOT_LABEL
 from maniskill_tomato.raycast.view_rays import ViewRays
@@ -20,16 +21,26 @@ from maniskill_tomato.segmentation.segmenter import Segmenter
 from maniskill_tomato.sensing.belief import Belief
 from maniskill_tomato.sensing.camera_perception import CameraPerception
 from maniskill_tomato.sensing.fruit_detector import FruitDetector
+from maniskill_tomato.sensing.fruit_map import FruitMap
 from maniskill_tomato.sensing.measurement import RIPE_CATEGORIES
 from maniskill_tomato.sensing.observation import ObservationLayout, ViewpointObserver
 from maniskill_tomato.sensing.posed_frame import PosedFrame
-from maniskill_tomato.sensing.target_tracker import choose_new_target
 
 Sight = Literal["images", "rays"]
 """From masks and depth images, as on a robot; or from the twin's exact rays, as in the simulated task."""
 
 TRUE_MASKS: Final = "ground_truth"
 """Name of the segmenter that takes the masks that only a simulated camera knows."""
+
+
+UNRIPE_CATEGORY: Final = "tomato_unripe"
+"""What fruits are called that only a simulated camera tells from ripe ones."""
+
+PLACE_ERROR: Final = 0.01
+"""Standard deviation of each coordinate of a target's position that a profile gives, in [m]."""
+
+FULL_VISIBILITY: Final = 0.8
+"""A fruit of which more is visible needs no better view, as in `TomatoViewpoint-v1`."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -40,12 +51,16 @@ class Sighting:
     """The pattern about the target, as the simulated task has it."""
     visible_fraction: float
     """V_f, 0 if the target is not seen."""
+    sure_fraction: float
+    """Lower bound of V_f, by which a run ends."""
     mask: BinaryMask
     """Visible pixels of the target. Shape (H, W)."""
     fruits_seen: int
     """How many ripe fruits the picture shows."""
     target_position: Float64
     """Where the target is believed to be, world frame, in [m]. Shape (3,)."""
+    recall: Callable[[ViewpointObserver], None] | None = None
+    """Makes a memory of earlier views anew, if the target turned out to stand elsewhere."""
 
     @property
     def target_seen(self) -> bool:
@@ -100,43 +115,75 @@ class ImagePerception:
         self.begin(None)
 
     def begin(self, target_position: Float64 | None) -> None:
-        """Forgets all views; without a position the largest sure ripe fruit of the first picture is the target."""
+        """Forgets all views; without a position the largest sure ripe fruit of the first picture is the target, of
+        those that it does not show fully if there are any."""
         self._perception = CameraPerception(1, self._detector)
-        self._has_target = target_position is not None
-        if target_position is not None:
-            self._perception.begin(0, target_position, is_located=True)
+        self._perception.begin(0, target_position, place_error=PLACE_ERROR)
+        self._chooses = target_position is None
+
+    def begin_row(self) -> CameraPerception:
+        """Forgets all views and has no target; returns what the row's fruits are mapped with."""
+        self._perception = CameraPerception(1, self._detector)
+        self._chooses = False
+        return self._perception
 
     def look(self, frame: Frame, T_world_camera: Float64) -> Sighting | None:
         """The sighting by masks and depth; see `Perception`."""
         perception = self._perception
+        moved = self.take(frame, T_world_camera)
+        if self._chooses:
+            perception.choose(0, FULL_VISIBILITY)
+            if perception.target(0) is None:
+                perception.choose(0, 1.0)
+            if perception.target(0) is None:
+                return None
+            self._chooses, moved = False, True
+        return self.sighting(moved)
+
+    def take(self, frame: Frame, T_world_camera: Float64) -> bool:
+        """Takes a picture into the map; whether the target turned out to stand elsewhere.
+
+        Raises:
+            PerceptionError: The picture cannot be used.
+        """
         try:
             measured = self._detector.measure(self._posed(frame, T_world_camera))
         except TomatoError as error:
             raise PerceptionError(f"the picture cannot be segmented: {error}") from error
-        if not self._has_target:
-            chosen = choose_new_target(measured.fruits)
-            centre = None if chosen is None else measured.fruits[chosen].centre_w
-            if centre is None:
-                return None
-            perception.begin(0, centre, is_located=True)
-            self._has_target = True
-        perception.add(0, measured)
+        return self._perception.add(0, measured)
+
+    def sighting(self, moved: bool) -> Sighting:
+        """What the last picture that was taken in told of the target.
+
+        Args:
+            moved: Whether the memory of earlier views must be made anew.
+        """
+        perception = self._perception
         return Sighting(
             rays=perception.rays(),
             visible_fraction=float(perception.visible_fraction[0]),
-            mask=measured.mask(perception.target_fruit(0)),
-            fruits_seen=sum(fruit.is_ripe for fruit in measured.fruits),
+            sure_fraction=float(perception.sure_fraction[0]),
+            mask=perception.mask(0),
+            fruits_seen=sum(fruit.is_ripe for fruit in perception.views(0)[-1].fruits),
             target_position=perception.position_w(0),
+            recall=self._recall if moved else None,
         )
+
+    @property
+    def map(self) -> FruitMap:
+        """The fruits that were seen since `begin`."""
+        return self._perception.map(0)
+
+    def _recall(self, observer: ViewpointObserver) -> None:
+        self._perception.recall(observer, torch.zeros(1, dtype=torch.int64))
 
     def _posed(self, frame: Frame, T_world_camera: Float64) -> PosedFrame:
         robot_mask, fruits = None, None
-        if self._knows_truth and frame.truth is not None:
-            labels = frame.truth.labels
-            robot_mask = np.asarray(labels == ROBOT_LABEL)
-            ripe = frame.truth.ripe_labels
-            masks = labels[None] == np.array(ripe, labels.dtype)[:, None, None]
-            fruits = Instances.from_masks(masks, categories=(RIPE_CATEGORIES[0],) * len(ripe))
+        numbers: tuple[int, ...] = ()
+        if frame.truth is not None:
+            # With a segmenter only the twin's judgement of itself asks for these.
+            fruits, numbers = _true_fruits(frame.truth)
+            robot_mask = np.asarray(frame.truth.labels == ROBOT_LABEL) if self._knows_truth else None
         return PosedFrame(
             depth_m=frame.depth,
             intrinsics=frame.intrinsics,
@@ -144,7 +191,19 @@ class ImagePerception:
             rgb=frame.color,
             robot_mask=robot_mask,
             true_fruits=fruits,
+            true_numbers=numbers,
         )
+
+
+def _true_fruits(truth: FrameTruth) -> tuple[Instances, tuple[int, ...]]:
+    """The fruits in a picture and which they are, as far as the camera says."""
+    shown = set(np.unique(truth.labels).tolist())
+    ripe = [label for label in truth.ripe_labels if label in shown]
+    others = [label for label in truth.fruit_labels if label in shown and label not in truth.ripe_labels]
+    labels = np.array([*ripe, *others], truth.labels.dtype)
+    categories = (RIPE_CATEGORIES[0],) * len(ripe) + (UNRIPE_CATEGORY,) * len(others)
+    numbers = tuple(truth.fruit_labels.index(label) for label in labels) if truth.fruit_labels else ()
+    return Instances.from_masks(truth.labels[None] == labels[:, None, None], categories=categories), numbers
 
 
 class TruthPerception:
@@ -169,6 +228,7 @@ class TruthPerception:
         return Sighting(
             rays=truth.rays,
             visible_fraction=truth.visible_fraction,
+            sure_fraction=truth.visible_fraction,
             mask=np.asarray(truth.labels == truth.target_label),
             fruits_seen=sum(bool((truth.labels == label).any()) for label in truth.ripe_labels),
             target_position=self._target,
@@ -243,10 +303,12 @@ class RobotBelief:
             sighting: What the picture told.
             moves_left: Moves until the run ends.
         """
-        if not self._has_views:
+        if sighting.recall is not None:
+            sighting.recall(self._observer)
+        elif not self._has_views:
             target = torch.as_tensor(sighting.target_position, dtype=torch.float32)[None]
             self._observer.begin(torch.zeros(1, dtype=torch.int64), target)
-            self._has_views = True
+        self._has_views = True
         T_world_flange, T_world_camera = self._poses(joint_positions)
         self._rpy = matrix_to_rpy(T_world_flange[:, :3, :3], self._rpy)
         viewpoint = torch.cat([T_world_flange[:, :3, 3], self._rpy], dim=-1)

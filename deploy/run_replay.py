@@ -15,6 +15,7 @@ import torch
 from maniskill_tomato.deploy.clock import SimulatedClock
 from maniskill_tomato.deploy.deploy_errors import CutOffError, NotConnectedError, RecordingError
 from maniskill_tomato.deploy.guarded_arm import GuardedArm
+from maniskill_tomato.deploy.inspection_run import whole_row
 from maniskill_tomato.deploy.interface import Arm, ArmState, Camera, Float64, Frame, FrameTruth, JointMove
 from maniskill_tomato.deploy.loop import TASK, Loop
 from maniskill_tomato.deploy.profile import Profile, TargetConfig, parse_profile
@@ -82,7 +83,7 @@ class Replay:
 
 
 def load_recording(path: Path) -> RecordedRun:
-    """Reads a recording of `deploy run`; of one that was cut off, the looks that are whole.
+    """Reads a recording of `deploy run` or `deploy inspect`; of one that was cut off, the looks that are whole.
 
     Raises:
         RecordingError: It is missing, damaged, of another kind, or holds no whole look.
@@ -130,8 +131,9 @@ def replay(recorded: RecordedRun, policy: str | None = None) -> Replay:
     playback = _Playback(recorded.steps, clock)
     comparison = _Comparison(recorded.steps)
     opened = open_policy(policy or str(recorded.info["policy"]), env_id=TASK, seed=int(recorded.info["seed"]))
-    loop = Loop(_played_workcell(recorded, playback), opened, Stops(), "unattended", [comparison])
-    result = loop.run()
+    workcell, row_moves = _played_workcell(recorded, playback), recorded.info.get("row_moves")
+    goal = None if row_moves is None else whole_row(workcell, int(row_moves))
+    result = Loop(workcell, opened, Stops(), "unattended", [comparison], goal=goal).run()
     differences = list(comparison.differences)
     last = recorded.steps[-1].facts["outcome"]
     if comparison.count < len(recorded.steps):
@@ -146,8 +148,9 @@ def replay(recorded: RecordedRun, policy: str | None = None) -> Replay:
 def _played_workcell(recorded: RecordedRun, playback: "_Playback") -> Workcell:
     profile, clock = recorded.profile, playback.clock
     target = profile.target
-    if target.source != "seen":
-        x, y, z = recorded.steps[0].facts["target_position"]
+    truth = recorded.steps[0].frame.truth
+    if target.source == "twin" and truth is not None:
+        x, y, z = (float(c) for c in truth.target_position)
         target = TargetConfig(source="given", position=(x, y, z))
     profile = replace(
         profile,
@@ -313,6 +316,8 @@ def _truth(message: dict[str, Any]) -> FrameTruth:
         visible_fraction=float(message["visible_fraction"]),
         ripe_labels=tuple(int(label) for label in message["ripe_labels"]),
         rays=ViewRays(rays["direction_c"], rays["distance"], rays["label"]),
+        fruit_labels=tuple(int(label) for label in message.get("fruit_labels", ())),
+        ripe_fractions=tuple(float(v) for v in message.get("ripe_fractions", ())),
     )
 
 

@@ -149,7 +149,7 @@ class TomatoSim2RealEnv(Sim2RealEnv):  # type: ignore[misc]
             "elapsed_steps": self._elapsed_steps,
             "visible_fraction": fraction,
             "visible_fraction_gain": fraction - self._fraction_before,
-            "success": (fraction > base.task.full_visibility) & ~fail,
+            "success": (torch.tensor([view.sure_fraction]) > base.task.full_visibility) & ~fail,
             "fail": fail,
             "target_seen": seen,
             "tomato_seen": any_seen,

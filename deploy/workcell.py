@@ -47,12 +47,16 @@ class Workcell:
             assert target.position is not None
             return np.array(target.position)
         if target.source == "twin":
-            world: Any = getattr(self.camera, "_world", None)
+            world = self.twin()
             if world is None:
                 raise ProfileError("target.source = 'twin' goes with the camera driver mock only")
             position: Float64 = world.episode.target_position.double().numpy()
             return position
         return None
+
+    def twin(self) -> Any:
+        """The `TwinWorld` that a simulated camera looks at; None for a real one."""
+        return getattr(self.camera, "_world", None)
 
     def listen(self, out: Path, keyboard: bool) -> Stops:
         """Makes an output folder and listens for everything that stops a run there, once it is entered.

@@ -13,12 +13,12 @@ from maniskill_tomato.plants.spec import PlantPose, PlantSpec
 from maniskill_tomato.robot.d435 import CameraIntrinsics, color_intrinsics
 from maniskill_tomato.robot.viewpoint_move import OutsideWorkspace
 from maniskill_tomato.sensing.observation import ObservationLayout
+from maniskill_tomato.sensing.perception_kinds import RENDERED, Perception
 from maniskill_tomato.sensing.sensor_noise import SensorNoise
-from maniskill_tomato.sensing.simulated_camera import RENDERED, Perception
 from maniskill_tomato.tasks import MAX_EPISODE_STEPS, MAX_GENERAL_STEPS, MAX_ROW_STEPS, TASK_IDS
 from maniskill_tomato.tasks.arm_moves import ArmMoves, Control
 from maniskill_tomato.tasks.row.episode_selection import EpisodeChoice
-from maniskill_tomato.tasks.row.row_config import GeneralTaskConfig
+from maniskill_tomato.tasks.row.row_config import CameraConfig, GeneralTaskConfig
 from maniskill_tomato.tasks.row.search_game import SearchGame
 from maniskill_tomato.tasks.row.target_sequence import Transits
 from maniskill_tomato.tasks.thesis.thesis_config import ViewpointTaskConfig, guided_task, sparse_task
@@ -76,6 +76,12 @@ class SearchOptions(WorldOptions):
     """What camera and segmenter get wrong about exact labels."""
     perception: Perception = "ground_truth"
     """Where V_f, the target's position and the rays' labels come from."""
+    target: str | None = None
+    """How the target is named to a robot that sees through a camera, one of `Naming`; `track` if None."""
+    map_noise: float | None = None
+    """With `target="map"`: standard deviation of each coordinate of the place that is given, in [m]; 0.03 if None."""
+    association: str | None = None
+    """Who says which track a camera's detection belongs to, one of `Association`; `map` if None."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -118,6 +124,25 @@ def option_names(env_id: str) -> frozenset[str]:
     """Names of the options of a task that a world takes."""
     kind = ThesisOptions if env_id in TASK_IDS[:2] else RowOptions if env_id == TASK_IDS[3] else SearchOptions
     return frozenset(field.name for field in fields(kind))
+
+
+def check_other_tasks(env_id: str, names: Iterable[str]) -> None:
+    """Refuses options that only other tasks take.
+
+    Args:
+        env_id: The task.
+        names: Of options that it does not take.
+
+    Raises:
+        InvalidInputError: One of them is another task's.
+    """
+    for name in names:
+        takers = [other for other in TASK_IDS if name in option_names(other)]
+        if takers and env_id not in takers:
+            raise InvalidInputError(
+                f"{env_id} has no {name}=, which is an option of {' and '.join(takers)}; "
+                f"it takes {', '.join(sorted(option_names(env_id)))}"
+            )
 
 
 def default_control(env_id: str) -> Control:
@@ -246,6 +271,7 @@ def _search_setup(options: SearchOptions) -> TaskSetup:
             "sensor_noise disturbs ground truth; leave it out with perception='occlusion_model', "
             "whose depth has noise of its own"
         )
+    camera = _camera_config(options)
     task = options.task
     if options.start_visibility is not None:
         low, high = _finite_numbers("start_visibility", options.start_visibility, 2)
@@ -269,12 +295,34 @@ def _search_setup(options: SearchOptions) -> TaskSetup:
             layout=shape,
             noise=noise,
             perception=options.perception,
+            camera=camera,
             transits=transits,
         ),
         needs_pictures=options.perception in RENDERED,
         follows_list=episodes.episodes is not None,
         **_standing(options, task, plant, task.plant_pose_noise),
     )
+
+
+def _camera_config(options: SearchOptions) -> CameraConfig:
+    """How targets are named; in a row the robot chooses them."""
+    given: dict[str, Any] = {
+        name: value
+        for name in ("target", "map_noise", "association")
+        if (value := getattr(options, name)) is not None
+    }
+    if given and options.perception == "ground_truth":
+        raise InvalidInputError(
+            f"{next(iter(given))} is for a robot that sees through a camera; choose perception= as well"
+        )
+    if isinstance(options, RowOptions) and (named := [n for n in ("target", "map_noise") if n in given]):
+        raise InvalidInputError(
+            f"{named[0]} is for TomatoViewpoint-v1; in a row a robot with a camera chooses its targets itself"
+        )
+    config = CameraConfig(**given)
+    if options.map_noise is not None and config.target != "map":
+        raise InvalidInputError(f"map_noise goes with target='map'; got target={config.target!r}")
+    return config
 
 
 def _standing(

@@ -433,6 +433,19 @@ class World:
         told: Callable[[int], list[int]] = sequence.open_targets
         return told
 
+    @property
+    def targets_begun(self) -> Tensor:
+        """How many targets each episode has had so far. Shape (N,)."""
+        return self.state.targets_begun.clone()
+
+    @property
+    def inspecting(self) -> Any:
+        """The `InspectingSenses` of a row that is inspected with a camera; other tasks have no such attribute."""
+        senses = getattr(getattr(self.game, "sequence", None), "senses", None)
+        if senses is None:
+            raise AttributeError("inspecting")
+        return senses
+
     def fruit_position_w(self, env_index: int, fruit: int) -> Tensor:
         """Centre of a fruit in the world frame, in [m]. Shape (3,)."""
         return self.plant_batch.fruit_positions_w(env_index, [fruit])[0]

@@ -1,7 +1,7 @@
 """The twin's world: one arm in front of one plant, what its camera sees, and the options of a profile."""
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Final, Literal
 
@@ -113,9 +113,8 @@ class TwinWorld:
         self._palette = np.array([COLORS[c] for c in classes], dtype=np.float64)
         fruits = episode.plant.fruits
         self._target_label = FIRST_ORGAN_LABEL + fruits[episode.target].organ_index
-        self._ripe_labels = tuple(
-            FIRST_ORGAN_LABEL + fruit.organ_index for fruit in fruits if fruit.ripeness == "ripe"
-        )
+        self._ripe = [j for j, fruit in enumerate(fruits) if fruit.ripeness == "ripe"]
+        self._fruit_labels = tuple(FIRST_ORGAN_LABEL + fruit.organ_index for fruit in fruits)
 
     def advance(self) -> float:
         """Moves the arm on to the present; that time, in [s]."""
@@ -153,9 +152,29 @@ class TwinWorld:
             target_label=self._target_label,
             target_position=known.double().numpy(),
             visible_fraction=float(seen.visible_fraction[0]),
-            ripe_labels=self._ripe_labels,
+            ripe_labels=tuple(self._fruit_labels[j] for j in self._ripe),
             rays=rays,
+            fruit_labels=self._fruit_labels,
+            ripe_fractions=self.visible_fractions(self._ripe, self.arm.joint_positions),
         )
+
+    def visible_fractions(self, fruits: Sequence[int], joints: Float64) -> tuple[float, ...]:
+        """V_f of some fruits by ray casting.
+
+        Args:
+            fruits: As indices in `Plant.fruits`.
+            joints: Where the arm is, in [rad]. Shape (7,).
+        """
+        if not fruits:
+            return ()
+        camera, links = self._poses(joints)
+        seen = self.scene.visible_fraction_from(
+            camera.expand(len(fruits), 4, 4),
+            torch.tensor(list(fruits)),
+            self.episode.T_world_plant,
+            links.expand(len(fruits), *links.shape[1:]),
+        )
+        return tuple(seen.tolist())
 
     def _poses(self, joints: Float64) -> tuple[Tensor, Tensor]:
         """Poses of the optical frame and of the links, in single precision as in the simulated task."""

@@ -69,6 +69,9 @@ COMMANDS: Final[dict[str, CommandEntry]] = {
     ),
     "judge twin": CommandEntry("judge_commands:JudgeTwin", "The twin of `deploy` beside the simulated task"),
     "deploy run": CommandEntry("deploy_commands:DeployRun", "Look at a tomato until it is fully visible"),
+    "deploy inspect": CommandEntry(
+        "deploy_commands:DeployInspect", "Look at every ripe tomato of a row and list them"
+    ),
     "deploy check": CommandEntry("deploy_commands:DeployCheck", "Check everything; nothing moves"),
     "deploy calibrate": CommandEntry(
         "deploy_commands:DeployCalibrate", "Measure the camera's place on the flange"

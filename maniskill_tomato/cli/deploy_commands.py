@@ -22,20 +22,16 @@ from maniskill_tomato.errors import InvalidInputError
 from maniskill_tomato.policies.layout import GENERAL_IDS
 
 if TYPE_CHECKING:
-    from maniskill_tomato.deploy.run_records import Mode, Proposal
+    from maniskill_tomato.deploy.policy_run import RunConfig
+    from maniskill_tomato.deploy.run_records import Mode, Proposal, RunResult
 
 FAULT_STATUS = 3
 """Exit status of a run that a fault ended."""
 
 
 @dataclass(frozen=True, kw_only=True)
-class DeployRun:
-    """Look at a tomato with the devices of a profile until it is fully visible.
-
-    On hardware nothing moves unless --confirm or --unattended is given. Ctrl-C, SIGTERM, the key q with Enter, and the
-    file STOP in the output folder end a run; only the smartPAD or the emergency stop halts a move of the iiwa that is
-    under way. Exit status: 0 finished, 2 could not begin, 3 a fault ended it, 130 or 143 stopped by a signal.
-    """
+class _Moving:
+    """What the commands that move an arm have in common."""
 
     profile: str = "mock"
     """Name of a profile (see `deploy profiles`), or a TOML file."""
@@ -43,8 +39,6 @@ class DeployRun:
     """A planner's name, or the file of a policy (.pt, .onnx); by default the one that ships."""
     seed: int = 0
     """On the twin: which of the fixed episodes."""
-    out: Path = Path("runs/deploy")
-    """Folder of result.json, report.png and run.mcap."""
     confirm: bool = False
     """Ask before every move."""
     unattended: bool = False
@@ -54,23 +48,43 @@ class DeployRun:
     record: bool = True
     """Write run.mcap."""
 
-    def run(self) -> None:
-        """Runs, and says how it ended."""
+    def _config(self, out: Path) -> "RunConfig":
+        """What to run, checked as far as that goes without a device."""
         check_profile("--profile", self.profile)
         _check_policy(self.policy)
         mode = _one_mode(confirm=self.confirm, unattended=self.unattended, dry_run=self.dry_run)
 
-        from maniskill_tomato.deploy.policy_run import RunConfig, run
+        from maniskill_tomato.deploy.policy_run import RunConfig
         from maniskill_tomato.deploy.profile import load_profile
 
-        config = RunConfig(
+        return RunConfig(
             profile=load_profile(self.profile),
-            out=self.out,
+            out=out,
             policy=self.policy,
             seed=self.seed,
             mode=mode,
             record=self.record,
         )
+
+
+@dataclass(frozen=True, kw_only=True)
+class DeployRun(_Moving):
+    """Look at a tomato with the devices of a profile until it is fully visible.
+
+    On hardware nothing moves unless --confirm or --unattended is given. Ctrl-C, SIGTERM, the key q with Enter, and the
+    file STOP in the output folder end a run; only the smartPAD or the emergency stop halts a move of the iiwa that is
+    under way. Exit status: 0 finished, 2 could not begin, 3 a fault ended it, 130 or 143 stopped by a signal.
+    """
+
+    out: Path = Path("runs/deploy")
+    """Folder of result.json, report.png and run.mcap."""
+
+    def run(self) -> None:
+        """Runs, and says how it ended."""
+        config = self._config(self.out)
+
+        from maniskill_tomato.deploy.policy_run import run
+
         result = run(config, confirm=_ask, keyboard=not self.confirm)
         print(
             f"{result.reason}: {result.detail}; {result.moves} moves, V_f {result.visible_fraction:.2f}, "
@@ -78,11 +92,46 @@ class DeployRun:
         )
         print(f"result  {self.out / 'result.json'}")
         print(f"report  {self.out / 'report.png'}")
-        if result.is_fault:
-            print(f"error: {result.detail}", file=sys.stderr)
-            raise SystemExit(FAULT_STATUS)
-        if result.reason == "stopped":
-            _end_by_signal(result.detail)
+        _end(result)
+
+
+@dataclass(frozen=True, kw_only=True)
+class DeployInspect(_Moving):
+    """Inspect a row with the devices of a profile: find every ripe tomato and look at it until it is fully visible.
+
+    The camera alone finds the fruits; the profile's [target] is not used. Ends when nothing is worth another move.
+    On hardware nothing moves unless --confirm or --unattended is given. Ways to stop and exit status as for
+    `deploy run`; a run that was stopped still writes the list so far.
+    """
+
+    out: Path = Path("runs/inspect")
+    """Folder of inspection.json, fruits/, report.png, report.html and run.mcap."""
+    max_moves: int = 120
+    """The most moves for the row; the profile's loop.max_moves says how many for a fruit."""
+
+    def run(self) -> None:
+        """Inspects, and says what was found."""
+        check_counts(max_moves=self.max_moves)
+        config = self._config(self.out)
+
+        from maniskill_tomato.deploy.inspection_run import inspect_row
+
+        done = inspect_row(config, self.max_moves, confirm=_ask, keyboard=not self.confirm)
+        result, ripe = done.run, [fruit for fruit in done.fruits if fruit["ripeness"] == "ripe"]
+        full = sum(fruit["fully_seen"] for fruit in ripe)
+        print(
+            f"{result.reason}: {result.detail}; {len(ripe)} ripe fruits, {full} fully seen, {result.moves} moves, "
+            f"{result.seconds:.1f} s; {result.end_state}"
+        )
+        if done.totals:
+            t = done.totals
+            print(
+                f"truth   {t['true_fully_seen']} of {t['true_ripe_in_reach']} ripe fruits in reach fully seen, "
+                f"precision {t['true_precision']}, place {t['true_position_error_median_m']} m off in the median"
+            )
+        print(f"list    {self.out / 'inspection.json'}")
+        print(f"report  {self.out / 'report.html'}")
+        _end(result)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -309,6 +358,15 @@ class _Operator:
             print(question)
         self._shown = True
         return _goes() if self._asks else self._moves
+
+
+def _end(result: "RunResult") -> None:
+    """Ends with the exit status of a fault or a signal, if one ended the run."""
+    if result.is_fault:
+        print(f"error: {result.detail}", file=sys.stderr)
+        raise SystemExit(FAULT_STATUS)
+    if result.reason == "stopped":
+        _end_by_signal(result.detail)
 
 
 def _check_policy(policy: str | None) -> None:

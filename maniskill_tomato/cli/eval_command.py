@@ -2,12 +2,14 @@
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, get_args
 
 from maniskill_tomato.cli.arguments import Flat
 from maniskill_tomato.cli.early_checks import check_counts, check_env_id, check_policy
 from maniskill_tomato.cli.shared_options import EnvId, PlantOptions
+from maniskill_tomato.errors import InvalidInputError
 from maniskill_tomato.policies.opening import shipped_policy
+from maniskill_tomato.tasks import TASK_IDS
 
 EpisodeList = Literal["validation", "held_out"]
 
@@ -45,6 +47,15 @@ class Eval:
     """Episodes of a fixed list, TomatoViewpoint-v1 only: seed i is its i-th; by default held_out, unless options of
     the plants are given."""
 
+    perception: str = "ground_truth"
+    """What V_f and the target's position come from: ground_truth, occlusion_model, thesis_model, improved_model or
+    segmenter; the general tasks only."""
+    target: str | None = None
+    """How the target is named to a robot that sees through a camera: track (the default), map or any;
+    TomatoViewpoint-v1 only."""
+    map_noise: float | None = None
+    """With --target map: standard deviation of each coordinate of the place that is given, in [m]; 0.03 by default."""
+
     def run(self) -> None:
         """Evaluates and says where the report is."""
         check_env_id(self.env_id)
@@ -58,6 +69,7 @@ class Eval:
         env_options = self.plants.env_options()
         if self.episode_list is not None or (self.env_id == LISTED_ID and not env_options):
             env_options["episodes"] = self.episode_list or "held_out"
+        env_options.update(self._camera_options())
         config = EvaluationConfig(
             env_id=self.env_id,
             policy=self.policy,
@@ -74,10 +86,64 @@ class Eval:
         result = evaluate(config)
         print(f"policy  {result.origin}")
         print(summary(result.metrics))
+        if "true_success_rate" in result.metrics:
+            print(camera_summary(result.metrics))
+        if "recall" in result.metrics:
+            print(inspection_summary(result.metrics))
         if result.left_out:
             print(result.left_out)
         print(f"metrics {self.out / 'metrics.json'}")
         print(f"report  {result.report}")
+
+    def _camera_options(self) -> dict[str, Any]:
+        """The options of camera perception; none for ground truth.
+
+        Raises:
+            InvalidInputError: One is not allowed.
+        """
+        from maniskill_tomato.sensing.perception_kinds import RENDERED, Naming, Perception
+
+        for flag, value, allowed in (
+            ("--perception", self.perception, get_args(Perception)),
+            ("--target", self.target, get_args(Naming)),
+        ):
+            if value is not None and value not in allowed:
+                raise InvalidInputError.choice(flag, value, allowed)
+        named = {"target": self.target, "map_noise": self.map_noise}
+        options: dict[str, Any] = {name: value for name, value in named.items() if value is not None}
+        if self.perception == "ground_truth":
+            if options:
+                raise InvalidInputError(
+                    "--target and --map-noise are for a robot that sees through a camera; give --perception as well"
+                )
+            return {}
+        if self.env_id not in TASK_IDS[2:]:
+            raise InvalidInputError(f"--perception is for {' and '.join(TASK_IDS[2:])}; got {self.env_id}")
+        if self.perception in RENDERED:
+            options["render_backend"] = "auto"
+        return {"perception": self.perception, **options}
+
+
+def camera_summary(metrics: dict[str, Any]) -> str:
+    """One line with what a camera's success was worth."""
+    return (
+        f"truly full: the target {metrics['true_success_rate']:.0%}, the chosen fruit "
+        f"{metrics['chosen_success_rate']:.0%}, with a true association "
+        f"{metrics['true_association_success_rate']:.0%}; false stops {metrics['false_stop_rate']:.0%}"
+    )
+
+
+def inspection_summary(metrics: dict[str, Any]) -> str:
+    """One line with what the inspection lists of rows are worth."""
+    recall, precision = (
+        "none" if metrics[key] is None else f"{metrics[key]:.1%}" for key in ("recall", "precision")
+    )
+    error = metrics["position_error_median_m"]
+    place = "unknown" if error is None else f"{1e3 * error:.1f} mm"
+    return (
+        f"inspection: {recall} of the seeable ripe fruits truly seen, precision {precision}, place {place} (median), "
+        f"{metrics['mean_moves']:.1f} moves a row"
+    )
 
 
 def summary(metrics: dict[str, Any]) -> str:

@@ -3,7 +3,7 @@
 from collections import Counter
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, get_args
 
 import tyro
 
@@ -22,6 +22,7 @@ from maniskill_tomato.experiments.variants import choose_variants, experiments, 
 from maniskill_tomato.learning.rl.presets import PRESETS
 from maniskill_tomato.plants.episode_list import EPISODE_LISTS
 from maniskill_tomato.plants.spec import SEED_SPLITS
+from maniskill_tomato.sensing.perception_kinds import Perception
 from maniskill_tomato.tasks import TASK_IDS
 
 
@@ -58,6 +59,7 @@ class BenchmarkRows(RowBenchmarkConfig):
         """Runs what is missing and prints the table."""
         check_policies("--policies", self.policies)
         check_choice("--split", self.split, tuple(SEED_SPLITS))
+        check_choice("--perception", self.perception, get_args(Perception))
 
         from maniskill_tomato.experiments.row_benchmark import run_row_benchmark
 

@@ -5,6 +5,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from maniskill_tomato.errors import InvalidInputError
+from maniskill_tomato.sensing.perception_kinds import Perception
 
 ExperimentName = Literal["guided", "sparse"]
 
@@ -107,6 +108,9 @@ class RowBenchmarkConfig:
     """Split of the plants: held_out to report, validation to choose."""
     transits: str = "both"
     """When the arm goes by its ready posture: none, target, refused or both."""
+    perception: Perception = "ground_truth"
+    """What the robot knows: ground_truth, or what it sees through a camera (occlusion_model, segmenter, thesis_model or
+    improved_model); it then chooses its targets itself, and its inspection list is judged."""
     jobs: int = 1
     """Processes at a time."""
     out: Path = Path("runs/rows")

@@ -28,6 +28,8 @@ class RowSearch:
     """Way of the camera, transits included, in [m]."""
     joint_path_rad: float
     """Way of all joints together, transits included, in [rad]."""
+    listed: tuple[dict[str, Any], ...] | None = None
+    """The inspection list of a robot with a camera beside the truth, see `JudgedFruit`; None without a camera."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -64,6 +66,14 @@ class EpisodeRecord:
     """True V_f at every view, where `visible_fraction` is measured by a camera. Shape (T + 1,)."""
     true_target: Float64 | None = None
     """Where the target is at every view, world frame, in [m]. Shape (T + 1, 3)."""
+    chosen_visible_fraction: Float64 | None = None
+    """True V_f of the fruit that a camera took for the target at every view, 0 if of none. Shape (T + 1,)."""
+    chosen_fruit: NDArray[np.int64] | None = None
+    """Which that is, as an index in `Plant.fruits`, -1 for none. Shape (T + 1,)."""
+    target_fruit: NDArray[np.int64] | None = None
+    """The target, likewise. Shape (T + 1,)."""
+    target_named: NDArray[np.bool_] | None = None
+    """Whether the robot knew which of its tracks the target is, at every view. Shape (T + 1,)."""
     oracle_moves: int | None = None
     """Fewest moves known for this episode; None if no solution is known."""
     row: RowSearch | None = None
@@ -83,6 +93,10 @@ class EpisodeRecord:
         "clearance": (0, (), 5),
         "true_visible_fraction": (1, (), 5),
         "true_target": (1, (3,), 5),
+        "chosen_visible_fraction": (1, (), 5),
+        "chosen_fruit": (1, (), 0),
+        "target_fruit": (1, (), 0),
+        "target_named": (1, (), 0),
     }
     """Of every array: rows beside T, shape of a row, decimals that are stored (5 are 10 um and 10 urad)."""
 
@@ -162,7 +176,10 @@ class EpisodeRecord:
         Raises:
             InvalidInputError: A value is missing or has another shape.
         """
-        types = {"reachability": np.int64, "in_forbidden_zone": np.bool_, "contact": np.bool_}
+        types = {
+            **dict.fromkeys(("reachability", "chosen_fruit", "target_fruit"), np.int64),
+            **dict.fromkeys(("in_forbidden_zone", "contact", "target_named"), np.bool_),
+        }
         try:
             steps = len(content["decision_ms"])
             arrays: dict[str, Any] = {}
@@ -174,6 +191,8 @@ class EpisodeRecord:
             search = content["row"]
             if search is not None:
                 lists = {name: tuple(search[name]) for name in ("targets", "seen")}
+                if search.get("listed") is not None:
+                    lists["listed"] = tuple(search["listed"])
                 search = RowSearch(**{**search, **lists})
             return cls(
                 seed=int(content["seed"]),

@@ -18,6 +18,8 @@ from maniskill_tomato.experiments.episode_record import EpisodeRecord
 from maniskill_tomato.experiments.evaluation_report import ReportInput, ReportPicture, write_report
 from maniskill_tomato.experiments.metrics import make_metrics
 from maniskill_tomato.experiments.rollout import open_widest, run_episodes
+from maniskill_tomato.experiments.row_benchmark import ENV_ID as ROW_ID
+from maniskill_tomato.experiments.row_benchmark import seeable_in_row, without_camera
 from maniskill_tomato.experiments.training_runs import Run
 from maniskill_tomato.files import write_json
 from maniskill_tomato.learning.rl.envs import make_env
@@ -58,6 +60,8 @@ def evaluate(config: EvaluationConfig) -> EvaluationResult:
     found = find_policy(config.policy or shipped_policy(config.env_id), _required_task(config))
     path = found if isinstance(found, Path) else None
     episodes, baseline, threshold, policy = _run(config, found)
+    true_association = _with_true_association(config, found)
+    seeable = _seeable(config, episodes)
     description = {
         "path": None if path is None else str(path),
         **(policy.describe() if isinstance(policy, Planner) else {"kind": policy.name}),
@@ -70,6 +74,8 @@ def evaluate(config: EvaluationConfig) -> EvaluationResult:
         policy=description,
         wall_seconds=time.perf_counter() - start,
         baseline=baseline,
+        true_association=true_association,
+        seeable=seeable,
     )
     write_json(config.out / "metrics.json", metrics)
     write_trajectories(config.out / "trajectories.npz", episodes)
@@ -190,6 +196,35 @@ def _run_policy(config: EvaluationConfig, found: str | Path) -> tuple[list[Episo
     finally:
         env.close()
     return episodes, threshold, policy
+
+
+def _with_true_association(config: EvaluationConfig, found: str | Path) -> list[EpisodeRecord] | None:
+    """The policy's episodes when the truth tells which fruit each detection is; None where no camera decides, or the
+    options say already who tells."""
+    options = config.env_options
+    if options.get("perception", "ground_truth") == "ground_truth" or "association" in options:
+        return None
+    if config.env_id == ROW_ID:
+        return None
+    logger.info("the same episodes with a true association, to compare")
+    env = make_env(config.env_id, **options, association="truth")
+    try:
+        policy = _open(config, found, env)
+        return run_episodes(env, policy, config.episodes, config.seed, config.show_progress)
+    finally:
+        env.close()
+
+
+def _seeable(config: EvaluationConfig, episodes: Sequence[EpisodeRecord]) -> dict[int, set[int]] | None:
+    """The tomatoes of each row that can be seen, by its seed; None where no inspection list is judged."""
+    if any(e.row is None or e.row.listed is None for e in episodes):
+        return None
+    logger.info("asking the truth which tomatoes of the rows can be seen")
+    env = make_env(config.env_id, **without_camera(config.env_options))
+    try:
+        return {e.seed: set(seeable_in_row(env, e.seed)) for e in episodes}
+    finally:
+        env.close()
 
 
 def _plot_episodes(

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 import maniskill_tomato
 from maniskill_tomato.errors import InvalidInputError
+from maniskill_tomato.experiments.camera_metrics import summarise_camera, summarise_inspections
 from maniskill_tomato.experiments.episode_record import EpisodeRecord, Float64
 from maniskill_tomato.experiments.statistics import mean_interval, paired_test, wilson_interval
 
@@ -84,6 +85,8 @@ def make_metrics(
     policy: dict[str, Any],
     wall_seconds: float,
     baseline: Sequence[EpisodeRecord] | None = None,
+    true_association: Sequence[EpisodeRecord] | None = None,
+    seeable: Mapping[int, set[int]] | None = None,
 ) -> dict[str, Any]:
     """The content of `metrics.json`.
 
@@ -95,18 +98,26 @@ def make_metrics(
         policy: What the policy is: path, task and steps of its training.
         wall_seconds: Time that `episodes` took, in [s].
         baseline: What uniformly random actions did from the same seeds.
+        true_association: What the policy did from the same seeds when the truth told it which fruit each detection is.
+        seeable: The fruits of each row that can be seen fully, by its seed, where a camera inspected rows.
     """
     metrics = {
         "env_id": env_id,
         "seed": seed,
         "success_threshold": success_threshold,
         **summarise(episodes),
+        **summarise_camera(episodes, success_threshold),
         "policy": policy,
         "wall_seconds": wall_seconds,
         "package_version": maniskill_tomato.__version__,
     }
     if baseline is not None:
         metrics["random_actions"] = totals(summarise(baseline))
+    if seeable is not None:
+        metrics |= summarise_inspections(episodes, seeable, success_threshold)
+    if true_association is not None:
+        with_truth = summarise_camera(true_association, success_threshold)
+        metrics["true_association_success_rate"] = with_truth["true_success_rate"]
     return metrics
 
 

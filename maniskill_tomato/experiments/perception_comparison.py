@@ -13,7 +13,7 @@ from maniskill_tomato.experiments.policy_runs import Condition, parse_policies, 
 from maniskill_tomato.experiments.result_store import ResultStore
 from maniskill_tomato.files import write_atomically, write_json
 from maniskill_tomato.report_design import markdown_table
-from maniskill_tomato.sensing.simulated_camera import RENDERED, Perception
+from maniskill_tomato.sensing.perception_kinds import RENDERED, Perception
 from maniskill_tomato.tasks.row.row_config import GeneralTaskConfig
 
 PERCEPTIONS = get_args(Perception)

@@ -3,6 +3,7 @@
 import sys
 import time
 from collections.abc import Callable, Sequence
+from dataclasses import asdict
 from typing import Any, Protocol
 
 import gymnasium as gym
@@ -159,9 +160,12 @@ def run_batch(
     # Of all tasks that search for fruits, a row alone tells of every step whether its target is done.
     searches = "target_done" in info
     targets = [world.open_targets(i) if searches else () for i in range(len(seeds))]
+    inspecting = getattr(world, "inspecting", None)
+    lists: dict[int, tuple[dict[str, Any], ...]] = {}
     views, steps = [_view(world, observations, info)], []
     running = np.ones(len(seeds), dtype=np.bool_)
     success = np.zeros_like(running)
+    threshold = float(world.task.full_visibility) if searches else 1.0
     if watcher is not None:
         watcher.view(info, False)
     while running.any():
@@ -173,6 +177,9 @@ def run_batch(
         steps.append(_step(reward, info, running, decision_ms))
         success |= _array(info["success"]).astype(np.bool_) & running
         running &= ~(_array(terminated).astype(np.bool_) | _array(truncated).astype(np.bool_))
+        if inspecting is not None:
+            for i in set(np.flatnonzero(~running).tolist()) - set(lists):
+                lists[i] = tuple(asdict(fruit) for fruit in inspecting.judged(i))
         if watcher is not None:
             watcher.view(info, not running.any())
     seen, happened = _stacked(views), _stacked(steps)
@@ -198,8 +205,12 @@ def run_batch(
                 clearance=step.get("clearance"),
                 true_visible_fraction=view.get("true_visible_fraction"),
                 true_target=view.get("true_target"),
+                chosen_visible_fraction=view.get("chosen_visible_fraction"),
+                chosen_fruit=_indices(view.get("chosen_fruit")),
+                target_fruit=_indices(view["target_fruit"]) if "chosen_fruit" in view else None,
+                target_named=_flags(view.get("target_named")),
                 oracle_moves=None if oracle_moves is None else oracle_moves[i],
-                row=_row_search(targets[i], view, step) if searches else None,
+                row=_row_search(targets[i], view, step, lists.get(i), threshold) if searches else None,
             )
         )
     return records
@@ -219,6 +230,9 @@ def _view(world: Any, observations: Any, info: dict[str, Any]) -> dict[str, Floa
     if (true := info.get("true_visible_fraction")) is not None:
         view["true_visible_fraction"] = _array(true)
         view["true_target"] = _array(world.target_position_w)
+    if "chosen_fruit" in info:
+        for name in ("chosen_visible_fraction", "chosen_fruit", "target_named"):
+            view[name] = _array(info[name])
     if (fruit := getattr(world, "target_fruit", None)) is not None:
         view["target_fruit"] = _array(fruit)
     return view
@@ -249,16 +263,35 @@ def _step(reward: Any, info: dict[str, Any], running: Any, decision_ms: float) -
     }
 
 
-def _row_search(targets: Sequence[int], view: dict[str, Float64], step: dict[str, Float64]) -> RowSearch:
-    seen = view["target_fruit"][:-1][step["target_done"].astype(np.bool_)]
+def _row_search(
+    targets: Sequence[int],
+    view: dict[str, Float64],
+    step: dict[str, Float64],
+    listed: tuple[dict[str, Any], ...] | None,
+    threshold: float,
+) -> RowSearch:
+    seen = {int(fruit) for fruit in view["target_fruit"][:-1][step["target_done"].astype(np.bool_)]}
+    if listed is not None:
+        # What the robot believes is not what it saw.
+        seen = truly_seen(listed, threshold) & set(targets)
     return RowSearch(
         targets=tuple(int(fruit) for fruit in targets),
-        seen=tuple(sorted(int(fruit) for fruit in seen)),
+        seen=tuple(sorted(seen)),
         moves=int(step["moves"][-1]),
         transits=int(step["transits"].sum()),
         path_m=float(step["path_length"][-1]),
         joint_path_rad=float(step["joint_path_length"][-1]),
+        listed=listed,
     )
+
+
+def truly_seen(listed: Sequence[dict[str, Any]], threshold: float) -> set[int]:
+    """The ripe fruits that an inspection list calls fully seen and that truly were, as indices in `Plant.fruits`."""
+    return {
+        int(entry["fruit"])
+        for entry in listed
+        if entry["is_fully_seen"] and entry["is_truly_ripe"] and entry["true_fraction"] > threshold
+    }
 
 
 def _stacked(parts: Sequence[dict[str, Float64]]) -> dict[str, Float64]:
@@ -267,6 +300,10 @@ def _stacked(parts: Sequence[dict[str, Float64]]) -> dict[str, Float64]:
 
 def _flags(values: Float64 | None) -> Any:
     return None if values is None else values.astype(np.bool_)
+
+
+def _indices(values: Float64 | None) -> Any:
+    return None if values is None else values.astype(np.int64)
 
 
 def _array(values: Any) -> Float64:

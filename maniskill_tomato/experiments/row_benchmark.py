@@ -9,6 +9,7 @@ import torch
 
 import maniskill_tomato
 from maniskill_tomato.errors import InvalidInputError
+from maniskill_tomato.experiments.camera_metrics import summarise_inspections
 from maniskill_tomato.experiments.configs import RowBenchmarkConfig
 from maniskill_tomato.experiments.episode_record import EpisodeRecord, RowSearch
 from maniskill_tomato.experiments.policy_runs import Condition, parse_policies, run_policies
@@ -21,7 +22,9 @@ from maniskill_tomato.report_design import markdown_table
 from maniskill_tomato.robot.iiwa14 import READY_QPOS
 from maniskill_tomato.robot.inverse_kinematics import Reach
 from maniskill_tomato.robot.look_at_move import MIN_DISTANCE, LookAtMover
+from maniskill_tomato.sensing.perception_kinds import RENDERED, Perception
 from maniskill_tomato.sensing.view_lattice import ViewLattice
+from maniskill_tomato.tasks.row.row_config import GeneralTaskConfig
 from maniskill_tomato.worker_pool import run_jobs
 
 ENV_ID = "TomatoViewpointRow-v1"
@@ -34,6 +37,9 @@ SAMPLES = 4096
 
 FARTHEST_VIEW = 0.75
 """Farthest of them from the tomato, in [m]; the lattice's last is 0.74 m."""
+
+CAMERA_OPTIONS = ("perception", "render_backend", "association", "target", "map_noise")
+"""Options of a task that only a robot with a camera has."""
 
 _BLOCK = 128
 
@@ -64,7 +70,10 @@ def run_row_benchmark(config: RowBenchmarkConfig) -> str:
     """
     specs = parse_policies(config.policies)
     name = f"{config.split}-{config.transits}"
-    options = {"plant": {"seed": config.split, "pool": None}, "transits": config.transits}
+    options: dict[str, Any] = {"plant": {"seed": config.split, "pool": None}, "transits": config.transits}
+    if config.perception != "ground_truth":
+        name += f"-{config.perception}"
+        options |= camera_options(config.perception)
     condition = Condition(name=name, env_id=ENV_ID, env_options=options)
     settings = {"env_id": ENV_ID, "package_version": maniskill_tomato.__version__}
     store = ResultStore(config.out, settings, {f"policy {spec.label}": spec.fingerprint for spec in specs})
@@ -82,9 +91,22 @@ def run_row_benchmark(config: RowBenchmarkConfig) -> str:
     }
     path = config.out / f"rows-{name}.json"
     write_json(path, _content(results, seeable))
-    text = rows_table(results, seeable) + "\n" + "\n".join(compare_rows(results, seeable)) + "\n"
+    parts = [rows_table(results, seeable), "\n".join(compare_rows(results, seeable)) + "\n"]
+    if config.perception != "ground_truth":
+        parts.insert(1, inspection_table(results, seeable))
+    text = "\n".join(parts)
     write_atomically(path.with_suffix(".md"), text.encode())
     return text
+
+
+def camera_options(perception: Perception) -> dict[str, Any]:
+    """The options of a task that is seen through a camera."""
+    return {"perception": perception, **({"render_backend": "auto"} if perception in RENDERED else {})}
+
+
+def without_camera(options: Mapping[str, Any]) -> dict[str, Any]:
+    """Options of a task less those of a camera: the truth needs none."""
+    return {name: value for name, value in options.items() if name not in CAMERA_OPTIONS}
 
 
 def searched(record: EpisodeRecord) -> RowSearch:
@@ -98,13 +120,18 @@ def searched(record: EpisodeRecord) -> RowSearch:
     return record.row
 
 
+def seeable_in_row(env: gym.Env[Any, Any], seed: int) -> list[int]:
+    """The tomatoes of the row of a seed that the arm can see fully, as indices in `Plant.fruits`."""
+    env.reset(seed=seed)
+    world: Any = env.unwrapped
+    return SeeableTomatoes(env).among(world.open_targets(0))
+
+
 def _seeable_in_row(job: tuple[Condition, int]) -> list[int]:
     condition, seed = job
-    env = make_env(condition.env_id, **condition.env_options)
+    env = make_env(condition.env_id, **without_camera(condition.env_options))
     try:
-        env.reset(seed=seed)
-        world: Any = env.unwrapped
-        return SeeableTomatoes(env).among(world.open_targets(0))
+        return seeable_in_row(env, seed)
     finally:
         env.close()
 
@@ -193,6 +220,35 @@ def rows_table(results: Mapping[str, Sequence[EpisodeRecord]], seeable: Mapping[
     return f"{head}\n\n{markdown_table(HEAD, lines)}\n"
 
 
+INSPECTION_HEAD = (
+    "policy",
+    "recall",
+    "precision",
+    "fully seen and ripe",
+    "place, median [mm]",
+    "radius, median [mm]",
+    "moves",
+)
+
+
+def inspection_table(results: Mapping[str, Sequence[EpisodeRecord]], seeable: Mapping[int, set[int]]) -> str:
+    """What the policies' inspection lists are worth, as Markdown; see `summarise_inspections`."""
+    lines = []
+    for name, episodes in results.items():
+        figures = summarise_inspections(episodes, seeable, GeneralTaskConfig().full_visibility)
+        shares = [figures[key] for key in ("recall", "precision", "full_precision")]
+        errors = [figures[key] for key in ("position_error_median_m", "radius_error_median_m")]
+        lines.append(
+            (
+                name,
+                *("none" if share is None else f"{share:.1%}" for share in shares),
+                *("none" if error is None else f"{1e3 * error:.1f}" for error in errors),
+                f"{figures['mean_moves']:.1f}",
+            )
+        )
+    return markdown_table(INSPECTION_HEAD, lines) + "\n"
+
+
 def compare_rows(
     results: Mapping[str, Sequence[EpisodeRecord]], seeable: Mapping[int, set[int]]
 ) -> list[str]:
@@ -232,7 +288,7 @@ def _content(
                     "asked": e.steps,
                     "refused": int(e.refused.sum()),
                     "contacts": 0 if e.contact is None else int(e.contact.sum()),
-                    **vars(searched(e)),
+                    **{name: value for name, value in vars(searched(e)).items() if value is not None},
                 }
                 for e in episodes
             }

@@ -65,12 +65,20 @@ class BeliefFollower:
         """
         self._policy = policy
         self._world: Any = env.unwrapped
+        self._begun: Tensor | None = None
 
     def act(self, observations: Tensor) -> Tensor:
         """The policy's moves. Shape (B, 3)."""
         belief: Belief = self._world.belief
-        # One view: the episode has just begun, or the target has changed.
-        fresh = (belief.memory.visits == 1).nonzero()[:, 0]
+        # One view: the episode has just begun, or the target has changed. A robot that keeps a map has seen something
+        # of its next target before.
+        is_fresh = belief.memory.visits == 1
+        begun = getattr(self._world, "targets_begun", None)
+        if begun is not None:
+            if self._begun is not None:
+                is_fresh = is_fresh | (begun != self._begun)
+            self._begun = begun
+        fresh = is_fresh.nonzero()[:, 0]
         if len(fresh):
             self._policy.begin(belief, fresh)
         return self._policy.act(belief)

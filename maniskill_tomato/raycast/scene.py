@@ -231,23 +231,27 @@ class RayScene:
         T_w_camera: Tensor,
         T_w_plant: Tensor,
         T_w_links: Tensor | None = None,
+        env_index: int = 0,
     ) -> Picture:
-        """Depth, organs and shading of the first environment, as a painter needs them.
+        """Depth, organs and shading in one environment.
 
         Args:
             intrinsics: Of the picture.
             T_w_camera: Pose of the optical frame, translation in [m]. Shape (4, 4).
             T_w_plant: Pose of the plant. Shape (4, 4).
             T_w_links: Poses of `iiwa14.LINK_NAMES`; None for no robot. Shape (9, 4, 4).
+            env_index: Which environment.
 
         Raises:
-            InvalidInputError: A tensor has the wrong shape.
+            InvalidInputError: A tensor has the wrong shape, or there is no such environment.
         """
+        if not 0 <= env_index < self.num_envs:
+            raise InvalidInputError(f"env_index must be from 0 to {self.num_envs - 1}, got {env_index}")
         _check_shape("T_w_camera", T_w_camera, (4, 4))
         _check_shape("T_w_plant", T_w_plant, (4, 4))
         if T_w_links is not None:
             _check_shape("T_w_links", T_w_links, self._links_shape[1:])
-        return self._rays.picture(intrinsics, T_w_camera, T_w_plant, T_w_links)
+        return self._rays.picture(intrinsics, T_w_camera, T_w_plant, T_w_links, env_index)
 
     def clearance_along(
         self,

@@ -173,14 +173,16 @@ class WarpScene:
         T_w_camera: Tensor,
         T_w_plant: Tensor,
         T_w_links: Tensor | None,
+        env_index: int,
     ) -> Picture:
         """See `RayScene.picture`."""
         recorded = self._recorded(self._record_picture, intrinsics)
+        self._first_view.environments.fill_(env_index)
         self._first_view.place(T_w_camera, -1, T_w_plant, T_w_links)
         recorded.launch()
         depth, face, facing = (output[0].cpu().numpy() for output in recorded.outputs)
         # A face is -1 where there is nothing and -2 on the robot: the last two entries.
-        organs = self._shown[0].plant.organ_of_face.astype(np.int32) + FIRST_ORGAN_LABEL
+        organs = self._shown[env_index].plant.organ_of_face.astype(np.int32) + FIRST_ORGAN_LABEL
         labels = np.append(organs, np.array([ROBOT_LABEL, NOTHING_LABEL], np.int32))
         return Picture(depth.copy(), labels[face], facing.copy())
 

@@ -33,6 +33,9 @@ down from the elbow."""
 RETREAT_STEP: Final = 0.08
 """Longest step of it, in [m]."""
 
+STAND_OFF: Final = 0.3
+"""Places for the first view of a target are at least this far from it, in [m]."""
+
 LEG_PARTS: Final = 8
 """Straight parts of each leg, at whose ends it is checked and measured."""
 
@@ -96,6 +99,26 @@ class TransitPlanner:
         qpos = qpos.double()[None]
         position = flange_to_camera(forward_kinematics(qpos))[:, :3, 3]
         return int(self._mover.look_from(qpos, position, target.double()[None]).reach[0]) == Reach.REACHABLE
+
+    def to_first_view(
+        self, qpos: Tensor, camera_position: Tensor, places: Tensor, target: Tensor
+    ) -> Transit | None:
+        """The way to the nearest place for a first view of a target.
+
+        Args:
+            qpos: Joint positions, in [rad]. Shape (7,).
+            camera_position: Where the camera is, in the base frame, in [m]. Shape (3,).
+            places: Where it may look from; those nearer than `STAND_OFF` are left out, likewise. Shape (K, 3).
+            target: What it shall look at, likewise. Shape (3,).
+
+        Returns:
+            None if the camera sees the target from where it is, or if there is none.
+        """
+        if self.can_turn(qpos, target):
+            return None
+        places = places[(places - camera_position).norm(dim=-1).argsort()]
+        away = (places - target).norm(dim=-1)
+        return self.plan(qpos, places[away >= STAND_OFF], target)
 
     def plan(self, qpos: Tensor, places: Tensor, target: Tensor) -> Transit | None:
         """The way to the first place from which the arm can look at the target.

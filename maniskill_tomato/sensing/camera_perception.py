@@ -1,9 +1,12 @@
 """From the frames of N cameras to what is known of their targets: V_f, position, rays about it.
 
-Simulated worlds and the robot use the same class; what differs is who takes the frames.
+Simulated worlds and the robot use the same class; what differs is who takes the frames. Every environment has a
+`FruitMap`, and its target is one of the map's tracks.
 """
 
 from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Final
 
 import numpy as np
 import torch
@@ -11,17 +14,83 @@ from torch import Tensor
 
 from maniskill_tomato.errors import InvalidInputError
 from maniskill_tomato.raycast.view_rays import RAYS_PER_SIDE, RayLabel, ViewRays
+from maniskill_tomato.segmentation.masks import BinaryMask
 from maniskill_tomato.sensing.fruit_detector import FruitDetector
+from maniskill_tomato.sensing.fruit_map import Fraction, FruitMap, MapConfig, MappedView, Track
 from maniskill_tomato.sensing.measurement import Measurement, Position
 from maniskill_tomato.sensing.observation import ViewpointObserver
+from maniskill_tomato.sensing.occlusion_memory import CELL_SIZE
 from maniskill_tomato.sensing.posed_frame import PosedFrame
-from maniskill_tomato.sensing.target_tracker import TargetTracker
+
+MAP_NOISE: Final = 0.03
+"""Standard deviation of each coordinate of a place that a map of the row gives, in [m]."""
+
+RECENTRE: Final = CELL_SIZE / 4
+"""Memory and rays are centred anew when the target turns out to be farther than this from their centre, in [m]."""
+
+SAME_POSE: Final = 1e-3
+"""Entries of the camera's pose (in [m] for its place) differ by less than this in views from the same place."""
+
+SCAN_DEPTH: Final = 0.5
+"""How far in front of the camera a robot looks that has seen no fruit yet, in [m]."""
+
+SCAN_VIEWS: Final = 2
+"""Views of one place before a robot that does not find its target looks at another."""
+
+SCAN_OFFSETS: Final = (0.0, 0.12, -0.12, 0.24, 0.06, -0.06)
+"""How much farther away these places are, in [m]."""
+
+NEAR_AXIS: Final = 0.15
+"""Fruits farther from the optical axis do not say how far away the target may be, in [m]."""
+
+LARGEST_SPREAD: Final = 0.03
+"""Nor do tracks whose place is less certain, in [m]."""
+
+MEASURED_MARGIN: Final = 0.15
+"""How much more of a fruit must be measured than of a hidden target can be seen, to rule it out: three times the mean
+error of V_f."""
+
+UNSEEN_SHARE: Final = 0.3
+"""Share of the places about a target's that no view has shown: how likely it is none of the tracks."""
+
+SURE_SCORE: Final = 0.5
+"""A fruit with a lower score is not chosen as a new target."""
 
 _NO_RAYS = ViewRays(
     torch.tensor([0.0, 0.0, 1.0]).expand(1, RAYS_PER_SIDE**2, 3),
     torch.zeros(1, RAYS_PER_SIDE**2),
     torch.full((1, RAYS_PER_SIDE**2), int(RayLabel.OUTSIDE), dtype=torch.int8),
 )
+
+
+@dataclass(eq=False)
+class _Search:
+    """One environment: its map, which of the tracks is the target, and where it looks."""
+
+    map: FruitMap
+    place: Position | None = None
+    """Where the target is said to be, world frame, in [m]; None if nobody says. Shape (3,)."""
+    place_error: float = MAP_NOISE
+    """Standard deviation of its coordinates, in [m]."""
+    hidden_below: float | None = None
+    chooses: bool = False
+    """Whether any ripe fruit that is not fully seen yet will do."""
+    threshold: float = 1.0
+    """A fruit with a larger V_f is fully seen."""
+    target: int | None = None
+    ruled_out: frozenset[int] = frozenset()
+    """Tracks that cannot be the target."""
+    looks_at: Position | None = None
+    """Where the robot looks without a target, world frame, in [m]. Shape (3,)."""
+    centre: Position | None = None
+    """About which memory and rays stand, world frame, in [m]. Shape (3,)."""
+    views: list[MappedView] | None = None
+    fraction: Fraction = Fraction.nothing()
+
+    @property
+    def track(self) -> Track | None:
+        """The target's."""
+        return None if self.target is None else self.map.tracks.get(self.target)
 
 
 class CameraPerception:
@@ -32,54 +101,95 @@ class CameraPerception:
         num_envs: int,
         detector: FruitDetector,
         *,
-        identity_known: bool = False,
+        config: MapConfig | None = None,
+        true_association: bool = False,
         device: str | torch.device = "cpu",
     ) -> None:
-        """Begins with all targets at the origin.
+        """Begins with empty maps.
 
         Args:
             num_envs: Number of environments N.
             detector: Finds and measures fruits.
-            identity_known: Whether frames hold no fruit but the target, so that none can be mistaken for it.
+            config: Of the maps; measured defaults if None.
+            true_association: Whether the frames tell which fruit a detection shows, so that none is mistaken.
             device: Where tensors live.
         """
         self.num_envs = num_envs
         self.detector = detector
         """Finds and measures fruits."""
-        self._identity_known = identity_known
+        self.config = config or MapConfig()
+        """Of the maps."""
+        self._true_association = true_association
         self._device = torch.device(device)
-        self._trackers = [TargetTracker(np.zeros(3)) for _ in range(num_envs)]
-        self._views: list[list[Measurement]] = [[] for _ in range(num_envs)]
-        self._fruit: list[int | None] = [None] * num_envs
+        self._searches = [_Search(self._new_map()) for _ in range(num_envs)]
 
     def begin(
         self,
         env_index: int,
-        position_w: Position,
+        place_w: Position | None = None,
         *,
-        is_located: bool = False,
+        place_error: float = MAP_NOISE,
         hidden_below: float | None = None,
+        chooses: bool = False,
+        threshold: float = 1.0,
     ) -> None:
-        """Forgets an environment's views and begins with a new target.
+        """Forgets an environment's fruits and begins with a new target.
 
         Args:
             env_index: Which environment's.
-            position_w: As for `TargetTracker`, like the others. Shape (3,).
-            is_located: Whether it was measured.
+            place_w: Where the target is said to be, world frame, in [m]; None if `name` or `chooses` tells which it is.
+                Shape (3,).
+            place_error: Standard deviation of its coordinates, in [m].
             hidden_below: The first view shows less of the target than this V_f; None if that is not known.
+            chooses: Whether any ripe fruit that is not fully seen yet becomes the target.
+            threshold: V_f above which it is fully seen.
         """
-        self._trackers[env_index] = TargetTracker(
-            position_w,
-            is_located=is_located,
+        self._searches[env_index] = _Search(
+            self._new_map(),
+            place=None if place_w is None else np.array(place_w, dtype=np.float64),
+            place_error=place_error,
             hidden_below=hidden_below,
-            identity_known=self._identity_known,
+            chooses=chooses,
+            threshold=threshold,
+            centre=None if place_w is None else np.array(place_w, dtype=np.float64),
         )
-        self.forget_views(env_index)
 
-    def forget_views(self, env_index: int) -> None:
-        """Forgets an environment's views but not where its target is believed to be."""
-        self._views[env_index] = []
-        self._fruit[env_index] = None
+    def name(self, env_index: int, number: int | None) -> bool:
+        """Makes a track the target.
+
+        Returns:
+            Whether memory and rays must be centred anew, with `recall`.
+        """
+        search = self._searches[env_index]
+        search.target = number
+        return self._aim(search)
+
+    def turn_to(self, env_index: int, number: int | None, place_w: Position) -> bool:
+        """Makes a track the target, or looks at a place without one.
+
+        Args:
+            env_index: Which environment.
+            number: The track; None for none.
+            place_w: The place, world frame, in [m]. Shape (3,).
+
+        Returns:
+            Whether memory and rays must be centred anew, with `recall`.
+        """
+        search = self._searches[env_index]
+        search.target, search.looks_at = number, np.array(place_w, dtype=np.float64)
+        return self._aim(search)
+
+    def choose(self, env_index: int, threshold: float) -> bool:
+        """Makes the largest ripe, sure fruit of the last view the target, if its V_f there is not above a threshold.
+
+        Returns:
+            Whether memory and rays must be centred anew, with `recall`.
+        """
+        search = self._searches[env_index]
+        if search.views:
+            search.threshold = threshold
+            self._choose(search, search.views[-1])
+        return self._aim(search)
 
     def look(self, frames: Sequence[PosedFrame | None]) -> Tensor:
         """Measures new frames and finds the targets in them.
@@ -88,8 +198,8 @@ class CameraPerception:
             frames: One for each environment, None for those that do not look.
 
         Returns:
-            The environments whose target was first located in this view: what they have seen before should be taken
-            in again, about the new position, with `recall`. Shape (N,), bool.
+            The environments whose target turned out to be elsewhere: what they have seen before should be taken in
+            again, about the new position, with `recall`. Shape (N,), bool.
 
         Raises:
             InvalidInputError: The number of frames is wrong, or one lacks what segmentation needs.
@@ -98,53 +208,100 @@ class CameraPerception:
             raise InvalidInputError(
                 f"frames must be {self.num_envs}, one for each environment; got {len(frames)}"
             )
-        located = self.is_located
-        for k, frame in enumerate(frames):
-            if frame is not None:
-                self.add(k, self.detector.measure(frame))
-        return self.is_located & ~located
+        moved = [
+            frame is not None and self.add(k, self.detector.measure(frame)) for k, frame in enumerate(frames)
+        ]
+        return torch.tensor(moved, device=self._device)
 
-    def add(self, env_index: int, measurement: Measurement) -> None:
-        """Takes in a view that was measured already."""
-        self._views[env_index].append(measurement)
-        self._fruit[env_index] = self._trackers[env_index].update(measurement)
+    def add(self, env_index: int, measurement: Measurement) -> bool:
+        """Takes in a view that was measured already; whether its target turned out to be elsewhere."""
+        search = self._searches[env_index]
+        identities = None
+        if self._true_association:
+            shown = measurement.frame.shown_fruit
+            identities = [shown(measurement.mask(k)) for k in range(len(measurement.fruits))]
+        pose, last = measurement.frame.T_world_camera, search.views[-1] if search.views else None
+        if last is not None and np.allclose(
+            pose, last.measurement.frame.T_world_camera, rtol=0.0, atol=SAME_POSE
+        ):
+            view = search.map.again(measurement, last)
+        else:
+            view = search.map.update(measurement, identities)
+        first = not search.views
+        search.views = [*(_slimmed(earlier) for earlier in search.views or []), view]
+        if search.target is not None:
+            search.target = search.map.current(search.target)
+        if search.place is not None:
+            self._find(search, view, first)
+        elif search.chooses and search.target is None:
+            self._choose(search, view)
+        return self._aim(search)
 
     def views(self, env_index: int) -> Sequence[Measurement]:
-        """All views of an environment's target so far, in order."""
-        return self._views[env_index]
+        """All views of an environment so far, in order."""
+        return [view.measurement for view in self._searches[env_index].views or []]
+
+    def map(self, env_index: int) -> FruitMap:
+        """An environment's fruits."""
+        return self._searches[env_index].map
+
+    def last_view(self, env_index: int) -> MappedView | None:
+        """The last view with the tracks of its detections; None before the first."""
+        views = self._searches[env_index].views
+        return views[-1] if views else None
+
+    def target(self, env_index: int) -> Track | None:
+        """The target's track; None while it is not known which it is."""
+        return self._searches[env_index].track
 
     def target_fruit(self, env_index: int) -> int | None:
         """Index of the target among the fruits of the last view; None if it does not show it."""
-        return self._fruit[env_index]
+        view = self.last_view(env_index)
+        return None if view is None else view.detection(self._searches[env_index].target)
+
+    def mask(self, env_index: int) -> BinaryMask:
+        """Visible pixels of the target in the last view. Shape (H, W).
+
+        Raises:
+            InvalidInputError: There is no view yet.
+        """
+        view = self.last_view(env_index)
+        if view is None:
+            raise InvalidInputError("there is no mask before the first view")
+        return view.measurement.mask(self.target_fruit(env_index))
 
     def position_w(self, env_index: int) -> Position:
-        """Where an environment's target is believed to be, world frame, in [m]. Shape (3,), float64."""
-        return self._trackers[env_index].position_w
+        """About which an environment's memory and rays stand, world frame, in [m]: where the target is believed to be,
+        or where the robot looks for it. Shape (3,), float64."""
+        centre = self._searches[env_index].centre
+        return np.zeros(3) if centre is None else centre
 
     @property
     def is_located(self) -> Tensor:
-        """Whether the camera has measured where the targets are. Shape (N,), bool."""
-        return torch.tensor([tracker.is_located for tracker in self._trackers], device=self._device)
+        """Whether a track is the target. Shape (N,), bool."""
+        return torch.tensor([search.track is not None for search in self._searches], device=self._device)
 
     @property
     def target_position(self) -> Tensor:
         """Where targets are believed to be, world frame, in [m]. Shape (N, 3), float32."""
-        positions = np.stack([tracker.position_w for tracker in self._trackers])
+        positions = np.stack([self.position_w(k) for k in range(self.num_envs)])
         return torch.as_tensor(positions, dtype=torch.float32, device=self._device)
 
     @property
     def visible_fraction(self) -> Tensor:
         """V_f of the targets in the last views, 0 for one that is not seen. Shape (N,), float32."""
-        fractions = [0.0] * self.num_envs
-        for k, fruit in enumerate(self._fruit):
-            if fruit is not None and np.isfinite(v := self._views[k][-1].fruits[fruit].visible_fraction):
-                fractions[k] = v
-        return torch.tensor(fractions, dtype=torch.float32, device=self._device)
+        return self._fractions([search.fraction.value for search in self._searches])
+
+    @property
+    def sure_fraction(self) -> Tensor:
+        """Lower bound of V_f: `MapConfig.stop_errors` standard errors less. Shape (N,), float32."""
+        return self._fractions(
+            [max(s.fraction.value - self.config.stop_errors * s.fraction.error, 0.0) for s in self._searches]
+        )
 
     def rays(self) -> ViewRays:
         """The pattern about the believed positions, read from the last views; OUTSIDE where there is none yet."""
-        last = [views[-1] if views else None for views in self._views]
-        return self._rays(list(zip(last, self._fruit, strict=True)))
+        return self._rays([self.last_view(k) for k in range(self.num_envs)])
 
     def recall(self, observer: ViewpointObserver, env_idx: Tensor) -> None:
         """Begins the memory of some environments anew about where their targets are believed to be now, and takes in
@@ -156,24 +313,128 @@ class CameraPerception:
         """
         observer.begin(env_idx, self.target_position[env_idx])
         rows = [int(i) for i in env_idx]
+        earlier = {i: (self._searches[i].views or [])[:-1] for i in rows}
         poses = torch.eye(4, device=self._device).repeat(self.num_envs, 1, 1)
-        for k in range(max((len(self._views[i]) - 1 for i in rows), default=0)):
-            seen: list[tuple[Measurement | None, int | None]] = [(None, None)] * self.num_envs
-            for i in rows:
-                if k < len(self._views[i]) - 1:
-                    view = self._views[i][k]
-                    seen[i] = (view, self._trackers[i].find(view))
-                    poses[i] = torch.as_tensor(view.frame.T_world_camera).to(poses)
-            mask = torch.tensor([view is not None for view, _ in seen], device=self._device)
+        for k in range(max((len(views) for views in earlier.values()), default=0)):
+            seen: list[MappedView | None] = [None] * self.num_envs
+            for i, views in earlier.items():
+                if k < len(views):
+                    seen[i] = views[k]
+                    poses[i] = torch.as_tensor(views[k].measurement.frame.T_world_camera).to(poses)
+            mask = torch.tensor([view is not None for view in seen], device=self._device)
             observer.memory.integrate(poses, self._rays(seen), mask)
 
-    def _rays(self, seen: Sequence[tuple[Measurement | None, int | None]]) -> ViewRays:
-        parts = [
-            _NO_RAYS if view is None else view.rays(tracker.position_w, fruit)
-            for tracker, (view, fruit) in zip(self._trackers, seen, strict=True)
-        ]
+    # ------------------------------------------------------------------ target
+
+    def _find(self, search: _Search, view: MappedView, first: bool) -> None:
+        """The target by the place where it is said to be; another track takes over when it is more likely."""
+        if first and search.hidden_below is not None:
+            limit = search.hidden_below + MEASURED_MARGIN
+            search.ruled_out = frozenset(
+                number
+                for fruit, number in zip(view.measurement.fruits, view.tracks, strict=True)
+                if fruit.visible_fraction > limit
+            )
+        assert search.place is not None
+        weights = {}
+        for number, track in search.map.tracks.items():
+            ruled_out = any(search.map.current(other) == number for other in search.ruled_out)
+            if not track.is_ripe or ruled_out:
+                continue
+            spread = track.covariance[:3, :3] + search.place_error**2 * np.eye(3)
+            off = track.position_w - search.place
+            distance = float(off @ np.linalg.solve(spread, off))
+            weights[number] = float(
+                np.exp(-0.5 * distance) / np.sqrt(np.linalg.det(2.0 * np.pi * spread)) * track.existence
+            )
+        unseen = UNSEEN_SHARE * self.config.fruit_density
+        best = max(weights, key=lambda number: weights[number], default=None)
+        if best is not None and weights[best] > 0.5 * (sum(weights.values()) + unseen):
+            search.target = best
+        elif search.target is not None and best is not None and weights[best] <= unseen:
+            search.target = None
+
+    def _choose(self, search: _Search, view: MappedView) -> None:
+        """The largest ripe, sure fruit of the picture that is not fully visible in it becomes the target."""
+        best, pixels = None, 0
+        for index, (fruit, number) in enumerate(zip(view.measurement.fruits, view.tracks, strict=True)):
+            track = search.map.tracks.get(number)
+            if track is None or not track.is_ripe or fruit.score < SURE_SCORE or not fruit.is_depth_measured:
+                continue
+            seen = search.map.fraction(view.measurement, index, number)
+            if seen.value <= search.threshold and fruit.pixels > pixels:
+                best, pixels = number, fruit.pixels
+        search.target = best
+
+    def _aim(self, search: _Search) -> bool:
+        """Works out V_f and where to look; whether that is elsewhere."""
+        view = search.views[-1] if search.views else None
+        track = search.track
+        if track is not None:
+            towards = track.position_w
+        elif search.place is not None:
+            towards = search.place
+        elif search.looks_at is not None:
+            towards = search.looks_at
+        else:
+            towards = _scan_centre(search) if view is not None else np.zeros(3)
+        if view is not None:
+            index = view.detection(search.target)
+            search.fraction = search.map.fraction(view.measurement, index, search.target)
+        if search.centre is not None and np.linalg.norm(towards - search.centre) <= RECENTRE:
+            return False
+        # Whole millimetres: the errors of rounding of a fit do not shift the memory's voxels.
+        search.centre = np.round(1000.0 * np.asarray(towards, dtype=np.float64)) / 1000.0
+        return view is not None
+
+    def _new_map(self) -> FruitMap:
+        return FruitMap(self.config, self.detector.divide)
+
+    def _fractions(self, values: Sequence[float]) -> Tensor:
+        return torch.tensor(values, dtype=torch.float32, device=self._device)
+
+    def _rays(self, seen: Sequence[MappedView | None]) -> ViewRays:
+        parts = []
+        for k, view in enumerate(seen):
+            if view is None:
+                parts.append(_NO_RAYS)
+                continue
+            search = self._searches[k]
+            number = search.target
+            names = [search.map.current(n) for n in view.tracks]
+            index = names.index(number) if number is not None and number in names else None
+            parts.append(view.measurement.rays(self.position_w(k), index))
         return ViewRays(
             torch.cat([part.direction_c for part in parts]).to(self._device),
             torch.cat([part.distance for part in parts]).to(self._device),
             torch.cat([part.label for part in parts]).to(self._device),
         )
+
+
+def _slimmed(view: MappedView) -> MappedView:
+    """An earlier view without what only the last one is asked for, its colours and the truth: a row has a hundred."""
+    frame = view.measurement.frame
+    if frame.rgb is None and frame.true_fruits is None:
+        return view
+    frame = replace(frame, rgb=None, true_fruits=None, true_numbers=())
+    return replace(view, measurement=replace(view.measurement, frame=frame))
+
+
+def _scan_centre(search: _Search) -> Position:
+    """Where a robot looks that does not know its target: on the optical axis of its first view. Shape (3,).
+
+    At first that is as far away as the fruit nearest to the axis, of 30 starts on validation plants 32 mm off in the
+    mean; the median depth of the plant is 109 mm off. After every `SCAN_VIEWS` views it is another of `SCAN_OFFSETS`.
+    """
+    assert search.views
+    pose = search.views[0].measurement.frame.T_world_camera
+    position, axis = pose[:3, 3], pose[:3, 2]
+    depth, nearest = SCAN_DEPTH, NEAR_AXIS
+    for track in search.map.tracks.values():
+        away = track.position_w - position
+        along = float(away @ axis)
+        beside = float(np.linalg.norm(away - along * axis))
+        if along > 0.0 and beside < nearest and track.covariance[:3, :3].trace() < LARGEST_SPREAD**2:
+            depth, nearest = along, beside
+    turn = (len(search.views) - 1) // SCAN_VIEWS
+    return np.asarray(position + max(depth + SCAN_OFFSETS[turn % len(SCAN_OFFSETS)], 0.2) * axis)

@@ -1,5 +1,6 @@
 """From a frame to the fruits in it: masks by a segmenter, V_f and place by an occlusion model."""
 
+from collections.abc import Sequence
 from typing import Final
 
 import numpy as np
@@ -9,7 +10,7 @@ from maniskill_tomato.errors import InvalidInputError
 from maniskill_tomato.segmentation.instances import Instances, mask_box
 from maniskill_tomato.segmentation.masks import BinaryMask
 from maniskill_tomato.segmentation.segmenter import Segmenter
-from maniskill_tomato.sensing.measurement import DetectedFruit, Measurement, Position
+from maniskill_tomato.sensing.measurement import RIPE_CATEGORIES, DetectedFruit, Measurement, Position
 from maniskill_tomato.sensing.posed_frame import PosedFrame
 from maniskill_tomato.sensing.visible_fraction.estimate import (
     RADIUS_SPREAD,
@@ -56,22 +57,49 @@ class FruitDetector:
             kept = kept & (np.count_nonzero(found.masks, axis=(1, 2)) >= FEWEST_PIXELS)
         found = found.chosen(kept)
         masks = tuple(np.ascontiguousarray(mask) for mask in found.masks)
+        return Measurement(frame=frame, fruits=self._fruits(frame, masks, found.categories, found.scores))
+
+    def divide(self, measurement: Measurement, index: int, parts: Sequence[BinaryMask]) -> Measurement:
+        """A view measured anew with a detection's mask divided.
+
+        Args:
+            measurement: The view.
+            index: Of the detection in `Measurement.fruits`; its parts take its place.
+            parts: Their masks; those with fewer than `FEWEST_PIXELS` are left out. Each of shape (H, W).
+        """
+        fruits, whole = measurement.fruits, measurement.fruits[index]
+        masks = [part for part in parts if np.count_nonzero(part) >= FEWEST_PIXELS]
+        new = self._fruits(
+            measurement.frame,
+            tuple(masks),
+            (whole.category,) * len(masks),
+            np.full(len(masks), whole.score, np.float32),
+        )
+        return Measurement(frame=measurement.frame, fruits=(*fruits[:index], *new, *fruits[index + 1 :]))
+
+    def _fruits(
+        self,
+        frame: PosedFrame,
+        masks: tuple[BinaryMask, ...],
+        categories: Sequence[str],
+        scores: NDArray[np.float32],
+    ) -> tuple[DetectedFruit, ...]:
         depth = frame.depth_m.astype(np.float64)
         rgb = np.zeros((*depth.shape, 3), np.uint8) if frame.rgb is None else frame.rgb
         view = SegmentedImage(rgb=rgb, depth_m=depth, masks=masks, intrinsics=frame.intrinsics)
-        fruits = tuple(
+        return tuple(
             _fruit(frame, view, mask, estimate, category, float(score))
             for mask, estimate, category, score in zip(
-                masks, self._model(view), found.categories, found.scores, strict=True
+                masks, self._model(view), categories, scores, strict=True
             )
         )
-        return Measurement(frame=frame, fruits=fruits)
 
     def _segmented(self, frame: PosedFrame) -> Instances:
         if self._segmenter is None:
             if frame.true_fruits is None:
                 raise InvalidInputError("perfect masks need a simulated camera; choose a segmenter")
-            return frame.true_fruits
+            ripe = [category in RIPE_CATEGORIES for category in frame.true_fruits.categories]
+            return frame.true_fruits.chosen(np.array(ripe, np.bool_))
         if frame.rgb is None:
             raise InvalidInputError("a segmenter needs a picture with colours")
         return self._segmenter(frame.rgb, frame.depth_m)
@@ -92,16 +120,34 @@ def _fruit(
     ray = frame.intrinsics.ray_directions(pixel)
     rotation = frame.T_world_camera[:3, :3]
     centre = _centre(estimate, view, mask, ray)
+    if centre is None:
+        # Where neither it nor what is round it has depth, its size tells how far away it is.
+        distance = USUAL_RADIUS * frame.intrinsics.fx / (0.5 * max(crop.shape))
+        centre = ray * distance
     return DetectedFruit(
         category=category,
         score=score,
         corner=(top, left),
         crop=crop,
         visible_fraction=estimate.visible_fraction,
-        centre_w=None if centre is None else rotation @ centre + frame.T_world_camera[:3, 3],
+        centre_w=rotation @ centre + frame.T_world_camera[:3, 3],
         radius_m=estimate.radius_m,
+        is_depth_measured=bool(np.isfinite(fruit_depth(view.depth_m, mask))),
         direction_w=rotation @ (ray / np.linalg.norm(ray)),
+        redness=_redness(frame, mask),
     )
+
+
+DARK: Final = 30.0
+"""Sum of red and green below which a colour says nothing, of 510."""
+
+
+def _redness(frame: PosedFrame, mask: BinaryMask) -> float:
+    """(R - G) / (R + G) of the mean colour of a mask; NaN without colours, and where it is too dark to tell."""
+    if frame.rgb is None:
+        return float("nan")
+    red, green, _ = frame.rgb[mask].mean(axis=0)
+    return float((red - green) / (red + green)) if red + green > DARK else float("nan")
 
 
 def _centre(

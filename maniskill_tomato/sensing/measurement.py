@@ -1,6 +1,7 @@
 """What one view told: the fruits found in it, and the frame from which rays can be read about any target position."""
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 import torch
@@ -10,6 +11,7 @@ from maniskill_tomato.raycast.view_rays import ViewRays
 from maniskill_tomato.segmentation.masks import BinaryMask
 from maniskill_tomato.sensing.posed_frame import PosedFrame
 from maniskill_tomato.sensing.view_pattern import sample_view
+from maniskill_tomato.sensing.visible_fraction.estimate import filled_depth, fruit_depth
 
 Position = NDArray[np.float64]
 
@@ -31,12 +33,16 @@ class DetectedFruit:
     """Visible pixels in the smallest box that holds them."""
     visible_fraction: float
     """V_f as estimated; NaN where the estimator failed."""
-    centre_w: Position | None
-    """Centre in the world frame, in [m]; None where the picture has no depth of the fruit. Shape (3,)."""
+    centre_w: Position
+    """Centre in the world frame, in [m]; without depth, as far away as a usual fruit of its size. Shape (3,)."""
     radius_m: float
     """Radius in [m]; NaN where it is not known."""
+    is_depth_measured: bool
+    """Whether its depth was measured; if not, it is that of what is seen round it, or follows from its size."""
     direction_w: Position
     """Unit vector from the camera through the middle of the visible pixels, world frame. Shape (3,)."""
+    redness: float = float("nan")
+    """(R - G) / (R + G) of the mean colour of the visible pixels; NaN where that is not known."""
 
     @property
     def is_ripe(self) -> bool:
@@ -70,6 +76,23 @@ class Measurement:
             (top, left), crop = self.fruits[fruit].corner, self.fruits[fruit].crop
             mask[top : top + crop.shape[0], left : left + crop.shape[1]] = crop
         return mask
+
+    @cached_property
+    def depth_by_fruits(self) -> tuple[NDArray[np.float64], BinaryMask, tuple[float, ...]]:
+        """Depth without holes with every fruit at one depth, in [m], the pixels of all fruits, and the depth of each.
+
+        Shapes (H, W) and (H, W), and one number a fruit, NaN where none was measured.
+        """
+        raw = self.frame.depth_m
+        measured = np.where(np.isfinite(raw) & (raw > 0), raw, 0.0).astype(np.float64)
+        depth, pixels, owns = filled_depth(measured), np.zeros(raw.shape, np.bool_), []
+        for k in range(len(self.fruits)):
+            mask = self.mask(k)
+            owns.append(fruit_depth(measured, mask))
+            if np.isfinite(owns[-1]):
+                depth[mask] = owns[-1]
+            pixels |= mask
+        return depth, pixels, tuple(owns)
 
     def rays(self, target_position: Position, fruit: int | None) -> ViewRays:
         """The pattern of rays about a target position, read from depth and masks.

@@ -27,6 +27,8 @@ class PosedFrame:
     """Where the picture shows the robot itself, if that is known. Shape (H, W)."""
     true_fruits: Instances | None = None
     """The fruits that a simulated camera knows to be in the picture, for perfect segmentation."""
+    true_numbers: tuple[int, ...] = ()
+    """Which these are, as indices in `Plant.fruits`; empty where that is not known."""
 
     def __post_init__(self) -> None:
         size = (self.intrinsics.height, self.intrinsics.width)
@@ -38,3 +40,18 @@ class PosedFrame:
         ):
             if array is not None and array.shape != shape:
                 raise InvalidInputError(f"{name} must have shape {shape}, got {array.shape}")
+
+    def shown_fruit(self, mask: BinaryMask) -> int | None:
+        """Which fruit most pixels of a mask show, as an index in `Plant.fruits`.
+
+        Args:
+            mask: Of a detection. Shape (H, W).
+
+        Returns:
+            None if less than half of them show any one fruit, or if the camera does not know.
+        """
+        if self.true_fruits is None or not self.true_numbers:
+            return None
+        shared = (self.true_fruits.masks & mask).sum(axis=(1, 2))
+        best = int(np.argmax(shared))
+        return self.true_numbers[best] if 2 * shared[best] >= np.count_nonzero(mask) else None

@@ -1,12 +1,19 @@
 """The wrist cameras of N simulated environments: depth with the D435's faults, and masks or rendered colours."""
 
 from collections.abc import Callable
-from typing import Final, Literal
+from typing import Final
 
 import numpy as np
 from torch import Tensor
 
-from maniskill_tomato.raycast.images import PixelLabel
+from maniskill_tomato.plants.organs import Plant
+from maniskill_tomato.raycast.images import (
+    BACKGROUND_DEPTH,
+    FIRST_ORGAN_LABEL,
+    NOTHING_LABEL,
+    ROBOT_LABEL,
+    Picture,
+)
 from maniskill_tomato.raycast.scene import RayScene
 from maniskill_tomato.raycast.view_rays import DEPTH_MODE
 from maniskill_tomato.robot.d435 import CameraIntrinsics, color_intrinsics
@@ -15,18 +22,10 @@ from maniskill_tomato.segmentation.instances import Instances
 from maniskill_tomato.segmentation.segmenter import make_segmenter
 from maniskill_tomato.sensing.camera_perception import CameraPerception
 from maniskill_tomato.sensing.fruit_detector import FruitDetector
+from maniskill_tomato.sensing.perception_kinds import RENDERED, Perception
 from maniskill_tomato.sensing.posed_frame import PosedFrame
 from maniskill_tomato.sensing.visible_fraction.estimate import UInt8
 from maniskill_tomato.sensing.visible_fraction.occlusion_models import make_occlusion_model
-
-Perception = Literal["ground_truth", "occlusion_model", "thesis_model", "improved_model", "segmenter"]
-"""What reward, observation and the target's position come from.
-
-`occlusion_model`: `SphereModel` on a perfect mask and noisy depth. `thesis_model`, `improved_model`: those models on
-the same and rendered colours. `segmenter`: the light segmenter's masks in rendered colours, then `SphereModel`."""
-
-RENDERED: Final[tuple[Perception, ...]] = ("thesis_model", "improved_model", "segmenter")
-"""Those that need colours, and so a renderer."""
 
 IMAGE_SIZE: Final = (320, 240)
 """Width and height of cast images, in [px]."""
@@ -34,9 +33,7 @@ IMAGE_SIZE: Final = (320, 240)
 RENDERED_SIZE: Final = (640, 480)
 """Width and height of rendered ones unless `sensor_configs` says otherwise, in [px]: the camera's own."""
 
-COARSE_POSITION: Final = 0.03
-"""Standard deviation of each coordinate of a target's position before it was first seen, in [m]: that of a map of the
-row made from further away."""
+_CATEGORIES: Final = {"ripe": "tomato_ripe", "turning": "tomato_turning", "green": "tomato_unripe"}
 
 
 class SimulatedCamera:
@@ -71,7 +68,6 @@ class SimulatedCamera:
     def take(
         self,
         T_world_camera: Tensor,
-        target: Tensor,
         T_world_plant: Tensor,
         links: Tensor,
         mask: Tensor | None = None,
@@ -80,31 +76,47 @@ class SimulatedCamera:
 
         Args:
             T_world_camera: Poses of the optical frames. Shape (N, 4, 4).
-            target: Indices of the targets in `Plant.fruits`; `PosedFrame.true_fruits` has the target alone. Shape (N,).
             T_world_plant: Poses of the plants. Shape (N, 4, 4).
             links: World poses of the links. Shape (N, 9, 4, 4).
             mask: Which environments take one, all if None; the others get None. Shape (N,), bool.
         """
-        images = self._scene.image(self._intrinsics, T_world_camera, target, T_world_plant, links)
         frames: list[PosedFrame | None] = []
         for k, generator in enumerate(self._generators):
             if mask is not None and not bool(mask[k]):
                 frames.append(None)
                 continue
-            exact = images.depth[k].cpu().numpy().astype(np.float64)
-            depth = measure_depth(exact, self._intrinsics, self._noise, generator, stereo=DEPTH_MODE)
-            label = images.label[k].cpu().numpy()
+            cast = self._scene.picture(
+                self._intrinsics, T_world_camera[k], T_world_plant[k], links[k], env_index=k
+            )
+            is_plant = cast.labels != NOTHING_LABEL
+            exact = np.where(is_plant, np.minimum(cast.depth, BACKGROUND_DEPTH), BACKGROUND_DEPTH)
+            depth = measure_depth(
+                exact.astype(np.float64), self._intrinsics, self._noise, generator, stereo=DEPTH_MODE
+            )
+            fruits, numbers = true_fruits(cast, self._scene.plant(k))
             frames.append(
                 PosedFrame(
                     depth_m=depth.astype(np.float32),
                     intrinsics=self._intrinsics,
                     T_world_camera=T_world_camera[k].double().cpu().numpy(),
                     rgb=None if self._picture is None else self._picture(k),
-                    robot_mask=label == int(PixelLabel.ROBOT),
-                    true_fruits=Instances.from_masks(label[None] == int(PixelLabel.TARGET)),
+                    robot_mask=cast.labels == ROBOT_LABEL,
+                    true_fruits=fruits,
+                    true_numbers=numbers,
                 )
             )
         return frames
+
+
+def true_fruits(cast: Picture, plant: Plant) -> tuple[Instances, tuple[int, ...]]:
+    """The fruits in a cast picture and their indices in `Plant.fruits`, ordered by these."""
+    shown = set(np.unique(cast.labels).tolist())
+    numbers = tuple(
+        j for j, fruit in enumerate(plant.fruits) if fruit.organ_index + FIRST_ORGAN_LABEL in shown
+    )
+    labels = np.array([plant.fruits[j].organ_index + FIRST_ORGAN_LABEL for j in numbers], np.int32)
+    categories = tuple(_CATEGORIES[plant.fruits[j].ripeness] for j in numbers)
+    return Instances.from_masks(cast.labels[None] == labels[:, None, None], categories=categories), numbers
 
 
 def make_camera(
@@ -112,6 +124,8 @@ def make_camera(
     scene: RayScene,
     intrinsics: CameraIntrinsics,
     picture: Callable[[int], UInt8],
+    *,
+    true_association: bool = False,
 ) -> tuple[SimulatedCamera, CameraPerception] | None:
     """The camera of a kind of perception and what measures its frames; None for ground truth.
 
@@ -120,6 +134,7 @@ def make_camera(
         scene: The environments' plants and links.
         intrinsics: Of rendered pictures.
         picture: Renders them, by the index of an environment.
+        true_association: Whether no fruit is mistaken for another.
     """
     if perception == "ground_truth":
         return None
@@ -132,5 +147,6 @@ def make_camera(
         camera = SimulatedCamera(scene, intrinsics=intrinsics, picture=picture)
     else:
         camera = SimulatedCamera(scene)
-    known = perception != "segmenter"
-    return camera, CameraPerception(scene.num_envs, detector, identity_known=known, device=scene.device)
+    return camera, CameraPerception(
+        scene.num_envs, detector, true_association=true_association, device=scene.device
+    )

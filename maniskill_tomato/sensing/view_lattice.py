@@ -29,6 +29,9 @@ DISTANCE_RATIO: Final = 1.5
 """Between neighbouring distances: the last is 0.74 m, beyond which the arm reaches less than a third of the
 directions."""
 
+REACHABLE_SHARE: Final = 0.1
+"""A target is in reach when the arm can look at it from this share of the candidates or more."""
+
 _FAR_AWAY = 100.0
 
 
@@ -142,6 +145,10 @@ class ViewLattice:
             solution = self._inverse_kinematics.solve(T_base_flange, reference, neighbour=False)
             reached |= solution.reach == Reach.REACHABLE
         return reached.view(-1, self.size)
+
+    def in_reach(self, target_position: Tensor) -> Tensor:
+        """Which targets the arm can look at from `REACHABLE_SHARE` of the candidates. Shape (B, 3) to (B,), bool."""
+        return self.reachable(target_position).float().mean(dim=-1) >= REACHABLE_SHARE
 
     def _neighbours(self) -> Tensor:
         steps = torch.stack(

@@ -23,7 +23,13 @@ from maniskill_tomato.sensing.observation import ObservationLayout
 from maniskill_tomato.sensing.simulated_camera import RENDERED_SIZE
 from maniskill_tomato.tasks.arm_moves import Plan
 from maniskill_tomato.tasks.ground_truth import WorldTruth
-from maniskill_tomato.tasks.making import check_choice, default_control, make_setup, option_names
+from maniskill_tomato.tasks.making import (
+    check_choice,
+    check_other_tasks,
+    default_control,
+    make_setup,
+    option_names,
+)
 from maniskill_tomato.tasks.maniskill import scenery, shell_options
 from maniskill_tomato.tasks.maniskill.controllers import CONTROL_MODES
 from maniskill_tomato.tasks.maniskill.flat_state import checked_rows, unflatten
@@ -79,6 +85,7 @@ class TomatoEnv(BaseEnv):  # type: ignore[misc]
         shell_options.check_num_envs(num_envs, sim_backend)
         names = option_names(self.env_id)
         options = {name: kwargs.pop(name) for name in list(kwargs) if name in names}
+        check_other_tasks(self.env_id, kwargs)
         self._setup = setup = make_setup(self.env_id, **options)
         self.motion = motion
         if control_mode is None:
@@ -422,6 +429,16 @@ class SearchEnv(TomatoEnv):
 
 class RowEnv(SearchEnv):
     """What the shell of the row tells beside."""
+
+    @property
+    def targets_begun(self) -> Tensor:
+        """How many targets each row has had so far. Shape (num_envs,)."""
+        return self.world.targets_begun
+
+    @property
+    def inspecting(self) -> Any:
+        """What knows the inspection lists of rows that are inspected with a camera; there is none otherwise."""
+        return self.world.inspecting
 
     def open_targets(self, env_index: int = 0) -> list[int]:
         """The fruits of a row that are yet to be looked for, as indices in `Plant.fruits`."""

@@ -18,14 +18,22 @@ from maniskill_tomato.robot.rotations import FORWARD_RPY
 from maniskill_tomato.robot.transit import TRANSIT_MOVES
 from maniskill_tomato.sensing.belief import Belief
 from maniskill_tomato.sensing.observation import ObservationLayout, ViewpointObserver
+from maniskill_tomato.sensing.perception_kinds import Perception
 from maniskill_tomato.sensing.sensor_noise import SensorNoise
-from maniskill_tomato.sensing.simulated_camera import Perception
 from maniskill_tomato.tasks import MAX_ROW_STEPS
 from maniskill_tomato.tasks.arm_moves import Plan
 from maniskill_tomato.tasks.row.episode_selection import EpisodeChoice
 from maniskill_tomato.tasks.row.hidden_starts import HardStarts, Start, StartRequest
-from maniskill_tomato.tasks.row.row_config import GeneralTaskConfig
-from maniskill_tomato.tasks.row.senses import ViewMeasurement, ViewPoses, make_senses
+from maniskill_tomato.tasks.row.inspecting import InspectedSequence, InspectingSenses
+from maniskill_tomato.tasks.row.row_config import CameraConfig, GeneralTaskConfig
+from maniskill_tomato.tasks.row.senses import (
+    CameraSenses,
+    ExactSenses,
+    Senses,
+    ViewMeasurement,
+    ViewPoses,
+    check_pictures,
+)
 from maniskill_tomato.tasks.row.target_sequence import TargetSequence, Transits, with_transits
 from maniskill_tomato.tasks.world import World
 from maniskill_tomato.tasks.world_state import MAX_VIEWS
@@ -50,6 +58,7 @@ class SearchGame:
         layout: ObservationLayout,
         noise: SensorNoise,
         perception: Perception,
+        camera: CameraConfig,
         transits: Transits | None,
     ) -> None:
         """Plays in a world.
@@ -61,6 +70,7 @@ class SearchGame:
             layout: What the observation holds.
             noise: What is wrong with exact labels.
             perception: Where labels and V_f come from.
+            camera: How targets are named to a robot with a camera.
             transits: When arms go by their ready posture in a row; None for the task with one target.
         """
         self.task = task
@@ -68,10 +78,22 @@ class SearchGame:
         self.episodes = episodes
         self._world = world
         self._observer = ViewpointObserver(world.num_envs, world.device, layout, task.max_moves)
-        self._senses = make_senses(perception, world, noise)
         self._is_camera = perception != "ground_truth"
         self._starts = HardStarts(task, world.scene, world.device)
-        self.sequence = None if transits is None else TargetSequence(world, self._observer.lattice, transits)
+        self._senses: Senses
+        self.sequence: TargetSequence | None = None
+        lattice = self._observer.lattice
+        if not self._is_camera:
+            self._senses = ExactSenses(world, noise)
+            self.sequence = None if transits is None else TargetSequence(world, lattice, transits)
+        else:
+            check_pictures(perception, world)
+            if transits is None:
+                self._senses = CameraSenses(world, perception, camera, task.full_visibility)
+            else:
+                inspecting = InspectingSenses(world, perception, camera, task.full_visibility)
+                self._senses = inspecting
+                self.sequence = InspectedSequence(world, lattice, transits, inspecting)
         self._measured: ViewMeasurement | None = None
         self._seen_from = torch.zeros(0)
         """Poses of the cameras at the last views. Shape (N, 4, 4)."""
@@ -363,8 +385,14 @@ class SearchGame:
         if self._is_camera:
             info["true_visible_fraction"] = measured.true_fraction.clone()
             info["true_success"] = measured.true_fraction > self.task.full_visibility
+            assert measured.chosen_fraction is not None and measured.chosen_fruit is not None
+            assert measured.named is not None
+            info["told_visible_fraction"] = measured.told_fraction.clone()
+            info["chosen_visible_fraction"] = measured.chosen_fraction.clone()
+            info["chosen_fruit"] = measured.chosen_fruit.clone()
+            info["target_named"] = measured.named.clone()
         if self.sequence is not None:
-            info["success"] = state.seen_count >= state.target_count
+            info["success"] = self.sequence.is_success()
             over = self.sequence.is_over() | (state.moves >= MAX_ROW_STEPS)
             info["fail"] = over & ~info["success"]
             info["seen_count"] = state.seen_count.clone()

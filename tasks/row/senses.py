@@ -4,7 +4,7 @@ The errors of a view follow from the episode's `noise_seed` and the number of th
 another's, and a view that is looked at again is measured the same.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Protocol
 
 import numpy as np
@@ -14,9 +14,13 @@ from torch import Tensor
 
 from maniskill_tomato.errors import InvalidInputError
 from maniskill_tomato.raycast.view_rays import ViewRays
+from maniskill_tomato.sensing.inspection_judge import NO_FRUIT
 from maniskill_tomato.sensing.observation import ViewpointObserver
+from maniskill_tomato.sensing.perception_kinds import RENDERED, Perception
+from maniskill_tomato.sensing.posed_frame import PosedFrame
 from maniskill_tomato.sensing.sensor_noise import SensorErrors, SensorNoise
-from maniskill_tomato.sensing.simulated_camera import COARSE_POSITION, RENDERED, Perception, make_camera
+from maniskill_tomato.sensing.simulated_camera import make_camera
+from maniskill_tomato.tasks.row.row_config import CameraConfig
 from maniskill_tomato.tasks.world import World
 from maniskill_tomato.tasks.world_state import NOISE_SEEDS
 
@@ -38,6 +42,12 @@ class ViewMeasurement:
     """V_f as it is. Shape (N,)."""
     tomato_seen: Tensor
     """Whether any ripe tomato is in view. Shape (N,), bool."""
+    chosen_fraction: Tensor | None = None
+    """V_f as it is of the fruit that a camera took for the target, 0 if of none; None without a camera. Shape (N,)."""
+    chosen_fruit: Tensor | None = None
+    """Which that is, as an index in `Plant.fruits`, -1 for none. Shape (N,)."""
+    named: Tensor | None = None
+    """Whether the robot knows which track its target is. Shape (N,), bool."""
 
     def where(self, mask: Tensor, other: "ViewMeasurement") -> "ViewMeasurement":
         """This where `mask` is True, else the other one. Shape (N,), bool."""
@@ -53,7 +63,14 @@ class ViewMeasurement:
             told_fraction=torch.where(mask, self.told_fraction, other.told_fraction),
             true_fraction=torch.where(mask, self.true_fraction, other.true_fraction),
             tomato_seen=torch.where(mask, self.tomato_seen, other.tomato_seen),
+            chosen_fraction=_where(mask, self.chosen_fraction, other.chosen_fraction),
+            chosen_fruit=_where(mask, self.chosen_fruit, other.chosen_fruit),
+            named=_where(mask, self.named, other.named),
         )
+
+
+def _where(mask: Tensor, mine: Tensor | None, others: Tensor | None) -> Tensor | None:
+    return None if mine is None or others is None else torch.where(mask, mine, others)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -169,16 +186,28 @@ class ExactSenses:
 class CameraSenses:
     """Measures what a camera sees; where the truth is needed only to be told beside it, rays are cast."""
 
-    def __init__(self, world: World, perception: Perception) -> None:
+    def __init__(
+        self, world: World, perception: Perception, config: CameraConfig, full_visibility: float
+    ) -> None:
         """Senses in a world.
 
         Args:
             world: The plants and arms, with a renderer for those in `RENDERED`.
             perception: Which camera and estimator.
+            config: How targets are named.
+            full_visibility: V_f above which a fruit is fully visible.
         """
-        made = make_camera(perception, world.scene, world.intrinsics, self._picture)
+        made = make_camera(
+            perception,
+            world.scene,
+            world.intrinsics,
+            self._picture,
+            true_association=config.association == "truth",
+        )
         assert made is not None
         self._world = world
+        self._config = config
+        self._full_visibility = full_visibility
         self._camera, self._perception = made
         self._qpos = world.state.qpos
         self._pictures: NDArray[np.uint8] | None = None
@@ -190,12 +219,12 @@ class CameraSenses:
         state.hidden_below[env_index] = hidden_below
 
     def begin_targets(self, env_idx: Tensor) -> None:
-        """Draws where the targets are believed to be, which are known from afar only."""
+        """Draws where the targets are said to be, if that is how they are named."""
         state = self._world.state
         for i in env_idx.tolist():
             # Streams of targets and of views differ in the length of their keys.
             key = (int(state.noise_seed[i]), int(state.targets_begun[i]), 0)
-            error = np.random.default_rng(key).normal(0.0, COARSE_POSITION, 3)
+            error = np.random.default_rng(key).normal(0.0, self._config.map_noise, 3)
             state.position_error[i] = torch.as_tensor(error).to(state.position_error)
             self._begin_target(i, is_first=int(state.targets_begun[i]) == 0)
 
@@ -205,13 +234,19 @@ class CameraSenses:
             self._begin_target(i, is_first=int(self._world.state.targets_begun[i]) == 1)
 
     def _begin_target(self, env_index: int, *, is_first: bool) -> None:
-        state = self._world.state
-        position = self._world.target_position_w[env_index] + state.position_error[env_index]
+        state, config = self._world.state, self._config
+        place = None
         hidden_below = float(state.hidden_below[env_index]) if is_first else 0.0
+        if config.target == "map":
+            error = state.position_error[env_index]
+            place = (self._world.target_position_w[env_index] + error).double().cpu().numpy()
         self._perception.begin(
             env_index,
-            position.double().cpu().numpy(),
+            place,
+            place_error=config.map_noise,
             hidden_below=hidden_below or None,
+            chooses=config.target == "any",
+            threshold=self._full_visibility,
         )
 
     def known_target(self) -> Tensor:
@@ -220,23 +255,97 @@ class CameraSenses:
 
     def look(self, view: ViewPoses) -> tuple[ViewMeasurement, Tensor | None]:
         """Takes and measures frames."""
+        moved = self._take(view, view.mask)
+        chosen = self._chosen(view.mask)
+        for i in view.seeds(self._world.state.noise_seed):
+            last = self._perception.last_view(i)
+            if self._config.target != "map" and not bool(self._perception.is_located[i]) and last is not None:
+                moved[i] |= self._name(i, last.measurement.frame)
+                chosen[i] = self._shown_fruit(i)
+            if self._config.target == "any" and int(chosen[i]) != NO_FRUIT and bool(moved[i]):
+                self._judge_by(i, int(chosen[i]))
+        return self._measured(view, chosen), moved.nonzero()[:, 0]
+
+    def _take(self, view: ViewPoses, mask: Tensor | None) -> Tensor:
+        """Takes frames of some environments into their maps; which targets turned out to be elsewhere.
+
+        Args:
+            view: From where.
+            mask: Which environments look; all if None. Shape (N,), bool.
+
+        Returns:
+            Shape (N,), bool.
+        """
         world = self._world
-        target, T_w_plant = world.state.target, world.plant_batch.T_world_plant
-        for i, seed in view.seeds(world.state.noise_seed).items():
+        for i, seed in replace(view, mask=mask).seeds(world.state.noise_seed).items():
             self._camera.seed(i, seed)
         self._qpos, self._pictures = view.qpos, None
-        frames = self._camera.take(view.T_w_camera, target, T_w_plant, view.T_w_links, view.mask)
-        located = self._perception.look(frames)
+        frames = self._camera.take(view.T_w_camera, world.plant_batch.T_world_plant, view.T_w_links, mask)
+        return self._perception.look(frames)
+
+    def _chosen(self, mask: Tensor | None) -> Tensor:
+        """The fruits that the targets' detections show, of the environments that have looked. Shape (N,)."""
+        n, device = self._world.num_envs, self._world.device
+        looked = range(n) if mask is None else mask.nonzero()[:, 0].tolist()
+        chosen = torch.full((n,), NO_FRUIT, device=device)
+        for i in looked:
+            chosen[i] = self._shown_fruit(i)
+        return chosen
+
+    def _measured(self, view: ViewPoses, chosen: Tensor) -> ViewMeasurement:
+        """What was sensed, with the truth about the targets and about the fruits that were taken for them."""
+        world = self._world
+        target, T_w_plant = world.state.target, world.plant_batch.T_world_plant
         seen = world.scene.visibility(view.T_w_camera, target, T_w_plant, view.T_w_links)
-        fraction = self._perception.visible_fraction
-        measured = ViewMeasurement(
+        at = torch.where(chosen == NO_FRUIT, target, chosen)
+        of_chosen = seen
+        if not torch.equal(at, target):
+            of_chosen = world.scene.visibility(view.T_w_camera, at, T_w_plant, view.T_w_links)
+        return ViewMeasurement(
             rays=self._perception.rays(),
-            visible_fraction=fraction,
-            told_fraction=fraction,
+            visible_fraction=self._perception.sure_fraction,
+            told_fraction=self._perception.visible_fraction,
             true_fraction=seen.visible_fraction,
             tomato_seen=seen.any_visible,
+            chosen_fraction=torch.where(chosen == NO_FRUIT, 0.0, of_chosen.visible_fraction),
+            chosen_fruit=chosen,
+            named=self._perception.is_located,
         )
-        return measured, located.nonzero()[:, 0]
+
+    def _name(self, env_index: int, frame: PosedFrame) -> bool:
+        """Names the track that holds most of the target's pixels, if one does; whether it stands elsewhere.
+
+        A detection of which less than half shows the target holds it by accident and is not named, nor is one without a
+        depth of its own, which says too little of where it is.
+        """
+        last = self._perception.last_view(env_index)
+        target = int(self._world.state.target[env_index])
+        if self._config.target != "track" or last is None or target not in frame.true_numbers:
+            return False
+        assert frame.true_fruits is not None
+        true = frame.true_fruits.masks[frame.true_numbers.index(target)]
+        held = {}
+        for k, number in enumerate(last.tracks):
+            mask = last.measurement.mask(k)
+            is_measured = last.measurement.fruits[k].is_depth_measured
+            if is_measured and frame.shown_fruit(mask) == target:
+                held[number] = int(np.count_nonzero(mask & true))
+        if not held:
+            return False
+        return self._perception.name(env_index, max(held, key=lambda number: held[number]))
+
+    def _shown_fruit(self, env_index: int) -> int:
+        """The fruit that the target's detection in the last view shows."""
+        last, index = self._perception.last_view(env_index), self._perception.target_fruit(env_index)
+        if last is None or index is None:
+            return NO_FRUIT
+        shown = last.measurement.frame.shown_fruit(last.measurement.mask(index))
+        return NO_FRUIT if shown is None else shown
+
+    def _judge_by(self, env_index: int, fruit: int) -> None:
+        """Makes a fruit that the robot has chosen the one that its episode is judged by, if it is ripe."""
+        if fruit in self._world.plant_batch.ripe_fruits[env_index]:
+            self._world.set_target(torch.tensor([env_index], device=self._world.device), [fruit])
 
     def revise(self, observer: ViewpointObserver, env_idx: Tensor) -> None:
         """Reads the kept measurements again."""
@@ -251,13 +360,14 @@ class CameraSenses:
         return picture
 
 
-def make_senses(perception: Perception, world: World, noise: SensorNoise) -> Senses:
-    """The senses of a kind of perception; `noise` is for ground truth only."""
-    if perception == "ground_truth":
-        return ExactSenses(world, noise)
+def check_pictures(perception: Perception, world: World) -> None:
+    """Checks that a world has the pictures that a kind of perception needs.
+
+    Raises:
+        InvalidInputError: It has none.
+    """
     if perception in RENDERED and world.pictures is None:
         raise InvalidInputError(
             f"perception={perception!r} renders colours, which a world without a simulator cannot; use "
             "gymnasium.make, or 'occlusion_model'"
         )
-    return CameraSenses(world, perception)

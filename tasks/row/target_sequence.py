@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import Final, Literal, get_args
+from typing import Literal, get_args
 
 import numpy as np
 import torch
@@ -17,15 +17,9 @@ from maniskill_tomato.tasks.arm_moves import Plan
 from maniskill_tomato.tasks.world import World
 from maniskill_tomato.tasks.world_state import MAX_TARGETS
 
-REACHABLE_SHARE = 0.1
-"""A fruit is in reach when the arm can look at it from this share of the lattice's candidates or more."""
-
 Transits = Literal["none", "target", "refused", "both"]
 """When the arm goes by its ready posture (`robot.transit`): never; to the next target, if it cannot look at it from
 where it stands; where a move is refused, if another posture reaches the place; or both."""
-
-STAND_OFF: Final = 0.3
-"""Places for the first view of a target are at least this far from it, in [m]."""
 
 
 class TargetSequence:
@@ -51,8 +45,7 @@ class TargetSequence:
         plant_batch = self._world.plant_batch
         ripe = [[j for j in plant_batch.ripe_fruits[i] if j < MAX_TARGETS] for i in indices]
         centres = [plant_batch.fruit_positions_w(i, own) for i, own in zip(indices, ripe, strict=True)]
-        shares = self._lattice.reachable(torch.cat(centres)).float().mean(dim=-1).tolist()
-        near = iter(share >= REACHABLE_SHARE for share in shares)
+        near = iter(self._lattice.in_reach(torch.cat(centres)).tolist())
         return [[j for j in own if next(near)] for own in ripe]
 
     def begin(self, env_idx: Tensor) -> None:
@@ -71,6 +64,11 @@ class TargetSequence:
     def is_over(self) -> Tensor:
         """Whether no target is left. Shape (N,), bool."""
         return ~self._world.state.open_targets.any(-1)
+
+    def is_success(self) -> Tensor:
+        """Whether all targets were seen. Shape (N,), bool."""
+        state = self._world.state
+        return state.seen_count >= state.target_count
 
     def open_targets(self, env_index: int = 0) -> list[int]:
         """The fruits that are yet to be looked for, the target among them, as indices in `Plant.fruits`."""
@@ -107,14 +105,12 @@ class TargetSequence:
         """
         if self.transits not in ("target", "both"):
             return None
-        qpos = self._world.state.qpos[env_index]
-        if self._planner.can_turn(qpos, known_target):
-            return None
-        position = self._world.T_w_camera[env_index, :3, 3]
-        places = self._lattice.positions(known_target[None])[0]
-        places = places[(places - position).norm(dim=-1).argsort()]
-        away = (places - known_target).norm(dim=-1)
-        return self._planner.plan(qpos, places[away >= STAND_OFF], known_target)
+        return self._planner.to_first_view(
+            self._world.state.qpos[env_index],
+            self._world.T_w_camera[env_index, :3, 3],
+            self._lattice.positions(known_target[None])[0],
+            known_target,
+        )
 
     def ways_of_refused(self, plan: Plan, action: Tensor, known_target: Tensor) -> Plan:
         """The plan with transits where a look-at move is refused and another posture reaches the place.

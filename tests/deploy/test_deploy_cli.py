@@ -49,6 +49,18 @@ def test_the_twin_runs_without_sapien_and_maniskill(tmp_path: Path) -> None:
     assert (tmp_path / "run.mcap").stat().st_size > 10_000
 
 
+def test_an_inspection_runs_without_them_too(tmp_path: Path) -> None:
+    command = [sys.executable, "-c", BLOCKED, "deploy", "inspect", "--profile", "mock", "--seed", "6"]
+    options = ["--max-moves", "2", "--no-record", "--out", str(tmp_path)]
+    done = subprocess.run([*command, *options], capture_output=True, text=True, timeout=500)
+    assert done.returncode == 0, done.stderr
+    assert "LOADED []" in done.stdout
+    content = json.loads((tmp_path / "inspection.json").read_text())
+    assert (content["reason"], content["moves"], content["row_moves"]) == ("budget", 2, 2)
+    for fruit in content["fruits"]:
+        assert {"position_m", "radius_m", "ripeness", "visible_fraction"} <= fruit.keys()
+
+
 def test_sigterm_ends_a_run_in_a_defined_state(tmp_path: Path) -> None:
     profile = tmp_path / "slow.toml"
     profile.write_text(
@@ -117,6 +129,11 @@ def test_a_fault_has_its_own_exit_status(tmp_path: Path, capsys: pytest.CaptureF
         (["run", "--confirm", "--unattended"], "exclude each other"),
         (["run", "--seed", "-1"], "the seed must be 0 or more"),
         (["run", "--out", "/dev/null/x"], "cannot use the folder"),
+        (["inspect", "--profile", "nothing"], "give the path of a TOML file or one of"),
+        (["inspect", "--policy", "oracle"], "in simulation only"),
+        (["inspect", "--dry-run", "--unattended"], "exclude each other"),
+        (["inspect", "--max-moves", "0"], "--max-moves must be 1 or more, got 0"),
+        (["inspect", "--out", "/dev/null/x"], "cannot use the folder"),
         (["calibrate", "--profile", "mock", "--out", "/dev/null/x"], "cannot use the folder"),
         (["calibrate", "--views", "missing"], "--views: there is no folder missing"),
         (["profiles", "--show", "missing"], "no profile 'missing'"),

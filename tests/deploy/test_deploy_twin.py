@@ -188,7 +188,9 @@ def test_fruits_are_located_to_a_centimetre_where_enough_is_seen() -> None:
     errors = []
     for seed in (4, 9):
         arm, camera = devices(seed)
+        # Without light no fruit is told to be unripe, so that all of them count.
         frame, pose = camera.read(), pose_of(arm)
+        frame = replace(frame, color=np.zeros_like(frame.color))
         episode = load_episode("held_out", seed)
         T = episode.T_world_plant.double().numpy()
         for fruit in episode.plant.fruits:

@@ -210,7 +210,7 @@ def test_what_is_collected_is_the_truth(env: Any) -> None:
 
 
 def test_a_camera_that_corrects_the_target_moves_the_candidates_that_are_judged() -> None:
-    env: Any = make_env("TomatoViewpoint-v1", plant=PLANT, perception="occlusion_model")
+    env: Any = make_env("TomatoViewpoint-v1", plant=PLANT, perception="occlusion_model", target="map")
     world = env.unwrapped
     data = collect_episodes(env, range(3))
     # An episode whose target was located on the way has a table for each belief.

@@ -36,13 +36,15 @@ def test_visible_fraction_position_and_radius_are_near_the_truth() -> None:
             from_target = -0.35 * np.array([np.cos(turn), np.sin(turn), -np.sin(rise)])
             pose = look_at_pose(centre + torch.as_tensor(from_target), centre).float()
             target = torch.tensor([episode.target])
-            (frame,) = camera.take(pose, target, stand, AWAY)
+            (frame,) = camera.take(pose, stand, AWAY)
             assert frame is not None
             truth = float(scene.visibility(pose, target, stand).visible_fraction[0])
             measured = detector.measure(frame)
             if truth < 0.3:
                 continue
-            found = measured.fruits[0]
+            shown = [frame.shown_fruit(measured.mask(k)) for k in range(len(measured.fruits))]
+            found = measured.fruits[shown.index(episode.target)]
+            assert found.is_depth_measured
             assert found.centre_w is not None
             fractions.append(abs(found.visible_fraction - truth))
             positions.append(float(np.linalg.norm(found.centre_w - centre[0].numpy())))

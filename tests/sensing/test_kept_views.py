@@ -39,7 +39,7 @@ def frame(camera: tuple[float, float, float], hidden: bool = False) -> PosedFram
         depth_m=depth.astype(np.float32),
         intrinsics=INTRINSICS,
         T_world_camera=pose,
-        true_fruits=Instances.from_masks(mask[None]),
+        true_fruits=Instances.from_masks(mask[None], categories=("tomato_ripe",)),
     )
 
 
@@ -76,7 +76,7 @@ def test_what_was_seen_before_is_taken_in_again_about_the_measured_position() ->
     expected = ViewpointObserver(2, max_moves=5)
     expected.begin(torch.arange(2), perception.target_position)
     for k in range(2):
-        known.begin(k, perception.position_w(k), is_located=True)
+        known.begin(k, perception.position_w(k), place_error=0.001)
     for frames in ([HIDDEN, HIDDEN], [OPEN, OPEN]):
         known.look(frames)
         observe(expected, known, frames, None)

@@ -70,3 +70,8 @@ def test_plants_that_would_never_be_shown_are_refused_with_what_to_do() -> None:
         gym.make(
             "TomatoViewpoint-v1", obs_mode="rgb", episodes="validation", reconfiguration_freq=0, num_envs=1
         )
+
+
+def test_a_thesis_task_says_that_it_has_no_camera_perception() -> None:
+    with pytest.raises(InvalidInputError, match=r"has no perception=.*TomatoViewpoint-v1.*it takes.*plant"):
+        gym.make("TomatoViewpointGuided-v1", perception="segmenter", render_backend="none")

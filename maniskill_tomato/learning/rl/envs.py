@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from maniskill_tomato.errors import InvalidInputError
-from maniskill_tomato.sensing.simulated_camera import RENDERED
+from maniskill_tomato.sensing.perception_kinds import RENDERED
 from maniskill_tomato.tasks import TASK_IDS
 from maniskill_tomato.tasks.making import option_names
 from maniskill_tomato.tasks.vector_env import make_vector_env

@@ -96,10 +96,35 @@ class OcclusionModel(Protocol):
         ...
 
 
+LEAST_MEASURED_SHARE: Final = 0.2
+"""A fruit of which the camera measured a smaller share of the visible pixels has no depth of its own: the few pixels
+lie in the shadow that stereo leaves beside a nearer leaf. Of 1,380 detections on validation plants those farther than
+5 cm from their fruit had a share of 0.02 (median; 0.14 for nine of ten), the others 0.94 (0.49)."""
+
+FARTHEST_PLANT: Final = 1.6
+"""What is farther away is not the plant that is looked at, in [m]."""
+
+
 def fruit_depth(depth_m: Float64, mask: BinaryMask) -> float:
-    """The median depth of a mask's pixels, in [m]; NaN without a measurement."""
+    """The median depth of a mask's pixels, in [m]; NaN if too few of them are measured."""
     values = depth_m[mask]
+    count = len(values)
     values = values[values > 0]
+    enough = len(values) > 0 and len(values) >= LEAST_MEASURED_SHARE * count
+    return float(np.median(values)) if enough else float("nan")
+
+
+def surrounding_depth(depth_m: Float64, mask: BinaryMask) -> float:
+    """The median depth of the plant round a mask, in [m]; NaN if none is measured."""
+    rows, columns = np.nonzero(mask)
+    if not len(rows):
+        return float("nan")
+    margin = 4 + max(int(np.ptp(rows)), int(np.ptp(columns))) // 2
+    window = depth_m[
+        max(rows.min() - margin, 0) : rows.max() + margin + 1,
+        max(columns.min() - margin, 0) : columns.max() + margin + 1,
+    ]
+    values = window[(window > 0) & (window < FARTHEST_PLANT)]
     return float(np.median(values)) if len(values) else float("nan")
 
 

@@ -23,9 +23,13 @@ from maniskill_tomato.sensing.visible_fraction.estimate import (
     SegmentedImage,
     filled_depth,
     fruit_depth,
+    surrounding_depth,
 )
 
 Floats = NDArray[np.floating[Any]]
+
+NEAREST_MEASURED: Final = 0.15
+"""A fruit at least as far away as this, in [m], has depth unless something nearer shadows it."""
 
 SAMPLES: Final = 64
 """Points of each kind that a circle is judged by."""
@@ -151,8 +155,11 @@ class _Fit:
         own = fruit_depth(view.depth_m[box], mask[box])
         measured = bool(np.isfinite(own))
         if not measured:
-            # Nearer than the camera measures; the mask's own extent then stands for the size.
+            # Nearer than the camera measures, where the mask's own extent stands for the size; or in a stereo shadow.
             own = config.radius_m * focal / (0.5 * (max(width, height) + 1))
+            around = surrounding_depth(view.depth_m, mask)
+            if own > NEAREST_MEASURED and np.isfinite(around):
+                own, measured = around, True
         size = config.radius_m * focal / own
         reach = int(np.ceil(1.4 * size)) + 4
         top, left = max(first_y - reach, 0), max(first_x - reach, 0)
@@ -193,22 +200,8 @@ class _Fit:
         """
         mask, i = self.mask, view.intrinsics
         x, y, radius = self.circle[0] + self.corner[0], self.circle[1] + self.corner[1], self.circle[2]
-        low_x, low_y = int(np.floor(x - radius)) - 1, int(np.floor(y - radius)) - 1
-        side = int(np.ceil(2 * radius)) + 3
-        u, v = np.meshgrid(low_x + np.arange(side) + 0.5, low_y + np.arange(side) + 0.5)
-        disc = (u - x) ** 2 + (v - y) ** 2 < radius**2
-        height, width = mask.shape
-        inside = (u >= 0) & (u < width) & (v >= 0) & (v < height)
-        outside = int(np.count_nonzero(disc & ~inside))
-        chosen = disc & inside
-        rows, columns = v[chosen].astype(int), u[chosen].astype(int)
-        if self.measured:
-            there = shown[rows, columns]
-            step = np.where(fruits[rows, columns], 0.0, config.edge_step_m)
-            hidden = (there > 0) & (there <= self.own + step)
-            rows, columns = rows[hidden], columns[hidden]
-        whole = mask.copy()
-        whole[rows, columns] = True
+        own = self.own + config.edge_step_m if self.measured else np.inf
+        whole, outside = whole_silhouette(mask, (x, y, radius), shown, own, self.own, fruits)
         centre, radius_m = None, float("nan")
         if self.measured:
             z = _centre_depth(self.evidence.mask_depth, self.circle, self.own, self.focal)
@@ -222,6 +215,47 @@ class _Fit:
             centre_optical=centre,
             radius_m=radius_m,
         )
+
+
+def whole_silhouette(
+    mask: BinaryMask,
+    circle: tuple[float, float, float],
+    depth: Float64,
+    farthest: float,
+    farthest_fruit: float,
+    fruits: BinaryMask,
+) -> tuple[BinaryMask, int]:
+    """The mask of a tomato and the pixels of its outline that something hides.
+
+    Args:
+        mask: Its visible pixels. Shape (height, width).
+        circle: Its outline: x, y, radius, in [px].
+        depth: Of the image, in [m], 0 where it is not known. Shape (height, width).
+        farthest: What is nearer than this hides it, in [m]; infinity if the depth tells nothing.
+        farthest_fruit: The same for other tomatoes, in [m].
+        fruits: The pixels of all tomatoes. Shape (height, width).
+
+    Returns:
+        Its silhouette inside the image, of shape (height, width), and how many pixels of it lie outside.
+    """
+    x, y, radius = circle
+    low_x, low_y = int(np.floor(x - radius)) - 1, int(np.floor(y - radius)) - 1
+    side = int(np.ceil(2 * radius)) + 3
+    u, v = np.meshgrid(low_x + np.arange(side) + 0.5, low_y + np.arange(side) + 0.5)
+    disc = (u - x) ** 2 + (v - y) ** 2 < radius**2
+    height, width = mask.shape
+    inside = (u >= 0) & (u < width) & (v >= 0) & (v < height)
+    outside = int(np.count_nonzero(disc & ~inside))
+    chosen = disc & inside
+    rows, columns = v[chosen].astype(int), u[chosen].astype(int)
+    if np.isfinite(farthest):
+        there = depth[rows, columns]
+        limit = np.where(fruits[rows, columns], farthest_fruit, farthest)
+        hidden = (there > 0) & (there <= limit)
+        rows, columns = rows[hidden], columns[hidden]
+    whole = mask.copy()
+    whole[rows, columns] = True
+    return whole, outside
 
 
 def _collect(

@@ -1,0 +1,143 @@
+"""What a run is after: a goal says what each look means. `OneFruit` is that of `deploy run`."""
+
+from dataclasses import dataclass
+from typing import Protocol
+
+from maniskill_tomato.deploy.interface import Float64, Frame
+from maniskill_tomato.deploy.robot_perception import Perception, Sighting
+from maniskill_tomato.deploy.run_records import LoopConfig
+
+
+@dataclass(frozen=True, kw_only=True)
+class End:
+    """Why a run is over."""
+
+    reason: str
+    """`success`, `budget` or another word of `RunResult.reason`."""
+    detail: str
+    """In words."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Look:
+    """What a look means: the run is over, the arm goes to given joint positions, or the policy is asked."""
+
+    view: Sighting
+    moves_left: int
+    """What the policy is told."""
+    end: End | None = None
+    """Why the run is over."""
+    go_to: Float64 | None = None
+    """Where the arm goes without the policy being asked, joint positions in [rad]. Shape (7,)."""
+    cost: int = 0
+    """Moves that count when the arm goes there."""
+    is_new_target: bool = False
+    """Whether the policy begins anew."""
+    true_fraction: float | None = None
+    """V_f of what is looked at by ray casting; None where nobody knows it."""
+    detail: str = ""
+    """For the record of a move to `go_to`."""
+
+
+class Goal(Protocol):
+    """What a run is after."""
+
+    max_moves: int
+    """The most moves for one target: the length of the policy's episodes."""
+
+    def look(self, frame: Frame, T_world_camera: Float64, joints: Float64, moves: int) -> Look | None:
+        """Takes in a picture; once for every look.
+
+        Args:
+            frame: The picture.
+            T_world_camera: Pose of the optical frame when it was taken. Shape (4, 4).
+            joints: The arm's then, in [rad]. Shape (7,).
+            moves: Moves so far.
+
+        Returns:
+            None if there is no target, and the picture shows none.
+
+        Raises:
+            PerceptionError: The picture cannot be used.
+        """
+        ...
+
+    def refused(self, in_a_row: int, why: str) -> End | None:
+        """Hears that the last move was refused.
+
+        Args:
+            in_a_row: How many were, one after the other.
+            why: The last reason.
+
+        Returns:
+            Why the run is over; None to go on.
+        """
+        ...
+
+
+class OneFruit:
+    """One fruit, until it is fully visible."""
+
+    def __init__(
+        self, perception: Perception, config: LoopConfig, target_position: Float64 | None = None
+    ) -> None:
+        """Begins without a view.
+
+        Args:
+            perception: Turns pictures into sightings.
+            config: When the run ends.
+            target_position: Where the target is, world frame, in [m]; None to choose one that the first picture shows.
+                Shape (3,).
+        """
+        self.max_moves = config.max_moves
+        self._perception, self._config = perception, config
+        self._is_chosen = target_position is None
+        self._shown: int | None = None
+        self._lost_in_a_row = 0
+        self._is_first = True
+        perception.begin(target_position)
+
+    def look(self, frame: Frame, T_world_camera: Float64, joints: Float64, moves: int) -> Look | None:
+        """The sighting, and whether it ends the run; see `Goal`."""
+        view = self._perception.look(frame, T_world_camera)
+        if view is None:
+            return None
+        self._lost_in_a_row = 0 if view.target_seen else self._lost_in_a_row + 1
+        is_first, self._is_first = self._is_first, False
+        return Look(
+            view=view,
+            moves_left=self.max_moves - moves,
+            end=self._end(view, moves),
+            is_new_target=is_first,
+            true_fraction=self._true_fraction(frame, view),
+        )
+
+    def refused(self, in_a_row: int, why: str) -> End | None:
+        """Too many in a row end the run."""
+        if in_a_row < self._config.refused_after:
+            return None
+        return End(reason="refused", detail=f"{in_a_row} moves in a row were refused, the last one: {why}")
+
+    def _end(self, view: Sighting, moves: int) -> End | None:
+        config, fraction = self._config, f"V_f = {view.visible_fraction:.2f}"
+        if view.sure_fraction > config.threshold:
+            return End(reason="success", detail=f"{fraction} after {moves} moves")
+        if moves >= config.max_moves:
+            return End(reason="budget", detail=f"{fraction} after all {config.max_moves} moves")
+        if self._lost_in_a_row >= config.lost_after:
+            return End(
+                reason="target_lost",
+                detail=f"{self._lost_in_a_row} looks in a row showed nothing of the target",
+            )
+        return None
+
+    def _true_fraction(self, frame: Frame, view: Sighting) -> float | None:
+        """Of the fruit that was named, or of the one that was chosen, which is the one that its mask shows."""
+        truth = frame.truth
+        if truth is None:
+            return None
+        if not self._is_chosen:
+            return truth.visible_fraction
+        shown = truth.shown_label(view.mask)
+        self._shown = self._shown if shown is None else shown
+        return None if self._shown is None else truth.fraction(self._shown)
