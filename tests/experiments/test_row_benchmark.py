@@ -25,6 +25,7 @@ from maniskill_tomato.learning.rl.envs import make_env
 from maniskill_tomato.policies.opening import open_policy
 from maniskill_tomato.robot.kinematics import forward_kinematics
 from maniskill_tomato.robot.look_at import flange_to_camera
+from maniskill_tomato.tasks.making import make_world
 
 TARGET = torch.tensor([0.75, 0.1, 0.8], dtype=torch.float64)
 
@@ -119,4 +120,17 @@ def test_a_row_benchmark_goes_on_where_it_was(tmp_path: Path) -> None:
     assert run_row_benchmark(config) == text
     assert {path: path.read_bytes() for path in tmp_path.rglob("*.jsonl")} == stored
     (row,) = json.loads((tmp_path / "rows-held_out-both.json").read_text())["rows"]["stay"].values()
-    assert row["seed"] == 1000 and row["seen"] == []
+    assert row["seed"] == 1000 and row["seen"] == seen_by_an_arm_that_stays(1000)
+
+
+def seen_by_an_arm_that_stays(seed: int) -> list[int]:
+    """The tomatoes that come into view on transits to the next target alone."""
+    world = make_world("TomatoViewpointRow-v1", plant={"seed": "held_out", "pool": None}, transits="both")
+    world.reset(seed)
+    seen = []
+    while not bool((info := world.info())["success"] | info["fail"]):
+        target = int(world.state.target)
+        world.step(torch.zeros(1, 3))
+        if bool(world.info()["target_done"]):
+            seen.append(target)
+    return sorted(seen)
