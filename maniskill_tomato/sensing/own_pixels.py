@@ -46,7 +46,7 @@ def _own(mask: BinaryMask, depth_m: Float64, filled: Float64) -> BinaryMask:
     ends = values if values[-1] - values[0] > SURFACE_SPAN else values[:1]
     held = np.searchsorted(values, ends + SURFACE_SPAN, side="right") - np.arange(len(ends))
     near = float(ends[int(np.argmax(held))])
-    others = mask & ((filled < near) | (filled > near + SURFACE_SPAN))
+    others = mask & (filled > 0) & ((filled < near) | (filled > near + SURFACE_SPAN))
     patch = np.ones((SMALLEST_PATCH, SMALLEST_PATCH), np.uint8)
     own: BinaryMask = mask & (cv2.morphologyEx(others.view(np.uint8), cv2.MORPH_OPEN, patch) == 0)
     return own
