@@ -21,7 +21,7 @@ from maniskill_tomato.robot.d435 import CameraIntrinsics
 from maniskill_tomato.segmentation.masks import BinaryMask
 from maniskill_tomato.sensing.measurement import DetectedFruit, Measurement, Position
 from maniskill_tomato.sensing.visible_fraction.estimate import Float64
-from maniskill_tomato.sensing.visible_fraction.sphere import SphereConfig, whole_silhouette
+from maniskill_tomato.sensing.visible_fraction.sphere import SphereConfig, round_outline, whole_silhouette
 
 GATE: Final = float(chi2.ppf(0.9995, 4))
 """Largest squared Mahalanobis distance of a detection from the track that it is assigned to."""
@@ -618,10 +618,12 @@ def _fused_fraction(measurement: Measurement, index: int, track: Track) -> float
     if circle is None:
         return float("nan")
     mask = measurement.mask(index)
+    pose = frame.T_world_camera
+    stretch = round_outline(pose[2, :3], pose[:3, :3].T @ (track.position_w - pose[:3, 3]))
     depth, fruits, owns = measurement.depth_by_fruits
     own = owns[index]
     # Without depth nobody knows what is hidden: all of the outline that is not seen counts.
     farthest = own + SphereConfig().edge_step_m if np.isfinite(own) else np.inf
-    whole, outside = whole_silhouette(mask, circle, depth, farthest, own, fruits)
+    whole, outside = whole_silhouette(mask, circle, depth, farthest, own, fruits, stretch)
     visible = np.count_nonzero(mask)
     return float(min(visible / (np.count_nonzero(whole) + outside), 1.0))

@@ -33,6 +33,8 @@ class SegmentedImage:
     """The visible pixels of each detected tomato. Each of shape (height, width)."""
     intrinsics: CameraIntrinsics
     """The colour camera's; the depth is aligned to it."""
+    up_optical: Float64 | None = None
+    """Unit vector upwards in the optical frame; None if it is not known. Shape (3,)."""
 
     def __post_init__(self) -> None:
         if self.rgb.dtype != np.uint8 or self.rgb.ndim != 3 or self.rgb.shape[2] != 3 or self.rgb.size == 0:
