@@ -88,7 +88,13 @@ class FruitDetector:
     ) -> tuple[DetectedFruit, ...]:
         depth = frame.depth_m.astype(np.float64)
         rgb = np.zeros((*depth.shape, 3), np.uint8) if frame.rgb is None else frame.rgb
-        view = SegmentedImage(rgb=rgb, depth_m=depth, masks=masks, intrinsics=frame.intrinsics, up_optical=frame.T_world_camera[2, :3])
+        view = SegmentedImage(
+            rgb=rgb,
+            depth_m=depth,
+            masks=masks,
+            intrinsics=frame.intrinsics,
+            up_optical=frame.T_world_camera[2, :3],
+        )
         if self._segmenter is not None:
             view = replace(view, masks=own_pixels(masks, view.depth_m))
         return tuple(
