@@ -15,6 +15,7 @@ from maniskill_tomato.sensing.fruit_detector import FruitDetector
 from maniskill_tomato.sensing.fruit_map import NO_TRACK, FruitMap, MapConfig, outline
 from maniskill_tomato.sensing.measurement import DetectedFruit, Measurement
 from maniskill_tomato.sensing.posed_frame import PosedFrame
+from maniskill_tomato.sensing.visible_fraction.sphere import FLATNESS
 
 torch = pytest.importorskip("torch")
 
@@ -40,16 +41,21 @@ def cast(
     *,
     leaf: Place | None = None,
     merged: bool = False,
+    flatness: float = FLATNESS,
 ) -> PosedFrame:
-    """Spheres of one radius before a wall, a leaf of 8 cm about a place in front of them; exact masks."""
+    """Tomatoes of one radius and so many times as high as wide, before a wall, a leaf of 8 cm about a place in front of
+    them; exact masks."""
     pose = look_from(camera)
     rays = INTRINSICS.ray_directions(INTRINSICS.pixel_centres())
-    square = (rays**2).sum(-1)
+    # They are spheres in a world that is stretched upwards.
+    stretch = pose[:3, :3].T @ np.diag([1.0, 1.0, 1.0 / flatness]) @ pose[:3, :3]
+    stretched = rays @ stretch
+    square = (stretched**2).sum(-1)
     depth = np.full(square.shape, BEHIND)
     owner = np.full(square.shape, -1)
     for k, sphere in enumerate(spheres):
-        centre = pose[:3, :3].T @ (sphere - pose[:3, 3])
-        along = rays @ centre
+        centre = stretch @ pose[:3, :3].T @ (sphere - pose[:3, 3])
+        along = stretched @ centre
         inside = along**2 - square * (centre @ centre - RADIUS**2)
         hit = np.where(inside > 0.0, (along - np.sqrt(np.maximum(inside, 0.0))) / square, np.inf)
         owner = np.where(hit < depth, k, owner)
@@ -277,7 +283,7 @@ def test_a_fruit_without_a_depth_of_its_own_is_found_again_by_the_ray_to_it() ->
 
 
 def test_a_spheres_outline_holds_its_pixels() -> None:
-    frame = cast(CAMERAS[1], [FRUIT])
+    frame = cast(CAMERAS[1], [FRUIT], flatness=1.0)
     circle = outline(np.array([*FRUIT, RADIUS]), frame.T_world_camera, INTRINSICS)
     assert circle is not None and frame.true_fruits is not None
     v, u = np.indices(frame.depth_m.shape) + 0.5
@@ -360,3 +366,23 @@ def test_the_same_picture_again_tells_nothing_more() -> None:
     # A detection that the last picture lacked is found again by its place.
     missed = fruits.again(DETECTOR.measure(cast(CAMERAS[0], [])), first)
     assert fruits.again(measured, missed).tracks == (track.number,)
+
+
+@pytest.mark.parametrize("camera", [(0.5, 0.0, 0.6), (0.6, 0.0, 0.85)])
+def test_v_f_of_a_flat_fruit_behind_a_leaf_counts_its_own_outline(camera: tuple[float, float, float]) -> None:
+    fruits = FruitMap()
+    for clear in CAMERAS:
+        fruits.update(DETECTOR.measure(cast(clear, [FRUIT])))
+    pose = look_from(camera)
+    # The leaf's upper edge lies a third of a radius below the middle, for a camera whose y axis points down.
+    leaf = FRUIT - 0.08 * pose[:3, 2] + (0.04 + RADIUS / 3.0) * pose[:3, 1]
+    whole, hidden = cast(camera, [FRUIT]), cast(camera, [FRUIT], leaf=leaf)
+    assert whole.true_fruits is not None and hidden.true_fruits is not None
+    truth = np.count_nonzero(hidden.true_fruits.masks) / np.count_nonzero(whole.true_fruits.masks)
+    view = fruits.update(DETECTOR.measure(hidden))
+    number = only(fruits)
+    fraction = fruits.fraction(view.measurement, view.detection(number), number)
+    assert 0.5 < truth < 0.85
+    # A pixel is 3 mm there. By a circle `single` is 0.07 too small.
+    assert fraction.fused == pytest.approx(truth, abs=0.045)
+    assert fraction.single == pytest.approx(truth, abs=0.045)

@@ -16,6 +16,7 @@ from maniskill_tomato.robot.look_at import look_at_pose  # noqa: E402
 from maniskill_tomato.sensing.measurement import Measurement  # noqa: E402
 from maniskill_tomato.sensing.posed_frame import PosedFrame  # noqa: E402
 from maniskill_tomato.sensing.view_lattice import ViewLattice  # noqa: E402
+from maniskill_tomato.sensing.visible_fraction.sphere import FLATNESS  # noqa: E402
 
 Place = NDArray[np.float64]
 
@@ -49,7 +50,7 @@ def map_of(*tracks: Track) -> FruitMap:
 
 
 def view_of(centre: Place | None, *, hidden: float = 0.0) -> Measurement:
-    """A red sphere seen from `HERE` before a wall, a share of its pixels from the left hidden by a near leaf.
+    """A red, flat tomato seen from `HERE` before a wall, a share of its pixels from the left hidden by a near leaf.
 
     Without a centre the wall alone.
     """
@@ -59,7 +60,9 @@ def view_of(centre: Place | None, *, hidden: float = 0.0) -> Measurement:
     mask = np.zeros(depth.shape, np.bool_)
     if centre is not None:
         rays = INTRINSICS.ray_directions(INTRINSICS.pixel_centres())
-        local = pose[:3, :3].T @ (centre - pose[:3, 3])
+        # It is a sphere in a world that is stretched upwards.
+        stretch = pose[:3, :3].T @ np.diag([1.0, 1.0, 1.0 / FLATNESS]) @ pose[:3, :3]
+        rays, local = rays @ stretch, stretch @ pose[:3, :3].T @ (centre - pose[:3, 3])
         square, along = (rays**2).sum(-1), rays @ local
         inside = along**2 - square * (local @ local - RADIUS**2)
         hit = inside > 0.0
