@@ -7,8 +7,7 @@ from torch import Tensor
 
 from maniskill_tomato.errors import InvalidInputError
 from maniskill_tomato.plants.spec import ROW_PLANT, PlantPose, PlantSpec
-from maniskill_tomato.sensing.camera_perception import MAP_NOISE
-from maniskill_tomato.sensing.perception_kinds import Association, Naming
+from maniskill_tomato.sensing.perception_kinds import MAP_NOISE, Association, Naming
 from maniskill_tomato.tasks import MAX_GENERAL_STEPS
 
 Range = tuple[float, float]
