@@ -363,9 +363,7 @@ def test_a_calyx_sits_on_top_of_its_fruit() -> None:
 @pytest.mark.parametrize("preset", PRESETS)
 def test_more_density_means_more_leaf_area_and_zero_means_none(preset: str) -> None:
     for seed in range(3):
-        areas = [
-            leaf_area(grown(preset, seed, leaf_density=d)) for d in (0.0, 0.3, 0.6, 1.0, 1.5, 2.0)
-        ]
+        areas = [leaf_area(grown(preset, seed, leaf_density=d)) for d in (0.0, 0.3, 0.6, 1.0, 1.5, 2.0)]
         assert areas[0] == 0.0
         assert all(np.diff(areas) > 0), areas
 
