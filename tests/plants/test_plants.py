@@ -418,9 +418,9 @@ def test_a_density_out_of_range_is_refused(density: float) -> None:
 
 def test_bad_seeds_and_details_are_refused() -> None:
     with pytest.raises(InvalidInputError, match="seed must be an integer of 0 or more"):
-        grown("full", -1)
+        generate_plant("full", -1)
     with pytest.raises(InvalidInputError, match="detail must be one of 'training', 'picture'"):
-        grown("full", 0, "finest")  # type: ignore[arg-type]  # pyright: ignore[reportArgumentType]
+        generate_plant("full", 0, "finest")  # type: ignore[arg-type]  # pyright: ignore[reportArgumentType]
 
 
 def test_configurations_refuse_contradictions() -> None:
