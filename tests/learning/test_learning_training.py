@@ -126,7 +126,7 @@ def test_training_solves_the_toy_task_that_an_untrained_policy_does_not(tmp_path
         ReachTask(), small_config(total_timesteps=1, learning_starts=10), tmp_path / "untrained"
     )
     trained = train(
-        ReachTask(), small_config(total_timesteps=2800, exploration_steps=1400), tmp_path / "trained"
+        ReachTask(), small_config(total_timesteps=4000, exploration_steps=2000), tmp_path / "trained"
     )
     assert success_rate(load_actor(untrained.policy_path), 100) < 0.3
     assert success_rate(load_actor(trained.policy_path), 100) > 0.7
