@@ -1,6 +1,7 @@
 """From a frame to the fruits in it: masks by a segmenter, V_f and place by an occlusion model."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Final
 
 import numpy as np
@@ -11,6 +12,7 @@ from maniskill_tomato.segmentation.instances import Instances, mask_box
 from maniskill_tomato.segmentation.masks import BinaryMask
 from maniskill_tomato.segmentation.segmenter import Segmenter
 from maniskill_tomato.sensing.measurement import RIPE_CATEGORIES, DetectedFruit, Measurement, Position
+from maniskill_tomato.sensing.own_pixels import own_pixels
 from maniskill_tomato.sensing.posed_frame import PosedFrame
 from maniskill_tomato.sensing.visible_fraction.estimate import (
     RADIUS_SPREAD,
@@ -87,10 +89,12 @@ class FruitDetector:
         depth = frame.depth_m.astype(np.float64)
         rgb = np.zeros((*depth.shape, 3), np.uint8) if frame.rgb is None else frame.rgb
         view = SegmentedImage(rgb=rgb, depth_m=depth, masks=masks, intrinsics=frame.intrinsics)
+        if self._segmenter is not None:
+            view = replace(view, masks=own_pixels(masks, view.depth_m))
         return tuple(
             _fruit(frame, view, mask, estimate, category, float(score))
             for mask, estimate, category, score in zip(
-                masks, self._model(view), categories, scores, strict=True
+                view.masks, self._model(view), categories, scores, strict=True
             )
         )
 

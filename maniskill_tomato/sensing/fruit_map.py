@@ -70,7 +70,7 @@ class MapConfig:
     """The same for V_f by the map's sphere."""
     error_scale: float = 1.0
     """Standard error of both together over that of two independent estimates."""
-    stop_errors: float = 1.0
+    stop_errors: float = 0.75
     """A fruit is taken for fully visible when V_f less so many standard errors is above the threshold."""
 
 

@@ -79,6 +79,32 @@ def test_small_and_unsure_fruits_are_left_out() -> None:
     assert not measured.mask(None).any()
 
 
+def test_a_mask_that_spills_over_to_neighbours_keeps_the_pixels_of_its_own_surface() -> None:
+    rows, columns = np.mgrid[:60, :80]
+    disc = (rows - 30) ** 2 + (columns - 40) ** 2 < 15**2
+    depth = np.full((60, 80), 0.6, np.float32)
+    depth[disc] = 0.36 - 0.02 * np.sqrt(1.0 - ((rows - 30) ** 2 + (columns - 40) ** 2)[disc] / 15**2)
+    nearer, farther = disc & (columns < 30), np.zeros_like(disc)
+    farther[25:35, 55:62] = True
+    depth[nearer], depth[farther] = 0.3, 0.42
+    unmeasured = disc & (rows > 40)
+    depth[rows > 40] = 0.0
+    spilled = Instances.from_masks((disc | farther)[None], np.ones(1, np.float32), ("tomato_ripe",))
+    seen = PosedFrame(
+        depth_m=depth,
+        intrinsics=color_intrinsics(80, 60),
+        T_world_camera=np.eye(4),
+        rgb=np.zeros((60, 80, 3), np.uint8),
+    )
+    mask = FruitDetector(lambda image, depth_m=None: spilled).measure(seen).mask(0)
+    own = disc & ~nearer & ~unmeasured
+    spill = (nearer | farther) & ~unmeasured
+    assert np.count_nonzero(mask & spill) < 0.1 * np.count_nonzero(spill)
+    assert mask[own].all()
+    # Rows without any depth say nothing against the mask.
+    assert mask[unmeasured].all()
+
+
 def test_what_segmentation_needs_must_be_in_the_frame() -> None:
     with pytest.raises(InvalidInputError, match="choose a segmenter"):
         FruitDetector(None).measure(frame())

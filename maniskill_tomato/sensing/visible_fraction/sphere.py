@@ -230,7 +230,8 @@ def whole_silhouette(
     Args:
         mask: Its visible pixels. Shape (height, width).
         circle: Its outline: x, y, radius, in [px].
-        depth: Of the image, in [m], 0 where it is not known. Shape (height, width).
+        depth: Of the image, in [m], 0 where it is not known, which counts as nearer: whole rows without depth show what
+            is too near to be measured. Shape (height, width).
         farthest: What is nearer than this hides it, in [m]; infinity if the depth tells nothing.
         farthest_fruit: The same for other tomatoes, in [m].
         fruits: The pixels of all tomatoes. Shape (height, width).
@@ -251,7 +252,7 @@ def whole_silhouette(
     if np.isfinite(farthest):
         there = depth[rows, columns]
         limit = np.where(fruits[rows, columns], farthest_fruit, farthest)
-        hidden = (there > 0) & (there <= limit)
+        hidden = there <= limit
         rows, columns = rows[hidden], columns[hidden]
     whole = mask.copy()
     whole[rows, columns] = True

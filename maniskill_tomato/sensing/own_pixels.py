@@ -1,0 +1,52 @@
+"""Which pixels of a segmenter's mask are the fruit's own: those at the depth of one surface.
+
+A mask spills over to a neighbour, nearer or farther, and where it does the fruit seems fuller, larger or elsewhere than
+it is. The depth of a fruit's visible surface spans no more than a radius.
+"""
+
+from typing import Final
+
+import cv2
+import numpy as np
+
+from maniskill_tomato.segmentation.masks import BinaryMask
+from maniskill_tomato.sensing.visible_fraction.estimate import (
+    LEAST_MEASURED_SHARE,
+    USUAL_RADIUS,
+    Float64,
+    filled_depth,
+)
+
+SURFACE_SPAN: Final = 1.2 * USUAL_RADIUS
+"""Depths of one fruit's surface differ by less than this, noise included, in [m]."""
+
+SMALLEST_PATCH: Final = 3
+"""Strips thinner than this stay: masks and depth disagree by a pixel or two at edges, in [px]."""
+
+
+def own_pixels(masks: tuple[BinaryMask, ...], depth_m: Float64) -> tuple[BinaryMask, ...]:
+    """The pixels of each mask that lie at the depth of most of it.
+
+    Args:
+        masks: A segmenter's. Each of shape (H, W).
+        depth_m: In [m], 0 where there is no measurement. Shape (H, W).
+
+    Returns:
+        As many masks; one of which too little is measured is left as it is. Each of shape (H, W).
+    """
+    filled = filled_depth(depth_m)
+    return tuple(_own(mask, depth_m, filled) for mask in masks)
+
+
+def _own(mask: BinaryMask, depth_m: Float64, filled: Float64) -> BinaryMask:
+    values = np.sort(depth_m[mask])
+    values = values[values > 0]
+    if not len(values) or len(values) < LEAST_MEASURED_SHARE * np.count_nonzero(mask):
+        return mask
+    ends = values if values[-1] - values[0] > SURFACE_SPAN else values[:1]
+    held = np.searchsorted(values, ends + SURFACE_SPAN, side="right") - np.arange(len(ends))
+    near = float(ends[int(np.argmax(held))])
+    others = mask & (filled > 0) & ((filled < near) | (filled > near + SURFACE_SPAN))
+    patch = np.ones((SMALLEST_PATCH, SMALLEST_PATCH), np.uint8)
+    own: BinaryMask = mask & (cv2.morphologyEx(others.view(np.uint8), cv2.MORPH_OPEN, patch) == 0)
+    return own
