@@ -20,23 +20,20 @@ class End:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Look:
-    """What a look means: the run is over, the arm goes to given joint positions, or the policy is asked."""
+    """What a look means: the run is over, the arm goes to another place first, or the policy is asked."""
 
     view: Sighting
     moves_left: int
     """What the policy is told."""
     end: End | None = None
     """Why the run is over."""
-    go_to: Float64 | None = None
-    """Where the arm goes without the policy being asked, joint positions in [rad]. Shape (7,)."""
-    cost: int = 0
-    """Moves that count when the arm goes there."""
+    places: Float64 | None = None
+    """Where the camera goes without the policy being asked, because it cannot look at the target from where it is: the
+    most wanted place first, base frame, in [m]. Shape (K, 3)."""
     is_new_target: bool = False
     """Whether the policy begins anew."""
     true_fraction: float | None = None
     """V_f of what is looked at by ray casting; None where nobody knows it."""
-    detail: str = ""
-    """For the record of a move to `go_to`."""
 
 
 class Goal(Protocol):
@@ -62,8 +59,16 @@ class Goal(Protocol):
         """
         ...
 
+    def pass_by(self, frame: Frame, T_world_camera: Float64, joints: Float64) -> None:
+        """Takes in a picture on the way to another view; the arguments are those of `look`.
+
+        Raises:
+            PerceptionError: The picture cannot be used.
+        """
+        ...
+
     def refused(self, in_a_row: int, why: str) -> End | None:
-        """Hears that the last move was refused.
+        """Hears that the last move was refused, or that there is no way to the places that it named.
 
         Args:
             in_a_row: How many were, one after the other.
@@ -111,6 +116,9 @@ class OneFruit:
             is_new_target=is_first,
             true_fraction=self._true_fraction(frame, view),
         )
+
+    def pass_by(self, frame: Frame, T_world_camera: Float64, joints: Float64) -> None:
+        """Nothing: the way has an end from which the target is looked at."""
 
     def refused(self, in_a_row: int, why: str) -> End | None:
         """Too many in a row end the run."""

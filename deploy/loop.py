@@ -2,16 +2,19 @@
 
     capture -> perceive -> observe -> policy -> kinematics -> safety -> arm -> settle -> capture
 
-What a look means says the run's `Goal`: one fruit, or all of a row. A move that the kinematics or `safety` refuses
-counts as a move, as in the simulated task. The policy sees that the camera has not moved and tries something else.
+What a look means says the run's `Goal`: one fruit, or all of a row. Where the kinematics or `safety` refuse the
+policy's move, a planner takes over: of the views that it thinks most of, the first to which `way` finds a safe way.
+Where there is none, the move counts as refused, as in the simulated task; the policy sees that the camera has not moved
+and tries something else. Before each piece of a way a fresh picture is taken for the collision check, and the goal
+may take it in.
 """
 
 import logging
 import time
-from collections import defaultdict
+from collections import defaultdict, deque
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
@@ -34,10 +37,15 @@ from maniskill_tomato.deploy.robot_perception import RobotBelief
 from maniskill_tomato.deploy.run_records import Mode, Proposal, Recorder, RunResult, Step
 from maniskill_tomato.deploy.safety import Refusal
 from maniskill_tomato.deploy.stops import Stops
+from maniskill_tomato.deploy.way import Way, WayPlanner
 from maniskill_tomato.deploy.workcell import Workcell
 from maniskill_tomato.errors import PolicyError, TomatoError
+from maniskill_tomato.policies.lattice_planner import LatticePlanner
+from maniskill_tomato.policies.next_best_view import NextBestView
 from maniskill_tomato.policies.opening import shipped_policy
 from maniskill_tomato.policies.protocol import Policy
+from maniskill_tomato.robot.look_at_move import MAX_MOVE
+from maniskill_tomato.robot.transit import TRANSIT_MOVES
 from maniskill_tomato.sensing.belief import Belief
 
 TASK: Final = "TomatoViewpoint-v1"
@@ -51,6 +59,15 @@ WAIT_SLICE: Final = 0.1
 
 STOP_TIME: Final = 2.0
 """An arm that was told to stop stands after so long, in [s]."""
+
+STANDS: Final = 0.005
+"""Joints that have turned by less than this have not moved, in [rad]."""
+
+PLACES_WANTED: Final = 60
+"""So many views are tried when a planner takes over."""
+
+REPLANS: Final = 2
+"""A way of which new pictures show that it is not safe is planned anew so often."""
 
 _logger = logging.getLogger(__name__)
 
@@ -92,6 +109,20 @@ class _End(Exception):
         self.reason, self.detail, self.is_fault = reason, detail, is_fault
 
 
+@dataclass(eq=False)
+class _Journey:
+    """The arm's way to another view."""
+
+    places: Float64
+    """Where it may lead, the most wanted first, in [m]. Shape (K, 3)."""
+    pieces: deque[Float64]
+    """Joint positions that are left to go to, in [rad]. Each of shape (7,)."""
+    replans: int = REPLANS
+    """How often it may still be planned anew."""
+    why: str = ""
+    """Why the last piece was refused."""
+
+
 class Loop:
     """One run over connected devices."""
 
@@ -128,11 +159,17 @@ class Loop:
         self._recorders, self._confirm = recorders, confirm
         self._robot_belief = RobotBelief(profile.T_flange_camera, self._goal.max_moves)
         self._chooser = MoveChooser(self._arm.safety, profile.T_flange_camera)
+        self._ways = WayPlanner(self._arm.safety, profile.T_flange_camera)
+        self._planner = policy if isinstance(policy, LatticePlanner) else NextBestView()
         self._points = PlantPoints(profile.T_flange_camera)
         self._fractions: list[float] = []
         self._moves = self._refused = self._refused_in_a_row = 0
         self._settled_at = self._clock.now()
-        self._way_back: Float64 | None = None
+        self._way_back: list[Float64] = []
+        self._trail: list[Float64] = []
+        self._journey: _Journey | None = None
+        self._no_way_from: Float64 | None = None
+        self._last: Step | None = None
         self._true_fraction: float | None = None
         self._times = _StageTimes()
 
@@ -181,8 +218,11 @@ class Loop:
         self._times.begin_step()
         with self._times.timed("capture"):
             self._camera.begin_view()
-            frame = self._capture.take(self._settled_at, may_be_blind=self._way_back is not None)
+            frame = self._capture.take(self._settled_at, may_be_blind=bool(self._way_back))
             joints = self._arm.read().joint_positions
+        if self._journey is not None:
+            self._go_on(self._journey, frame, joints)
+            return
         look, step = self._look(frame, joints)
         if look.end is not None:
             self._end(step, look.end.reason, look.end.detail)
@@ -190,16 +230,130 @@ class Loop:
             self._moves += 1
             self._go_back(step)
             return
-        self._way_back = joints
-        if look.go_to is not None:
-            self._moves += look.cost
-            self._send(replace(step, detail=look.detail), self._straight(step, look.go_to))
+        self._way_back = [joints]
+        if not self._trail or np.abs(joints - self._trail[-1]).max() > STANDS:
+            self._trail.append(joints)
+        if look.places is not None:
+            self._set_out(step, look.places)
             return
         with self._times.timed("policy"):
             action = decide(self._policy, self._belief)
         step = replace(step, action=(float(action[0]), float(action[1]), float(action[2])))
         self._moves += 1
-        self._send(step, self._chosen(step))
+        chosen = self._chosen(step)
+        is_refused = chosen.move is None or chosen.refusal is not None
+        if is_refused and look.moves_left >= TRANSIT_MOVES and self._hand_over(step):
+            return
+        self._send(step, chosen)
+
+    # ------------------------------------------------------------ ways to views
+
+    def _hand_over(self, step: Step) -> bool:
+        """Has the planner choose a view that the arm gets to; whether there is one."""
+        joints, planner = step.joint_positions, self._planner
+        if self._no_way_from is not None and np.abs(joints - self._no_way_from).max() < STANDS:
+            return False
+        with self._times.timed("way"):
+            if planner is not self._policy:
+                planner.act(self._belief)
+            ranked = planner.ranked(self._belief)[:PLACES_WANTED]
+            places = planner.views(self._belief)[0, ranked].double().numpy()
+            way = self._way_to(step, places)
+            planner.tried.refused[0, [ranked[k] for k in way.blocked]] = True
+        if way.place is None:
+            self._no_way_from = joints
+            return False
+        away = float(np.linalg.norm(places[way.place] - step.T_world_camera[:3, 3]))
+        if len(way.pieces) > 1 or away > MAX_MOVE:
+            self._moves += TRANSIT_MOVES - 1
+        _logger.info("the move is refused; a way of %d pieces to another view", len(way.pieces))
+        self._journey = _Journey(places=places[way.place :], pieces=deque(way.pieces))
+        self._send_piece(step, self._journey)
+        return True
+
+    def _set_out(self, step: Step, places: Float64) -> None:
+        """Begins the way to the first place that the arm gets to."""
+        with self._times.timed("way"):
+            way = self._way_to(step, places)
+        if way.place is None:
+            self._moves += 1
+            self._refuse(step, "there is no way to a view of it that safety lets through")
+            return
+        self._moves += TRANSIT_MOVES
+        _logger.info("a way of %d pieces to another view", len(way.pieces))
+        self._journey = _Journey(places=places[way.place :], pieces=deque(way.pieces))
+        self._send_piece(step, self._journey)
+
+    def _way_to(self, step: Step, places: Float64) -> Way:
+        state, points = self._arm.read(), self._points.points_w
+        target, now, before = step.target_position, self._clock.now(), self._trail[:-1]
+        return self._ways.to_view(places, target, state, now, step.frame.stamp, points, before)
+
+    def _go_on(self, journey: _Journey, frame: Frame, joints: Float64) -> None:
+        """The next piece, by what the picture shows of the plant."""
+        step = self._between(frame, joints)
+        if self._capture.is_blind(frame):
+            journey.pieces.clear()
+            journey.replans, journey.why = 0, "the camera saw no depth on the way"
+            self._go_back(step)
+            return
+        self._way_back = [joints]
+        with self._times.timed("plant points"):
+            self._points.add(frame, step.T_world_camera, joints)
+        with self._times.timed("perceive"):
+            self._goal.pass_by(frame, step.T_world_camera, joints)
+        if not journey.pieces and journey.replans:
+            journey.replans -= 1
+            with self._times.timed("way"):
+                journey.pieces.extend(self._way_to(step, journey.places).pieces)
+        if not journey.pieces:
+            self._journey = None
+            self._refuse(step, journey.why)
+            return
+        self._send_piece(step, journey)
+
+    def _send_piece(self, step: Step, journey: _Journey) -> None:
+        piece = self._straight(step, journey.pieces[0])
+        if piece.refusal is not None and self._mode != "dry_run":
+            # Only a new picture tells that a way is not safe: it is planned anew from here. One that took long to
+            # plan is kept for a fresh picture.
+            if piece.refusal.reason == "stale_frame" and journey.replans:
+                journey.replans -= 1
+            else:
+                journey.pieces.clear()
+            journey.why = str(piece.refusal)
+            self._count_refusal(step, journey.why)
+            return
+        journey.pieces.popleft()
+        if not journey.pieces:
+            self._journey = None
+        refused = self._refused
+        self._send(replace(step, detail="on the way to another view"), piece)
+        if self._refused > refused:
+            self._journey = None
+
+    def _between(self, frame: Frame, joints: Float64) -> Step:
+        """A look on the way, of which the goal learns nothing."""
+        assert self._last is not None
+        view = replace(
+            self._last.view,
+            visible_fraction=0.0,
+            sure_fraction=0.0,
+            mask=np.zeros(frame.depth.shape, np.bool_),
+            fruits_seen=0,
+            recall=None,
+        )
+        self._fractions.append(0.0)
+        return replace(
+            self._last,
+            number=len(self._fractions) - 1,
+            frame=frame,
+            view=view,
+            joint_positions=joints,
+            T_world_camera=self._robot_belief.camera_pose(joints),
+        )
+
+    # ------------------------------------------------------------ single moves
 
     def _look(self, frame: Frame, joints: Float64) -> tuple[Look, Step]:
         T_world_camera = self._robot_belief.camera_pose(joints)
@@ -208,13 +362,14 @@ class Loop:
         if look is None:
             raise _End("no_target", "the first picture shows no ripe fruit; start where one is in view")
         view = look.view
-        if look.go_to is None:
+        if look.places is None:
             with self._times.timed("observe"):
                 self._belief = self._robot_belief.observe(joints, view, look.moves_left)
         with self._times.timed("plant points"):
             self._points.add(frame, T_world_camera, joints)
         if look.is_new_target:
-            self._policy.begin(self._belief, torch.zeros(1, dtype=torch.int64))
+            for one in {id(p): p for p in (self._policy, self._planner)}.values():
+                one.begin(self._belief, torch.zeros(1, dtype=torch.int64))
         self._fractions.append(view.visible_fraction)
         self._true_fraction = look.true_fraction
         step = Step(
@@ -226,6 +381,7 @@ class Loop:
             target_position=view.target_position,
             moves_left=look.moves_left,
         )
+        self._last = step
         return look, step
 
     def _straight(self, step: Step, joints: Float64) -> Choice:
@@ -271,19 +427,22 @@ class Loop:
 
     def _go_back(self, step: Step) -> None:
         """Without depth nobody knows what is near, a leaf over the lens for one: back to where there was some."""
-        way_back, self._way_back = self._way_back, None
-        assert way_back is not None
+        way_back, self._way_back = self._way_back, []
+        assert way_back
         step = replace(step, detail="no depth here: back to the last view that had some")
-        move = JointMove(joint_positions=way_back, speed_fraction=self._arm.safety.config.speed_fraction)
+        back = [
+            JointMove(joint_positions=joints, speed_fraction=self._arm.safety.config.speed_fraction)
+            for joints in reversed(way_back)
+        ]
         if self._mode != "unattended":
-            self._ask(step, move, None)
+            self._ask(step, back[0], None)
         try:
-            sent = self._arm.command(move, step.frame.stamp, self._points.points_w)
+            sent = self._arm.command(back[0], step.frame.stamp, self._points.points_w)
         except RefusedError as error:
             raise PerceptionError(
                 f"the picture has no depth, and the way back is refused: {error}"
             ) from error
-        self._follow(step, sent)
+        self._follow(step, sent, tuple(back[1:]))
 
     def _follow(self, step: Step, sent: JointMove, then: tuple[JointMove, ...] = ()) -> None:
         """Waits for the end of the move, then sends the rest of a way round.
@@ -293,6 +452,8 @@ class Loop:
         self._refused_in_a_row = 0
         self._arrive(step, sent)
         for move in then:
+            if self._way_back:
+                self._way_back.append(sent.joint_positions)
             if self._mode == "confirm":
                 self._ask(replace(step, commanded=sent.joint_positions), move, None)
             try:
@@ -341,11 +502,14 @@ class Loop:
         if not confirmed:
             self._end(step, "declined", "the move was not confirmed")
 
-    def _refuse(self, step: Step, why: str) -> None:
+    def _count_refusal(self, step: Step, why: str) -> None:
         self._refused += 1
         self._refused_in_a_row += 1
         _logger.info("move %d refused: %s", self._moves, why)
         self._record(replace(step, outcome="refused", detail=why))
+
+    def _refuse(self, step: Step, why: str) -> None:
+        self._count_refusal(step, why)
         end = self._goal.refused(self._refused_in_a_row, why)
         if end is not None:
             raise _End(end.reason, end.detail)

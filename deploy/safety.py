@@ -186,6 +186,7 @@ class Safety:
         """
         refusal = (
             self._numbers(move, state, now, frame_stamp)
+            or self._seen(points_w)
             or self._limits(move, state)
             or self._ages(state, now, frame_stamp)
         )
@@ -202,7 +203,7 @@ class Safety:
             points_w: What was seen of the plant, base frame, in [m]; None for no such check. Shape (P, 3).
         """
         c = self.config
-        if self._collisions.nearest(joint_positions[None]) is not None:
+        if self._seen(points_w) is not None or self._collisions.nearest(joint_positions[None]) is not None:
             return True
         if c.plant_clearance is None or points_w is None or len(points_w) < c.plant_points_needed:
             return False
@@ -222,6 +223,18 @@ class Safety:
             if not np.isfinite(values).all():
                 return Refusal(reason="not_finite", detail=f"{name} are not finite: {values.tolist()}")
         return None
+
+    def _seen(self, points_w: Float64 | None) -> Refusal | None:
+        """A point that is not finite is near to nothing by every comparison, so that it would hide a leaf."""
+        if points_w is None or self.config.plant_clearance is None:
+            return None
+        bad = int((~np.isfinite(points_w)).any(-1).sum())
+        if not bad:
+            return None
+        return Refusal(
+            reason="not_finite",
+            detail=f"{bad} of the {len(points_w)} points that were seen of the plant are not finite",
+        )
 
     def _limits(self, move: JointMove, state: ArmState) -> Refusal | None:
         c, joints = self.config, move.joint_positions

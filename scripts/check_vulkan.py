@@ -138,6 +138,8 @@ def render_one_picture() -> None:
     import numpy as np
     import sapien
 
+    # The usual shaders need the same device, and compile for about ten seconds.
+    sapien.render.set_camera_shader_dir("trivial")
     scene = sapien.Scene()
     scene.set_ambient_light([0.5, 0.5, 0.5])
     builder = scene.create_actor_builder()

@@ -18,9 +18,10 @@ from maniskill_tomato.sensing.sensor_noise import SensorNoise
 from maniskill_tomato.tasks import MAX_EPISODE_STEPS, MAX_GENERAL_STEPS, MAX_ROW_STEPS, TASK_IDS
 from maniskill_tomato.tasks.arm_moves import ArmMoves, Control
 from maniskill_tomato.tasks.row.episode_selection import EpisodeChoice
-from maniskill_tomato.tasks.row.row_config import CameraConfig, GeneralTaskConfig
+from maniskill_tomato.tasks.row.row_config import GeneralTaskConfig
 from maniskill_tomato.tasks.row.search_game import SearchGame
 from maniskill_tomato.tasks.row.target_sequence import Transits
+from maniskill_tomato.tasks.senses import CameraConfig
 from maniskill_tomato.tasks.thesis.thesis_config import ViewpointTaskConfig, guided_task, sparse_task
 from maniskill_tomato.tasks.thesis.thesis_game import ThesisGame
 from maniskill_tomato.tasks.world import Game, Pictures, TaskConfig, World
@@ -46,6 +47,10 @@ class WorldOptions:
     """Half ranges of a uniform addition to it at every reset, in [m, m, rad]; the task's own if None."""
     rays_per_side: int = 16
     """A visible fraction is counted with this number of rays squared."""
+    perception: Perception = "ground_truth"
+    """Where V_f, the target's position and what is seen come from."""
+    association: str | None = None
+    """Who says which track a camera's detection belongs to, one of `Association`; `map` if None."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -74,14 +79,10 @@ class SearchOptions(WorldOptions):
     """What a move with plant contact costs; the task's own if None."""
     sensor_noise: SensorNoise | Mapping[str, float] | None = None
     """What camera and segmenter get wrong about exact labels."""
-    perception: Perception = "ground_truth"
-    """Where V_f, the target's position and the rays' labels come from."""
     target: str | None = None
     """How the target is named to a robot that sees through a camera, one of `Naming`; `track` if None."""
     map_noise: float | None = None
     """With `target="map"`: standard deviation of each coordinate of the place that is given, in [m]; 0.03 if None."""
-    association: str | None = None
-    """Who says which track a camera's detection belongs to, one of `Association`; `map` if None."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -255,8 +256,16 @@ def make_setup(env_id: str, **options: Any) -> TaskSetup:
 def _thesis_setup(options: ThesisOptions) -> TaskSetup:
     task, others = options.task, options.other_targets
     _check_integer("other_targets", others, 0)
+    check_choice("perception", options.perception, get_args(Perception))
+    camera = _camera_config(options)
+    if others and options.perception != "ground_truth":
+        raise InvalidInputError(
+            "other_targets judges other fruits by the truth, which a robot with a camera does not know; leave it out "
+            "with perception="
+        )
     return TaskSetup(
-        make_game=lambda world: ThesisGame(world, task, others),
+        make_game=lambda world: ThesisGame(world, task, others, options.perception, camera),
+        needs_pictures=options.perception in RENDERED,
         neighbour_poses=task.neighbour_poses,
         outside_workspace="home" if task.outside_workspace == "home" else "stay",
         **_standing(options, task, options.plant, (0.0, 0.0, 0.0)),
@@ -304,12 +313,12 @@ def _search_setup(options: SearchOptions) -> TaskSetup:
     )
 
 
-def _camera_config(options: SearchOptions) -> CameraConfig:
-    """How targets are named; in a row the robot chooses them."""
+def _camera_config(options: WorldOptions) -> CameraConfig:
+    """How targets are named; in a row and in the thesis's tasks the robot chooses them."""
     given: dict[str, Any] = {
         name: value
         for name in ("target", "map_noise", "association")
-        if (value := getattr(options, name)) is not None
+        if (value := getattr(options, name, None)) is not None
     }
     if given and options.perception == "ground_truth":
         raise InvalidInputError(
@@ -319,8 +328,10 @@ def _camera_config(options: SearchOptions) -> CameraConfig:
         raise InvalidInputError(
             f"{named[0]} is for TomatoViewpoint-v1; in a row a robot with a camera chooses its targets itself"
         )
+    if isinstance(options, ThesisOptions):
+        given["target"] = "any"
     config = CameraConfig(**given)
-    if options.map_noise is not None and config.target != "map":
+    if "map_noise" in given and config.target != "map":
         raise InvalidInputError(f"map_noise goes with target='map'; got target={config.target!r}")
     return config
 

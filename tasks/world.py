@@ -28,7 +28,7 @@ from maniskill_tomato.tasks.numpy_streams import (
     set_random_state,
     spread_seed,
 )
-from maniskill_tomato.tasks.plant_batch import GROWN_PLANTS, PlantBatch
+from maniskill_tomato.tasks.plant_batch import PlantBatch
 from maniskill_tomato.tasks.world_state import WorldState
 
 FIRST_ORGAN_ID = 24
@@ -169,7 +169,6 @@ class World:
             intrinsics,
             robot_meshes=link_meshes(),
             rays_per_side=rays_per_side,
-            cached_plants=GROWN_PLANTS,
             device=str(self.device),
         )
         self._plant_pose, self._plant_pose_noise = plant_pose, np.array(plant_pose_noise, dtype=np.float64)

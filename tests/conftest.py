@@ -14,7 +14,7 @@ import pytest
 
 ROOT = Path(__file__).resolve().parent.parent
 PROBE_SECONDS = 300
-"""The first picture on a machine compiles shaders, about 11 s when it is idle."""
+"""A picture takes a second or two when the machine is idle."""
 
 # ManiSkill asks on the terminal before it downloads an asset; a test must not wait for an answer.
 os.environ.setdefault("MS_SKIP_ASSET_DOWNLOAD_PROMPT", "1")

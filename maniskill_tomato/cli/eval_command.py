@@ -9,7 +9,7 @@ from maniskill_tomato.cli.early_checks import check_counts, check_env_id, check_
 from maniskill_tomato.cli.shared_options import EnvId, PlantOptions
 from maniskill_tomato.errors import InvalidInputError
 from maniskill_tomato.policies.opening import shipped_policy
-from maniskill_tomato.tasks import TASK_IDS
+from maniskill_tomato.tasks import THESIS_IDS
 
 EpisodeList = Literal["validation", "held_out"]
 
@@ -117,8 +117,11 @@ class Eval:
                     "--target and --map-noise are for a robot that sees through a camera; give --perception as well"
                 )
             return {}
-        if self.env_id not in TASK_IDS[2:]:
-            raise InvalidInputError(f"--perception is for {' and '.join(TASK_IDS[2:])}; got {self.env_id}")
+        if options and self.env_id in THESIS_IDS:
+            raise InvalidInputError(
+                "--target and --map-noise are for TomatoViewpoint-v1; in the thesis's tasks a robot with a camera "
+                "chooses its target itself"
+            )
         if self.perception in RENDERED:
             options["render_backend"] = "auto"
         return {"perception": self.perception, **options}

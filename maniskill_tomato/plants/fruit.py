@@ -96,6 +96,7 @@ def berry_patch(berry: Berry, centre: Float64, *, picture: bool) -> Patch:
         picture: Whether to use the finer mesh.
     """
     around, down = (48, 28) if picture else (12, 7)
+    to_plant = berry.frame().T
 
     def point(phi: Float64, theta: Float64) -> Float64:
         ring = np.sin(theta)
@@ -106,7 +107,7 @@ def berry_patch(berry: Berry, centre: Float64, *, picture: bool) -> Patch:
         height = height - berry.radius * berry.dent * np.exp(-((theta / 0.42) ** 2))
         height = height + berry.radius * 0.035 * np.exp(-(((pi - theta) / 0.35) ** 2))
         local = np.stack([across * np.cos(phi), across * np.sin(phi), height], -1)
-        return np.asarray(local @ berry.frame().T)
+        return np.asarray(local @ to_plant)
 
     # Rows crowd a little at the top, where the dent is.
     rows = np.linspace(0.0, 1.0, down + 1)

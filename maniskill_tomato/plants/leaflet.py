@@ -1,6 +1,7 @@
 """The blade of a leaflet: a lobed, folded and curled surface, meshed from both sides."""
 
 from dataclasses import dataclass
+from functools import lru_cache
 from math import pi
 
 import numpy as np
@@ -49,7 +50,7 @@ class Leaflet:
 def _half_width(leaflet: Leaflet, t: Float64, side: Float64, *, serrate: bool) -> Float64:
     """Half width along the midrib on one side (+1 left, -1 right), in [m]."""
     # Ovate, broadest at 0.28 of its length, drawn out into a point.
-    t = np.clip(t, 0.0, 1.0)
+    t = np.minimum(np.maximum(t, 0.0), 1.0)
     envelope = 2.585 * t**0.45 * (1.0 - t) ** 1.15
     lobe_phase = 2 * pi * leaflet.lobes * t**0.9 + np.where(side > 0, leaflet.phases[0], leaflet.phases[1])
     # A raised cosine to a power: round lobes and narrow sinuses.
@@ -116,15 +117,23 @@ def _cuts(leaflet: Leaflet, *, picture: bool) -> tuple[Float64, Float64, Int64]:
     columns = np.linspace(-1.0, 1.0, 2 * half_columns + 1)
     t = np.concatenate([[0.0], np.repeat(rows[1:-1], len(columns)), [1.0]])
     s = np.concatenate([[0.0], np.tile(columns, len(rows) - 2), [0.0]])
-    width = len(columns)
-    last = 1 + (len(rows) - 3) * width
-    fan = np.arange(width - 1)
+    return t, s, _blade_faces(len(rows), len(columns))
+
+
+@lru_cache(maxsize=64)
+def _blade_faces(rows: int, columns: int) -> Int64:
+    """Triangles of a blade whose first and last row are one point each; read-only. Shape (F, 3)."""
+    last = 1 + (rows - 3) * columns
+    tip = 1 + (rows - 2) * columns
+    fan = np.arange(columns - 1)
     faces = [
-        np.stack([np.zeros(width - 1, np.int64), 1 + fan, 2 + fan], 1),
-        1 + grid_faces(len(rows) - 2, width)[:, ::-1],
-        np.stack([last + fan, np.full(width - 1, len(t) - 1), last + fan + 1], 1),
+        np.stack([np.zeros(columns - 1, np.int64), 1 + fan, 2 + fan], 1),
+        1 + grid_faces(rows - 2, columns)[:, ::-1],
+        np.stack([last + fan, np.full(columns - 1, tip), last + fan + 1], 1),
     ]
-    return t, s, np.concatenate(faces).astype(np.int64)
+    result = np.concatenate(faces).astype(np.int64)
+    result.setflags(write=False)
+    return result
 
 
 def coarse_triangles(leaflet: Leaflet) -> Float64:

@@ -2,6 +2,7 @@
 
 from collections.abc import Iterable
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -34,14 +35,12 @@ def normalized(vectors: Float64) -> Float64:
 
 def cross(a: Float64, b: Float64) -> Float64:
     """Cross product along the last axis, with broadcasting."""
-    return np.stack(
-        [
-            a[..., 1] * b[..., 2] - a[..., 2] * b[..., 1],
-            a[..., 2] * b[..., 0] - a[..., 0] * b[..., 2],
-            a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0],
-        ],
-        -1,
-    )
+    # Small arrays, thousands of times a plant: filling one array is twice as fast as stacking three.
+    result = np.empty(np.broadcast_shapes(a.shape, b.shape))
+    result[..., 0] = a[..., 1] * b[..., 2] - a[..., 2] * b[..., 1]
+    result[..., 1] = a[..., 2] * b[..., 0] - a[..., 0] * b[..., 2]
+    result[..., 2] = a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0]
+    return result
 
 
 def join(patches: Iterable[Patch], material: str) -> MeshPart:
@@ -72,11 +71,14 @@ def flipped(patch: Patch) -> Patch:
     return Patch(patch.vertices, -patch.normals, patch.uvs, patch.faces[:, ::-1])
 
 
+@lru_cache(maxsize=256)
 def grid_faces(rows: int, columns: int) -> Int64:
-    """Triangles of a grid whose vertices are numbered row by row. Shape (2 (rows - 1) (columns - 1), 3)."""
+    """Triangles of a grid whose vertices are numbered row by row; read-only. Shape (2 (rows - 1) (columns - 1), 3)."""
     corner = (np.arange(rows - 1)[:, None] * columns + np.arange(columns - 1)).ravel()
     a, b, c, d = corner, corner + 1, corner + columns, corner + columns + 1
-    return np.concatenate([np.stack([a, b, d], 1), np.stack([a, d, c], 1)])
+    faces = np.concatenate([np.stack([a, b, d], 1), np.stack([a, d, c], 1)])
+    faces.setflags(write=False)
+    return faces
 
 
 def curve_frames(points: Float64) -> tuple[Float64, Float64, Float64]:

@@ -2,7 +2,6 @@
 
 from enum import IntEnum
 
-import numpy as np
 from numpy.random import PCG64, Generator, SeedSequence
 
 
@@ -27,7 +26,7 @@ def stream(seed: int, kind: Stream, index: int = 0) -> Generator:
 
 def normal(rng: Generator, mean: float, spread: float, limit: float = 2.5) -> float:
     """A normal draw, clipped to `limit` standard deviations."""
-    return mean + spread * float(np.clip(rng.standard_normal(), -limit, limit))
+    return mean + spread * min(max(float(rng.standard_normal()), -limit), limit)
 
 
 def uniform(rng: Generator, bounds: tuple[float, float]) -> float:

@@ -73,6 +73,11 @@ class Candidates:
             else:
                 self._refused_directions[i].clear()
 
+    def untried(self, belief: Belief, positions: Tensor, allowed: Tensor) -> Tensor:
+        """Which candidates are allowed, show another view than those taken and were not refused. Shape (B, K), bool."""
+        untried: Tensor = allowed & ~self.refused & (distance_to_taken(belief, positions) > TAKEN)
+        return untried
+
     def move_to_best(self, belief: Belief, positions: Tensor, worth: Tensor, allowed: Tensor) -> Tensor:
         """The moves towards the best candidates that are allowed, were not taken and not refused.
 
@@ -87,7 +92,7 @@ class Candidates:
         """
         position = belief.camera_position
         directions = torch.nn.functional.normalize(positions - position[:, None], dim=-1)
-        allowed = allowed & ~self.refused & (distance_to_taken(belief, positions) > TAKEN)
+        allowed = self.untried(belief, positions, allowed)
         for i, refused in enumerate(self._refused_directions):
             if refused:
                 near = (directions[i] @ torch.stack(refused).mT).amax(dim=-1) > math.cos(REFUSED_ANGLE)
@@ -115,6 +120,14 @@ class LatticePlanner(Planner):
         self.tried.note_refusals(belief)
         views = self.views(belief)
         return self.tried.move_to_best(belief, views, self.worth(belief, views), self.allowed(belief))
+
+    def ranked(self, belief: Belief) -> list[int]:
+        """The candidates of the first environment that are worth trying, the best first."""
+        views = self.views(belief)
+        untried = self.tried.untried(belief, views, self.allowed(belief))[0]
+        order = torch.where(untried, self.worth(belief, views)[0], -math.inf).argsort(descending=True)
+        best: list[int] = order[: int(untried.sum())].tolist()
+        return best
 
     @abstractmethod
     def worth(self, belief: Belief, views: Tensor) -> Tensor:

@@ -40,7 +40,6 @@ class RayScene:
         *,
         robot_meshes: LinkTriangles | None = None,
         rays_per_side: int = 16,
-        cached_plants: int = 64,
         device: str | torch.device = "cpu",
     ) -> None:
         """Builds the meshes.
@@ -50,7 +49,6 @@ class RayScene:
             intrinsics: The camera whose view is asked for, the same in all environments.
             robot_meshes: Links that can hide something, keyed by `iiwa14.LINK_NAMES`; None for no robot.
             rays_per_side: A visible fraction is counted with the square of this number of rays.
-            cached_plants: How many plants' meshes are kept for environments that show them again.
             device: Where the rays are cast and all tensors live: "cpu" or a CUDA device.
 
         Raises:
@@ -60,17 +58,13 @@ class RayScene:
             raise InvalidInputError("plants must name the plant of at least one environment, got none")
         if rays_per_side < 2:
             raise InvalidInputError(f"rays_per_side must be at least 2, got {rays_per_side}")
-        if cached_plants < 1:
-            raise InvalidInputError(f"cached_plants must be at least 1, got {cached_plants}")
         for name in robot_meshes or {}:
             if name not in LINK_NAMES:
                 raise InvalidInputError.choice("a key of robot_meshes", name, LINK_NAMES)
         self._intrinsics = intrinsics
         self._device = torch.device(device)
         self._plants = list(plants)
-        self._rays = WarpScene(
-            plants, intrinsics, robot_meshes or {}, rays_per_side, cached_plants, self._device
-        )
+        self._rays = WarpScene(plants, intrinsics, robot_meshes or {}, rays_per_side, self._device)
         n = len(plants)
         self._poses_shape, self._row_shape = (n, 4, 4), (n,)
         self._links_shape = (n, len(LINK_NAMES), 4, 4)

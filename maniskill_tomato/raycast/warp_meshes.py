@@ -1,8 +1,8 @@
 """Triangle meshes on a Warp device: the links, and one set per plant, shared by every environment that shows it."""
 
-from collections import OrderedDict
 from collections.abc import Mapping
-from typing import Any
+from functools import lru_cache
+from typing import Any, Final
 
 import numpy as np
 import torch
@@ -12,6 +12,9 @@ from numpy.typing import NDArray
 from maniskill_tomato.errors import InvalidInputError
 from maniskill_tomato.plants.organs import Plant
 from maniskill_tomato.robot.iiwa14 import LINK_NAMES
+
+CACHED_PLANTS: Final = 128
+"""How many plants' meshes are kept for scenes that show them again."""
 
 LinkTriangles = Mapping[str, tuple[NDArray[Any], NDArray[Any]]]
 """Vertices in the link frame, in [m], Shape (V, 3), and faces, Shape (F, 3), by link name."""
@@ -37,7 +40,7 @@ class PlantMeshes:
         if not plant.fruits:
             raise InvalidInputError(f"a plant needs at least one fruit to look at; {plant.preset!r} has none")
         self.plant = plant
-        """Kept so that the identity by which this set is found stays taken."""
+        """Whose meshes these are."""
         self.whole = build_mesh(plant.vertices, plant.faces, device)
         organs = [plant.organs[fruit.organ_index] for fruit in plant.fruits]
         self.fruits = [build_mesh(organ.vertices, organ.faces, device) for organ in organs]
@@ -46,29 +49,14 @@ class PlantMeshes:
         self.is_ripe = np.array([fruit.ripeness == "ripe" for fruit in plant.fruits], dtype=np.int32)
 
 
-class PlantMeshCache:
-    """The meshes of the plants seen last, found by the plant's identity.
+@lru_cache(maxsize=CACHED_PLANTS)
+def plant_meshes(plant: Plant, device: str) -> PlantMeshes:
+    """The meshes of a plant, found by its identity; those of the plants asked for last are kept for all scenes.
 
-    Building the hierarchy of a plant takes tens of milliseconds, so plants that come back should be found
-    here. Environments hold on to the sets they show themselves; the bound is on what this cache keeps alive.
+    Building the hierarchy of a plant takes tens of milliseconds. Scenes hold on to the sets that they show; the bound
+    is on what is kept beyond that.
     """
-
-    def __init__(self, device: str, capacity: int) -> None:
-        self._device = device
-        self._capacity = capacity
-        self._entries: OrderedDict[int, PlantMeshes] = OrderedDict()
-
-    def get(self, plant: Plant) -> PlantMeshes:
-        """The meshes of a plant, built now if they are not at hand."""
-        key = id(plant)
-        entry = self._entries.get(key)
-        if entry is None:
-            entry = self._entries[key] = PlantMeshes(plant, self._device)
-            if len(self._entries) > self._capacity:
-                self._entries.popitem(last=False)
-        else:
-            self._entries.move_to_end(key)
-        return entry
+    return PlantMeshes(plant, device)
 
 
 class LinkMeshes:

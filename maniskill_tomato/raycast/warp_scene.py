@@ -35,7 +35,7 @@ from maniskill_tomato.raycast.images import (
 )
 from maniskill_tomato.raycast.view_rays import NEAREST_DEPTH, RANGE, RAYS_PER_SIDE, ViewRays, ray_pattern
 from maniskill_tomato.raycast.visibility import Visibility, ray_lattice
-from maniskill_tomato.raycast.warp_meshes import LinkMeshes, LinkTriangles, PlantMeshCache
+from maniskill_tomato.raycast.warp_meshes import LinkMeshes, LinkTriangles, plant_meshes
 from maniskill_tomato.robot.d435 import CAMERA_FAR, CameraIntrinsics
 from maniskill_tomato.robot.iiwa14 import LINK_NAMES
 from maniskill_tomato.robot.spheres import sphere_table
@@ -59,7 +59,6 @@ class WarpScene:
         intrinsics: CameraIntrinsics,
         robot_meshes: LinkTriangles,
         rays_per_side: int,
-        cached_plants: int,
         device: torch.device,
     ) -> None:
         """Builds the meshes; the arguments are those of `RayScene`."""
@@ -76,8 +75,7 @@ class WarpScene:
         self._pattern = self._points(ray_lattice(rays_per_side))
         self._coarse_pattern = self._points(ray_lattice(_COARSE_RAYS_PER_SIDE))
 
-        self._cache = PlantMeshCache(self._warp_device, cached_plants)
-        self._shown = [self._cache.get(plant) for plant in plants]
+        self._shown = [plant_meshes(plant, self._warp_device) for plant in plants]
         self._links = LinkMeshes(robot_meshes, self._warp_device)
         self._scene: Any = kernels.Scene()
         self._links.describe(self._scene, device)
@@ -92,7 +90,7 @@ class WarpScene:
         """Shows other plants in some environments, once all queries under way are done."""
         if not plants:
             return
-        meshes = {env: self._cache.get(plant) for env, plant in plants.items()}
+        meshes = {env: plant_meshes(plant, self._warp_device) for env, plant in plants.items()}
         # A new mesh is built in Warp's stream, and an old one must outlive the casts still under way with it.
         self._finish_work()
         for env, shown in meshes.items():

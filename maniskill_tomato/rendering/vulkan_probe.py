@@ -10,7 +10,7 @@ from typing import Literal
 logger = logging.getLogger(__name__)
 
 PROBE_TIMEOUT_SECONDS = 180.0
-"""The first picture on a machine compiles shaders, about 11 s on two idle CPU cores."""
+"""A picture with the smallest shaders takes a second or two."""
 
 NO_RENDERING_HINT = (
     "No Vulkan device that SAPIEN can use was found; `make vulkan` installs one that runs on the CPU "
@@ -20,6 +20,7 @@ NO_RENDERING_HINT = (
 _PROBE = """
 import sys
 import sapien
+sapien.render.set_camera_shader_dir("trivial")
 system = sapien.render.RenderSystem(sapien.Device(sys.argv[1]))
 scene = sapien.Scene([sapien.physx.PhysxCpuSystem(), system])
 camera = scene.add_camera("probe", 8, 8, 1.0, 0.1, 1.0)
@@ -39,7 +40,8 @@ def rendering_available() -> bool:
 def render_backend() -> Literal["gpu", "cpu", "none"]:
     """The value of ManiSkill's `render_backend` that works here; `none` if there is no usable Vulkan device.
 
-    The answer is found once per process by taking a tiny picture in a process of its own.
+    The answer is found once per process by taking a tiny picture in a process of its own, with SAPIEN's smallest
+    shaders: the usual ones need the same device and compile for about ten seconds.
     """
     if sys.platform.startswith("linux") and os.path.exists("/dev/nvidiactl") and _takes_a_picture("cuda"):
         return "gpu"

@@ -139,11 +139,11 @@ class TransitPlanner:
                 f"qpos, places and target must have shapes (7,), (K, 3) and (3,), got {tuple(qpos.shape)}, "
                 f"{tuple(places.shape)} and {tuple(target.shape)}"
             )
-        out = [*self._backed_away(qpos.double()), self._ready]
+        out = [*self.backed_away(qpos.double()), self._ready]
         if not self._is_clear(out):
             return None
         for place, goal, T_world_camera in self._looks(places.double(), target.double()):
-            back = [self._ready, *reversed(self._backed_away(goal))]
+            back = [self._ready, *reversed(self.backed_away(goal))]
             if self._is_clear(back, LOWEST_LINK):
                 waypoints = torch.stack([*out, *back[1:]])
                 return Transit(waypoints=waypoints, T_world_camera=T_world_camera, place=place)
@@ -164,8 +164,15 @@ class TransitPlanner:
             for k in (look.reach[: len(block)] == int(Reach.REACHABLE)).nonzero()[:, 0].tolist():
                 yield first + k, look.qpos[k], look.T_world_camera[k]
 
-    def _backed_away(self, qpos: Tensor) -> list[Tensor]:
-        """Joint positions on the way back with the camera held as it is, as far as the arm gets, those given first."""
+    def backed_away(self, qpos: Tensor) -> list[Tensor]:
+        """Joint positions on the way back with the camera held as it is, as far as the arm gets, those given first.
+
+        Args:
+            qpos: Joint positions, in [rad]. Shape (7,), float64.
+
+        Returns:
+            In [rad]. Each of shape (7,).
+        """
         joints = [qpos]
         pose = flange_to_camera(forward_kinematics(qpos[None]))
         way = max(float(pose[0, 0, 3]) - CLEAR_X, 0.0)

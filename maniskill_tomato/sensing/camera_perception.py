@@ -20,10 +20,8 @@ from maniskill_tomato.sensing.fruit_map import Fraction, FruitMap, MapConfig, Ma
 from maniskill_tomato.sensing.measurement import Measurement, Position
 from maniskill_tomato.sensing.observation import ViewpointObserver
 from maniskill_tomato.sensing.occlusion_memory import CELL_SIZE
+from maniskill_tomato.sensing.perception_kinds import MAP_NOISE
 from maniskill_tomato.sensing.posed_frame import PosedFrame
-
-MAP_NOISE: Final = 0.03
-"""Standard deviation of each coordinate of a place that a map of the row gives, in [m]."""
 
 RECENTRE: Final = CELL_SIZE / 4
 """Memory and rays are centred anew when the target turns out to be farther than this from their centre, in [m]."""

@@ -14,8 +14,6 @@ from dataclasses import dataclass, field
 from typing import Final
 
 import numpy as np
-from scipy.optimize import linear_sum_assignment
-from scipy.stats import chi2
 
 from maniskill_tomato.robot.d435 import CameraIntrinsics
 from maniskill_tomato.segmentation.masks import BinaryMask
@@ -23,11 +21,12 @@ from maniskill_tomato.sensing.measurement import DetectedFruit, Measurement, Pos
 from maniskill_tomato.sensing.visible_fraction.estimate import Float64
 from maniskill_tomato.sensing.visible_fraction.sphere import SphereConfig, round_outline, whole_silhouette
 
-GATE: Final = float(chi2.ppf(0.9995, 4))
-"""Largest squared Mahalanobis distance of a detection from the track that it is assigned to."""
+GATE: Final = 19.997355
+"""Largest squared Mahalanobis distance of a detection from the track that it is assigned to: 99.95 % of chi-square
+with four degrees of freedom."""
 
-MERGE_GATE: Final = float(chi2.ppf(0.99, 4))
-"""Largest squared Mahalanobis distance of two tracks that are merged."""
+MERGE_GATE: Final = 13.276704
+"""Largest squared Mahalanobis distance of two tracks that are merged: 99 % of it."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -336,6 +335,8 @@ class FruitMap:
                 shown = shown_share(track, measurement)
                 for row in near:
                     gains[row, column] = self._gain(track, measurement.fruits[row], camera, shown)
+        from scipy.optimize import linear_sum_assignment  # Slow to load, and only maps need it.
+
         rows, columns = linear_sum_assignment(np.maximum(gains, 0.0), maximize=True)
         numbers: list[int | None] = [None] * len(measurement.fruits)
         for row, column in zip(rows, columns, strict=True):

@@ -149,8 +149,17 @@ class Inspection:
         self._views = self._lost = self._stale = 0
         self._most = 0.0
 
-    def take_in(self, fruits: FruitMap, view: MappedView) -> list[int]:
-        """Takes in a view that the map has taken in; returns the ripe tracks that are fully seen by it first."""
+    def take_in(self, fruits: FruitMap, view: MappedView, is_on_the_way: bool = False) -> list[int]:
+        """Takes in a view that the map has taken in.
+
+        Args:
+            fruits: The map.
+            view: Its last view.
+            is_on_the_way: Whether the camera looks at nothing yet, so that not to see the target is no bad sign.
+
+        Returns:
+            The ripe tracks that are fully seen by it first.
+        """
         before = {number for number in self._best if self.is_full(number)}
         self._follow_merged(fruits)
         frame = view.measurement.frame
@@ -178,17 +187,22 @@ class Inspection:
                     shown_fruit=frame.shown_fruit(mask),
                 )
         self._unscanned = {k for k in self._unscanned if not self._shows(frame, k)}
-        target = None if self.aim is None else self.aim.track
-        self._lost = 0 if target is None or target in view.tracks else self._lost + 1
-        shown = 0.0 if target is None or target not in self._best else self._best[target].fraction
-        self._stale = 0 if shown > self._most + 0.02 else self._stale + 1
-        self._most = max(self._most, shown)
+        if not is_on_the_way:
+            self._count(view)
         self._views += 1
         return [
             number
             for number in self._best
             if number not in before and self.is_full(number) and fruits.tracks[number].is_ripe
         ]
+
+    def _count(self, view: MappedView) -> None:
+        """Counts the views that do not show the target, or no more of it."""
+        target = None if self.aim is None else self.aim.track
+        self._lost = 0 if target is None or target in view.tracks else self._lost + 1
+        shown = 0.0 if target is None or target not in self._best else self._best[target].fraction
+        self._stale = 0 if shown > self._most + 0.02 else self._stale + 1
+        self._most = max(self._most, shown)
 
     def is_full(self, number: int) -> bool:
         """Whether a view has shown a track fully."""

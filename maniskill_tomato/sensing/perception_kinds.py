@@ -20,3 +20,6 @@ fruit that it does not see fully yet."""
 
 Association = Literal["map", "truth"]
 """Who says which track a detection belongs to: the fruit map, or the simulator."""
+
+MAP_NOISE: Final = 0.03
+"""Standard deviation of each coordinate of a place that a map of the row gives, in [m]."""

@@ -133,22 +133,30 @@ class ViewLattice:
         Returns:
             Shape (B, K), bool.
         """
+        return self._reached(target_position, enough=self.size)
+
+    def in_reach(self, target_position: Tensor) -> Tensor:
+        """Which targets the arm can look at from `REACHABLE_SHARE` of the candidates. Shape (B, 3) to (B,), bool."""
+        enough = math.ceil(REACHABLE_SHARE * self.size)
+        return self._reached(target_position, enough).sum(dim=-1) >= enough
+
+    def _reached(self, target_position: Tensor, enough: int) -> Tensor:
+        """As `reachable`, but asks about each target only until so many candidates are reached."""
         targets = target_position.double().repeat_interleave(self.size, dim=0)
         positions = self.positions(target_position.double()).reshape(-1, 3)
-        reached = torch.zeros(len(positions), dtype=torch.bool, device=self.device)
+        reached = torch.zeros(len(target_position), self.size, dtype=torch.bool, device=self.device)
         reference = torch.zeros(len(positions), NUM_JOINTS, dtype=torch.float64, device=self.device)
         upright = look_at_pose(positions, targets)
         for T_upright_flange in self._rolled_flanges:
             T_base_flange = upright @ T_upright_flange
-            # What is known to be reached is sent out of reach, where the solver takes no time.
-            T_base_flange[reached, 0, 3] = _FAR_AWAY
+            # What need not be asked is sent out of reach, where the solver takes little time.
+            known = reached | (reached.sum(dim=-1, keepdim=True) >= enough)
+            if bool(known.all()):
+                break
+            T_base_flange[known.view(-1), 0, 3] = _FAR_AWAY
             solution = self._inverse_kinematics.solve(T_base_flange, reference, neighbour=False)
-            reached |= solution.reach == Reach.REACHABLE
-        return reached.view(-1, self.size)
-
-    def in_reach(self, target_position: Tensor) -> Tensor:
-        """Which targets the arm can look at from `REACHABLE_SHARE` of the candidates. Shape (B, 3) to (B,), bool."""
-        return self.reachable(target_position).float().mean(dim=-1) >= REACHABLE_SHARE
+            reached |= (solution.reach == Reach.REACHABLE).view(-1, self.size)
+        return reached
 
     def _neighbours(self) -> Tensor:
         steps = torch.stack(

@@ -21,6 +21,8 @@ class TomatoViewpointGuidedEnv(TomatoEnv):
 
     **Options** of both thesis tasks: `ThesisOptions`. `reset(options=...)` also takes `target` (index of a ripe fruit
     in `Plant.fruits`) and `viewpoint` (x, y, z, roll, pitch, yaw of the start), for all environments being reset.
+    With `perception` target, V_f, reward and success are what a camera measures; the target is chosen when it is first
+    seen.
 
     **Observation** (`state`, 9 numbers, world frame): end-effector x, y, z [m], roll, pitch, yaw [rad],
     target x, y, z [m].

@@ -9,8 +9,8 @@ from maniskill_tomato.robot.kinematics import link_transforms
 from maniskill_tomato.sensing.inspection import InspectedFruit, Inspection
 from maniskill_tomato.sensing.inspection_judge import JudgedFruit, judge_fruits
 from maniskill_tomato.sensing.view_lattice import ViewLattice
-from maniskill_tomato.tasks.row.senses import CameraSenses, ViewMeasurement, ViewPoses
 from maniskill_tomato.tasks.row.target_sequence import TargetSequence, Transits
+from maniskill_tomato.tasks.senses import CameraSenses, ViewMeasurement, ViewPoses
 from maniskill_tomato.tasks.world import World
 
 

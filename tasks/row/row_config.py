@@ -1,45 +1,14 @@
 """What tells the general tasks apart: plants never seen before, hard starts, a reward that does not pay for waiting."""
 
 from dataclasses import dataclass, replace
-from typing import get_args
 
 from torch import Tensor
 
 from maniskill_tomato.errors import InvalidInputError
 from maniskill_tomato.plants.spec import ROW_PLANT, PlantPose, PlantSpec
-from maniskill_tomato.sensing.camera_perception import MAP_NOISE
-from maniskill_tomato.sensing.perception_kinds import Association, Naming
 from maniskill_tomato.tasks import MAX_GENERAL_STEPS
 
 Range = tuple[float, float]
-
-
-@dataclass(frozen=True, kw_only=True)
-class CameraConfig:
-    """How a robot that sees through a camera is told its target."""
-
-    target: Naming = "track"
-    """See `Naming`."""
-    map_noise: float = MAP_NOISE
-    """With `map`: standard deviation of each coordinate of the place that is given, in [m]."""
-    association: Association = "map"
-    """Who says which track a detection belongs to; `truth` to tell what identity costs."""
-
-    def __post_init__(self) -> None:
-        for name, value, allowed in (
-            ("target", self.target, get_args(Naming)),
-            ("association", self.association, get_args(Association)),
-        ):
-            if value not in allowed:
-                raise InvalidInputError.choice(name, value, allowed)
-        if not 0.0 <= self.map_noise <= LARGEST_MAP_NOISE:
-            raise InvalidInputError(
-                f"map_noise must be from 0 to {LARGEST_MAP_NOISE} m; got {self.map_noise!r}"
-            )
-
-
-LARGEST_MAP_NOISE = 0.5
-"""In [m]."""
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -12,7 +12,6 @@ from torch import Tensor
 
 from maniskill_tomato.plants.episode_list import Episode
 from maniskill_tomato.plants.row import Row
-from maniskill_tomato.robot.kinematics import link_transforms
 from maniskill_tomato.robot.look_at import camera_to_viewpoint
 from maniskill_tomato.robot.rotations import FORWARD_RPY
 from maniskill_tomato.robot.transit import TRANSIT_MOVES
@@ -25,18 +24,21 @@ from maniskill_tomato.tasks.arm_moves import Plan
 from maniskill_tomato.tasks.row.episode_selection import EpisodeChoice
 from maniskill_tomato.tasks.row.hidden_starts import HardStarts, Start, StartRequest
 from maniskill_tomato.tasks.row.inspecting import InspectedSequence, InspectingSenses
-from maniskill_tomato.tasks.row.row_config import CameraConfig, GeneralTaskConfig
-from maniskill_tomato.tasks.row.senses import (
+from maniskill_tomato.tasks.row.row_config import GeneralTaskConfig
+from maniskill_tomato.tasks.row.target_sequence import TargetSequence, Transits, with_transits
+from maniskill_tomato.tasks.senses import (
+    CameraConfig,
     CameraSenses,
     ExactSenses,
     Senses,
     ViewMeasurement,
     ViewPoses,
+    camera_info,
     check_pictures,
+    new_view,
+    remembered_views,
 )
-from maniskill_tomato.tasks.row.target_sequence import TargetSequence, Transits, with_transits
 from maniskill_tomato.tasks.world import World
-from maniskill_tomato.tasks.world_state import MAX_VIEWS
 
 
 class SearchGame:
@@ -300,19 +302,7 @@ class SearchGame:
 
     def _look(self, mask: Tensor | None) -> None:
         """Looks from where the arms stand and takes the view into the memory, once for every view."""
-        world, state = self._world, self._world.state
-        rows = torch.arange(world.num_envs, device=world.device) if mask is None else mask.nonzero()[:, 0]
-        state.views[rows, state.view_count[rows].clamp_max(MAX_VIEWS - 1)] = state.qpos[rows]
-        view = ViewPoses(
-            T_w_camera=world.T_w_camera,
-            T_w_links=world.T_w_links,
-            qpos=state.qpos,
-            look=state.looks.clone(),
-            mask=mask,
-        )
-        state.view_count[rows] += 1
-        state.looks[rows] += 1
-        self._sense(view)
+        self._sense(new_view(self._world, mask))
 
     def _sense(self, view: ViewPoses) -> None:
         """Senses one view of some environments and observes it."""
@@ -333,23 +323,10 @@ class SearchGame:
 
     def recall(self, env_idx: Tensor) -> None:
         """Looks again from where some environments looked, so that all is known of their targets that was known."""
-        state = self._world.state
         self._senses.recall_targets(env_idx)
         self._observer.begin(env_idx, self.known_target()[env_idx])
-        chosen = self._mask(env_idx)
-        count = state.view_count.clamp_max(MAX_VIEWS)
-        for k in range(int(count[env_idx].max())):
-            qpos = state.views[:, k]
-            T_w_links = link_transforms(qpos)
-            self._sense(
-                ViewPoses(
-                    T_w_camera=self._world.camera_poses(T_w_links),
-                    T_w_links=T_w_links,
-                    qpos=qpos,
-                    look=state.looks - state.view_count + k,
-                    mask=chosen & (k < count),
-                )
-            )
+        for view in remembered_views(self._world, env_idx):
+            self._sense(view)
 
     # ---------------------------------------------------------------- outcome
 
@@ -383,14 +360,7 @@ class SearchGame:
             "path_length": state.path_length.clone(),
         }
         if self._is_camera:
-            info["true_visible_fraction"] = measured.true_fraction.clone()
-            info["true_success"] = measured.true_fraction > self.task.full_visibility
-            assert measured.chosen_fraction is not None and measured.chosen_fruit is not None
-            assert measured.named is not None
-            info["told_visible_fraction"] = measured.told_fraction.clone()
-            info["chosen_visible_fraction"] = measured.chosen_fraction.clone()
-            info["chosen_fruit"] = measured.chosen_fruit.clone()
-            info["target_named"] = measured.named.clone()
+            info |= camera_info(measured, self.task.full_visibility)
         if self.sequence is not None:
             info["success"] = self.sequence.is_success()
             over = self.sequence.is_over() | (state.moves >= MAX_ROW_STEPS)

@@ -7,8 +7,20 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from maniskill_tomato.errors import InvalidInputError
 from maniskill_tomato.robot.inverse_kinematics import Reach
+from maniskill_tomato.sensing.perception_kinds import Perception
 from maniskill_tomato.tasks.arm_moves import Plan
+from maniskill_tomato.tasks.senses import (
+    CameraConfig,
+    CameraSenses,
+    ViewMeasurement,
+    ViewPoses,
+    camera_info,
+    check_pictures,
+    new_view,
+    remembered_views,
+)
 from maniskill_tomato.tasks.thesis.starts import Starts
 from maniskill_tomato.tasks.thesis.thesis_config import ViewpointTaskConfig
 from maniskill_tomato.tasks.thesis.thesis_rewards import in_forbidden_zone
@@ -19,16 +31,40 @@ class ThesisGame:
     """One class for both tasks; a `ViewpointTaskConfig` tells them apart."""
 
     keeps_belief = False
-    saved_columns: tuple[str, ...] = ("viewpoint", "reach", "target", "plant_pose", "plant_seed")
 
-    def __init__(self, world: World, task: ViewpointTaskConfig, other_targets: int = 0) -> None:
+    def __init__(
+        self,
+        world: World,
+        task: ViewpointTaskConfig,
+        other_targets: int = 0,
+        perception: Perception = "ground_truth",
+        camera: CameraConfig | None = None,
+    ) -> None:
         """Plays in a world.
 
         Args:
             world: The plants and arms.
             task: Starts, thresholds and rewards.
             other_targets: How many other ripe fruits are judged at every step as if each were the target.
+            perception: Where V_f, what is seen and the target's position come from. With a camera the target is the
+                largest ripe fruit of the first picture that shows one (Algorithm 2).
+            camera: How a camera tells fruits apart; None without one.
         """
+        self.saved_columns: tuple[str, ...] = ("viewpoint", "reach", "target", "plant_pose", "plant_seed")
+        self._camera: CameraSenses | None = None
+        if perception != "ground_truth":
+            assert camera is not None
+            check_pictures(perception, world)
+            self._camera = CameraSenses(world, perception, camera, full_visibility=1.0)
+            self.saved_columns += (
+                "views",
+                "view_count",
+                "looks",
+                "noise_seed",
+                "hidden_below",
+                "targets_begun",
+            )
+        self._measured: ViewMeasurement | None = None
         self.task = task
         self._world = world
         self._other_targets = other_targets
@@ -48,6 +84,10 @@ class ThesisGame:
         ripe = [world.plant_batch.ripe_fruits[i] for i in indices]
         targets = [int(fruits[rng.randint(len(fruits))]) for fruits, rng in zip(ripe, rngs, strict=True)]
         if "target" in options:
+            if self._camera is not None:
+                raise InvalidInputError(
+                    "the reset option target is for ground truth; a robot with a camera chooses its target itself"
+                )
             targets = [world.checked_target(i, options["target"]) for i in indices]
         if "viewpoint" in options:
             viewpoint, qpos = self._starts.given(options["viewpoint"], len(indices))
@@ -55,11 +95,29 @@ class ThesisGame:
             viewpoint, qpos = self._starts.draw(rngs)
         world.set_target(env_idx, targets)
         world.set_arm(env_idx, qpos, viewpoint)
-        self.recall(env_idx)
+        if self._camera is None:
+            self.recall(env_idx)
+        else:
+            self._begin_camera(self._camera, env_idx, rngs)
+
+    def _begin_camera(
+        self, camera: CameraSenses, env_idx: Tensor, rngs: Sequence[np.random.RandomState]
+    ) -> None:
+        world, state = self._world, self._world.state
+        for i, rng in zip(env_idx.tolist(), rngs, strict=True):
+            camera.begin(i, rng, 0.0)
+        for count in (state.looks, state.targets_begun, state.view_count):
+            count[env_idx] = 0
+        state.views[env_idx] = 0.0
+        camera.begin_targets(env_idx)
+        state.targets_begun[env_idx] = 1
+        mask = torch.zeros(world.num_envs, dtype=torch.bool, device=world.device)
+        mask[env_idx] = True
+        self._measure(camera, new_view(world, mask))
 
     def known_target(self) -> Tensor:
-        """Where the targets are, world frame, in [m]. Shape (N, 3)."""
-        return self._world.target_position_w
+        """Where the targets are, or where a camera located or seeks them, world frame, in [m]. Shape (N, 3)."""
+        return self._world.target_position_w if self._camera is None else self._camera.known_target()
 
     def amend(self, plan: Plan, action: Tensor) -> Plan:
         """The plan as it is."""
@@ -67,11 +125,19 @@ class ThesisGame:
 
     def look(self, before: Tensor, plan: Plan | None) -> Plan | None:
         """Looks at the targets; a step is one look."""
-        self._look()
+        if self._camera is None:
+            self._look()
+        else:
+            self._measure(self._camera, new_view(self._world, None))
         return None
 
     def recall(self, env_idx: Tensor) -> None:
-        """Looks from where the arms are."""
+        """Looks from where the arms are; with a camera from where they looked, so that all is known that was known."""
+        if self._camera is not None:
+            self._camera.recall_targets(env_idx)
+            for view in remembered_views(self._world, env_idx):
+                self._measure(self._camera, view)
+            return
         if self._other_targets:
             self._others, self._others_exist = _other_ripe_fruits(
                 self._world.plant_batch.ripe_fruits, self._world.state.target, self._other_targets
@@ -80,19 +146,33 @@ class ThesisGame:
 
     def _look(self) -> None:
         state = self._world.state
-        self._view = self._judge(state.target)
+        self._view = self._judge_truth(state.target)
         state.visible_fraction = self._view["visible_fraction"]
         if self._other_targets:
-            self._views_of_others = [self._judge(fruit) for fruit in self._others.unbind(-1)]
+            self._views_of_others = [self._judge_truth(fruit) for fruit in self._others.unbind(-1)]
 
-    def _judge(self, target: Tensor) -> dict[str, Tensor]:
+    def _measure(self, camera: CameraSenses, view: ViewPoses) -> None:
+        """Takes in a camera's view of some environments."""
+        measured, _ = camera.look(view)
+        if view.mask is not None and self._measured is not None:
+            measured = measured.where(view.mask, self._measured)
+        self._measured = measured
+        self._world.state.visible_fraction = measured.visible_fraction
+        self._view = self._judge(
+            measured.visible_fraction, measured.told_fraction > 0.0, camera.ripe_detected
+        ) | camera_info(measured, self.task.full_visibility)
+
+    def _judge_truth(self, target: Tensor) -> dict[str, Tensor]:
         """The present view as one of `target`, indices in `Plant.fruits`. Shape (N,)."""
-        world, state = self._world, self._world.state
+        world = self._world
         seen = world.scene.visibility(
             world.T_w_camera, target, world.plant_batch.T_world_plant, world.T_w_links
         )
-        fraction, tomato_seen = seen.visible_fraction, seen.any_visible
-        target_seen = fraction > 0.0
+        return self._judge(seen.visible_fraction, seen.visible_fraction > 0.0, seen.any_visible)
+
+    def _judge(self, fraction: Tensor, target_seen: Tensor, tomato_seen: Tensor) -> dict[str, Tensor]:
+        """A view by V_f, whether the target is seen, and whether any ripe tomato is. Each of shape (N,)."""
+        state = self._world.state
         forbidden = in_forbidden_zone(state.viewpoint[:, :3])
         unreachable = state.reach == int(Reach.UNREACHABLE)
         fail = unreachable if self.task.outside_workspace == "end" else torch.zeros_like(unreachable)
@@ -119,7 +199,7 @@ class ThesisGame:
         return {
             "ee_position": viewpoint[:, :3].clone(),
             "ee_rpy": viewpoint[:, 3:].clone(),
-            "target_position": self._world.target_position_w.clone(),
+            "target_position": self.known_target().clone(),
         }
 
     def info(self) -> dict[str, Tensor]:

@@ -12,21 +12,22 @@ import torch
 from maniskill_tomato.deploy.clock import SimulatedClock
 from maniskill_tomato.deploy.deploy_errors import ProfileError
 from maniskill_tomato.deploy.inspection_run import inspect_row, whole_row
-from maniskill_tomato.deploy.interface import Float64
-from maniskill_tomato.deploy.loop import TASK, Loop, default_policy
+from maniskill_tomato.deploy.interface import ArmState, Float64
+from maniskill_tomato.deploy.loop import REPLANS, TASK, Loop, default_policy
 from maniskill_tomato.deploy.mock.episode import load_episode
 from maniskill_tomato.deploy.policy_run import RunConfig
 from maniskill_tomato.deploy.profile import Profile, load_profile, parse_profile
-from maniskill_tomato.deploy.row_goal import WholeRow, cut_way
-from maniskill_tomato.deploy.run_records import KeptSteps, Mode, RunResult
+from maniskill_tomato.deploy.row_goal import WholeRow
+from maniskill_tomato.deploy.run_records import KeptSteps, Mode, RunResult, Step
 from maniskill_tomato.deploy.run_replay import load_recording, replay
 from maniskill_tomato.deploy.stops import Stops
+from maniskill_tomato.deploy.way import Way, WayPlanner, cut_way
 from maniskill_tomato.deploy.workcell import Workcell, make_workcell
 from maniskill_tomato.errors import InvalidInputError
 from maniskill_tomato.policies.opening import open_policy
 from maniskill_tomato.robot.iiwa14 import READY_QPOS
 from maniskill_tomato.robot.kinematics import forward_kinematics
-from maniskill_tomato.robot.transit import TRANSIT_MOVES, Transit, TransitPlanner
+from maniskill_tomato.robot.transit import TRANSIT_MOVES, TransitPlanner
 
 SEED = 1
 
@@ -132,56 +133,75 @@ def test_a_dry_run_of_an_inspection_sends_nothing() -> None:
 
 
 def a_way(monkeypatch: pytest.MonkeyPatch, *turns: float) -> None:
-    """Every turn to another fruit is a transit whose waypoints turn joint 1 so far from the start, in [rad]."""
+    """No fruit can be looked at from where the arm is, and every way turns joint 1 so far from there, in [rad]."""
 
-    def to_first_view(self: Any, qpos: Any, position: Any, places: Any, target: Any) -> Transit:
-        waypoints = qpos.repeat(len(turns) + 1, 1)
-        waypoints[1:, 0] += torch.tensor(turns, dtype=waypoints.dtype)
-        return Transit(waypoints=waypoints, T_world_camera=torch.eye(4, dtype=torch.float64), place=0)
+    def to_view(self: Any, places: Any, target: Any, state: ArmState, *others: Any) -> Way:
+        pieces = [state.joint_positions + np.array([turn, 0, 0, 0, 0, 0, 0]) for turn in turns]
+        return Way(pieces=tuple(pieces), place=0 if turns else None, blocked=())
 
-    monkeypatch.setattr(TransitPlanner, "to_first_view", to_first_view)
+    monkeypatch.setattr(TransitPlanner, "can_turn", lambda *_: False)
+    monkeypatch.setattr(WayPlanner, "to_view", to_view)
 
 
-def test_a_refused_transit_gives_its_target_up(monkeypatch: pytest.MonkeyPatch) -> None:
+def assert_never_again(steps: list[Step]) -> None:
+    for k, step in enumerate(steps):
+        others = [other.target_position for other in steps[:k]]
+        assert all(np.linalg.norm(step.target_position - other) > 0.01 for other in others), "never again"
+
+
+def test_a_way_whose_first_piece_the_arm_refuses_gives_its_target_up(monkeypatch: pytest.MonkeyPatch) -> None:
     a_way(monkeypatch, 0.02)
     naks = TEXT.replace("height = 160", 'height = 160\nfaults = { arm = "refuse" }')
     result, goal, kept, workcell = goes(parse_profile(naks, Path("test.toml")), 9)
     assert (result.reason, result.moves, result.refused_moves) == ("budget", 9, 5), result.detail
     pieces = [step for step in kept.steps if step.outcome == "refused" and step.action is None]
     assert len(pieces) == 4, "no moves are left for a fifth"
-    for k, step in enumerate(pieces):
-        others = [other.target_position for other in pieces[:k]]
-        assert all(np.linalg.norm(step.target_position - other) > 0.01 for other in others), "never again"
+    assert_never_again(pieces)
     assert len(goal.view_joints) == 1, "a view that stays the same is not taken in again"
 
 
-def test_a_transit_that_is_refused_half_way_ends_there(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_target_to_which_there_is_no_way_is_given_up_for_one_move(monkeypatch: pytest.MonkeyPatch) -> None:
+    a_way(monkeypatch)
+    result, _, kept, _ = goes(profile(), 3)
+    assert (result.reason, result.moves, result.refused_moves) == ("budget", 3, 2), result.detail
+    ways = [step for step in kept.steps if step.action is None and step.outcome == "refused"]
+    assert len(ways) == 2, "no moves are left for a third"
+    assert all("no way" in step.detail for step in ways)
+    assert_never_again(ways)
+
+
+def test_a_way_that_pictures_show_to_be_unsafe_is_planned_anew_then_given_up(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     a_way(monkeypatch, 9.0)
-    _, goal, kept, _ = goes(profile(), 3)
-    number = next(k for k, step in enumerate(kept.steps) if step.outcome == "refused")
-    refused, before, after = kept.steps[number], kept.steps[:number], kept.steps[number + 1 :]
-    assert refused.action is None and [step.outcome for step in before] == ["moved"] * number
-    assert number >= 1 and after
-    for step in after:
-        assert np.linalg.norm(step.target_position - refused.target_position) > 0.01
-    np.testing.assert_allclose(goal.view_joints[1], refused.joint_positions, atol=1e-6)
+    result, goal, kept, _ = goes(profile(), 3)
+    refused = [step for step in kept.steps if step.outcome == "refused"]
+    assert [step.outcome for step in kept.steps[: REPLANS + 2]] == ["refused"] * (REPLANS + 2)
+    assert all(step.action is None and "joint_limit" in step.detail for step in refused[: REPLANS + 2])
+    assert np.ptp([step.target_position for step in refused[: REPLANS + 2]], axis=0).max() == 0.0
+    after = kept.steps[REPLANS + 2]
+    assert np.linalg.norm(after.target_position - refused[0].target_position) > 0.01
+    assert result.moves == 3 and all(
+        np.abs(joints - refused[0].joint_positions).max() < 2.0 for joints in goal.view_joints
+    )
 
 
-def test_a_transit_counts_as_two_moves_and_its_views_are_not_mapped(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_way_counts_as_two_moves_and_its_views_are_mapped(monkeypatch: pytest.MonkeyPatch) -> None:
     a_way(monkeypatch, 0.02, 0.04, 0.06)
     result, goal, kept, _ = goes(profile(), 4)
     first = kept.steps[:4]
     assert [step.outcome for step in first[:3]] == ["moved"] * 3
     assert [step.action is None for step in first] == [True, True, True, False]
+    turned = [0.02, 0.04, 0.06]
     np.testing.assert_allclose(
         np.stack([step.commanded for step in first[:3] if step.commanded is not None])[:, 0]
         - first[0].joint_positions[0],
-        [0.02, 0.04, 0.06],
+        turned,
         atol=1e-9,
     )
     assert [step.moves_left for step in first[:3]] == [2, 2, 2] and first[3].moves_left == 4 - TRANSIT_MOVES
-    mapped = np.stack(goal.view_joints)[:, 0]
-    assert np.abs(mapped - (first[0].joint_positions[0] + 0.02)).min() > 0.005
+    mapped = np.stack(goal.view_joints)[:4, 0]
+    np.testing.assert_allclose(mapped - first[0].joint_positions[0], [0.0, *turned], atol=1e-6)
     assert result.moves == 4
 
 

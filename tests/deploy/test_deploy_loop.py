@@ -21,6 +21,7 @@ from maniskill_tomato.deploy.guarded_arm import GuardedArm
 from maniskill_tomato.deploy.interface import Frame, JointMove
 from maniskill_tomato.deploy.loop import TASK, Loop, default_policy
 from maniskill_tomato.deploy.mock.episode import load_episode
+from maniskill_tomato.deploy.move_choice import Choice, MoveChooser, MoveRequest
 from maniskill_tomato.deploy.profile import Profile, load_profile, parse_profile
 from maniskill_tomato.deploy.profile_files import profile_names
 from maniskill_tomato.deploy.robot_perception import TRUE_MASKS, ImagePerception, Sighting
@@ -139,6 +140,39 @@ def test_without_depth_the_arm_goes_back_once_and_no_farther() -> None:
     assert not covered.is_fault and covered.moves == 6
     # The same picture, by a map that knows one view more.
     assert covered.visible_fractions[1] == pytest.approx(covered.visible_fractions[3], abs=0.01)
+
+
+def test_from_the_end_of_a_way_in_parts_without_depth_the_arm_goes_back_the_way_it_came(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    aside = np.array([0.1, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0])
+
+    def two_parts(self: Any, request: MoveRequest, *others: Any) -> Choice:
+        first, second = (
+            JointMove(joint_positions=request.joint_positions + k * aside, speed_fraction=0.1) for k in (1, 2)
+        )
+        return Choice(move=first, refusal=None, then=(second,))
+
+    monkeypatch.setattr(MoveChooser, "choose", two_parts)
+    workcell, kept = (
+        make_workcell(profile('faults = { camera = "zero_depth", camera_from_read = 1 }'), EPISODE),
+        KeptSteps(),
+    )
+    sent: list[Any] = []
+    with workcell.arm, workcell.camera, Stops() as stops:
+        arm: Any = workcell.guarded_arm
+        command = arm.command
+
+        def told(move: JointMove, *others: Any) -> JointMove:
+            sent.append(move.joint_positions)
+            done: JointMove = command(move, *others)
+            return done
+
+        monkeypatch.setattr(arm, "command", told)
+        Loop(workcell, open_policy("stay", env_id=TASK), stops, "unattended", [kept]).run()
+    start = kept.steps[0].joint_positions
+    expected = [start + aside, start + 2 * aside, start + aside, start]
+    np.testing.assert_allclose(np.stack(sent), np.stack(expected), atol=1e-6)
 
 
 @pytest.mark.parametrize("fault", ["late", "black", "zero_depth", "wrong_size", "silent"])

@@ -95,14 +95,17 @@ def test_an_exported_policy_makes_the_moves_that_it_makes_in_torch(tmp_path: Pat
     with workcell.arm, workcell.camera, Stops() as stops:
         policy = open_policy(source, env_id=TASK)
         Loop(workcell, policy, stops, "unattended", [kept]).run()
-    assert len(kept.steps) == len(exported) == 6
+    # Five moves; a way to another view takes several looks.
+    assert len(kept.steps) == len(exported) >= 6
     assert any(step.outcome == "moved" for step in kept.steps)
     for step, facts in zip(kept.steps, exported, strict=True):
         assert step.outcome == facts["outcome"]
         np.testing.assert_allclose(step.joint_positions, facts["joint_positions"], atol=1e-4)
+        assert (step.action is None) == (facts["action"] is None)
         if step.action is not None:
             np.testing.assert_allclose(step.action, facts["action"], atol=1e-4)
-    moves = np.array([step.action for step in kept.steps[:-1]])
+    moves = np.array([step.action for step in kept.steps if step.action is not None])
+    assert len(moves) >= 3
     assert np.abs(moves).min() > 1e-3 and np.ptp(moves, axis=0).max() > 1e-3, "it looks at what it sees"
 
 

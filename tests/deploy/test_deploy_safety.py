@@ -218,6 +218,19 @@ def test_a_state_that_is_not_finite_lets_nothing_through(safety: Safety) -> None
     assert refusal is not None and refusal.reason == "not_finite"
 
 
+@pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])
+def test_a_seen_point_that_is_not_finite_lets_nothing_through(safety: Safety, bad: float) -> None:
+    points = np.full((20, 3), 5.0)
+    goal = turned(j1=0.1)
+    assert safety.check(move(goal), state(), 10.0, points_w=points) is None
+    points[7, 1] = bad
+    refusal = safety.check(move(goal), state(), 10.0, points_w=points)
+    assert refusal is not None and refusal.reason == "not_finite" and "1 of the 20 points" in refusal.detail
+    assert safety.stands_in_collision(goal, points)
+    blind = Safety(SafetyConfig(plant_clearance=None))
+    assert blind.check(move(goal), state(), 10.0, points_w=points) is None, "that does not ask for the plant"
+
+
 def test_workspace_and_forbidden_zone_hold_on_the_way_too() -> None:
     goal = turned(j1=0.8)
     flange = forward_kinematics(torch.as_tensor(joint_path(READY_QPOS, goal, 0.02)))[:, :3, 3].numpy()

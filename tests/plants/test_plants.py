@@ -3,7 +3,9 @@
 import ast
 import dataclasses
 import hashlib
+from functools import cache
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -54,6 +56,12 @@ FRUIT_CLASSES = {
     "turning": SemanticClass.FRUIT_TURNING,
     "green": SemanticClass.FRUIT_GREEN,
 }
+
+
+@cache
+def grown(preset: str, seed: int, *arguments: Any, **options: Any) -> Plant:
+    """A plant that several tests look at."""
+    return generate_plant(preset, seed, *arguments, **options)
 
 
 def organs_of(plant: Plant, prefix: str) -> list[Organ]:
@@ -135,7 +143,7 @@ def eye_at(
 @pytest.mark.parametrize(("preset", "count"), [("one_tomato", 1), ("three_tomatoes", 3)])
 def test_plants_of_the_thesis_carry_their_ripe_fruits_on_the_robots_side(preset: str, count: int) -> None:
     for seed in range(10):
-        plant = generate_plant(preset, seed)
+        plant = grown(preset, seed)
         assert len(plant.fruits) == count
         assert {fruit.ripeness for fruit in plant.fruits} == {"ripe"}
         for fruit in plant.fruits:
@@ -144,14 +152,14 @@ def test_plants_of_the_thesis_carry_their_ripe_fruits_on_the_robots_side(preset:
 
 
 def test_one_tomato_hangs_where_the_arm_works() -> None:
-    heights = [float(generate_plant("one_tomato", seed).fruits[0].centre[2]) for seed in range(20)]
+    heights = [float(grown("one_tomato", seed).fruits[0].centre[2]) for seed in range(20)]
     assert min(heights) > 0.68 and max(heights) < 0.87
     assert np.ptp(heights) > 0.05
 
 
 def test_three_tomatoes_hang_at_clearly_different_heights() -> None:
     for seed in range(10):
-        heights = [float(fruit.centre[2]) for fruit in generate_plant("three_tomatoes", seed).fruits]
+        heights = [float(fruit.centre[2]) for fruit in grown("three_tomatoes", seed).fruits]
         np.testing.assert_allclose(heights, [0.62, 0.80, 0.98], atol=0.06)
         assert np.diff(heights).min() > 0.12
 
@@ -159,7 +167,7 @@ def test_three_tomatoes_hang_at_clearly_different_heights() -> None:
 def test_full_plants_carry_every_ripeness_and_ripen_from_below() -> None:
     order = {"green": 0, "turning": 1, "ripe": 2}
     for seed in range(6):
-        plant = generate_plant("full", seed)
+        plant = grown("full", seed)
         assert len(plant.fruits) == sum(make_full_config().fruits_per_truss)
         assert {fruit.ripeness for fruit in plant.fruits} == set(order)
         lower, upper = plant.fruits[:6], plant.fruits[-6:]
@@ -170,14 +178,14 @@ def test_full_plants_carry_every_ripeness_and_ripen_from_below() -> None:
 
 @pytest.mark.parametrize("preset", PRESETS)
 def test_training_plants_stay_under_the_triangle_budget(preset: str) -> None:
-    counts = [len(generate_plant(preset, seed).faces) for seed in range(20)]
+    counts = [len(grown(preset, seed).faces) for seed in range(20)]
     assert max(counts) < 15_000
     assert min(counts) > 3_000
 
 
 def test_the_densest_full_plants_stay_under_the_triangle_budget() -> None:
     # The seeds with the most triangles among the first 300.
-    assert max(len(generate_plant("full", seed).faces) for seed in DENSEST) < 15_000
+    assert max(len(grown("full", seed).faces) for seed in DENSEST) < 15_000
 
 
 @pytest.mark.parametrize("preset", PRESETS)
@@ -198,7 +206,7 @@ def test_the_same_seed_gives_the_same_plant_and_another_seed_another(preset: str
 def test_a_seed_gives_this_plant_on_every_machine(
     preset: str, triangles: str, expected: list[list[float]]
 ) -> None:
-    plant = generate_plant(preset, 3)
+    plant = grown(preset, 3)
     assert triangle_checksum(plant) == triangles
     # Expected to 1e-6 m; processors round the vertices of a plant to 1e-7 m, each in its own way.
     np.testing.assert_allclose(moments(plant), expected, rtol=0.0, atol=1e-6)
@@ -206,7 +214,7 @@ def test_a_seed_gives_this_plant_on_every_machine(
 
 @pytest.mark.parametrize("preset", PRESETS)
 def test_the_picture_level_is_the_same_plant_with_more_triangles(preset: str) -> None:
-    coarse, fine = generate_plant(preset, 2, "training"), generate_plant(preset, 2, "picture")
+    coarse, fine = grown(preset, 2, "training"), grown(preset, 2, "picture")
     assert len(fine.faces) > 5 * len(coarse.faces)
     assert [o.name for o in coarse.organs] == [o.name for o in fine.organs]
     assert [o.semantic_class for o in coarse.organs] == [o.semantic_class for o in fine.organs]
@@ -221,7 +229,7 @@ def test_the_picture_level_is_the_same_plant_with_more_triangles(preset: str) ->
 
 @pytest.mark.parametrize("preset", PRESETS)
 def test_organs_have_unique_names_and_the_class_of_their_kind(preset: str) -> None:
-    plant = generate_plant(preset, 1)
+    plant = grown(preset, 1)
     names = [organ.name for organ in plant.organs]
     assert len(set(names)) == len(names)
     assert names[0] == "stem"
@@ -241,7 +249,7 @@ def test_organs_have_unique_names_and_the_class_of_their_kind(preset: str) -> No
 @pytest.mark.parametrize("detail", ["training", "picture"])
 @pytest.mark.parametrize("preset", PRESETS)
 def test_meshes_are_valid(preset: str, detail: str) -> None:
-    plant = generate_plant(preset, 4, "training" if detail == "training" else "picture")
+    plant = grown(preset, 4, "training" if detail == "training" else "picture")
     for organ in plant.organs:
         for part in organ.parts:
             assert part.material in MATERIALS
@@ -258,7 +266,7 @@ def test_meshes_are_valid(preset: str, detail: str) -> None:
 
 @pytest.mark.parametrize("detail", ["training", "picture"])
 def test_fruits_are_closed_outward_and_inside_their_radius(detail: str) -> None:
-    plant = generate_plant("full", 7, "training" if detail == "training" else "picture")
+    plant = grown("full", 7, "training" if detail == "training" else "picture")
     for fruit in plant.fruits:
         organ = plant.organs[fruit.organ_index]
         mesh = trimesh.Trimesh(organ.vertices, organ.faces, process=True)
@@ -271,7 +279,7 @@ def test_fruits_are_closed_outward_and_inside_their_radius(detail: str) -> None:
 
 
 def test_normals_point_to_the_side_from_which_a_triangle_is_seen() -> None:
-    plant = generate_plant("full", 0)
+    plant = grown("full", 0)
     for organ in plant.organs:
         for part in organ.parts:
             corners = part.vertices.astype(np.float64)[part.faces]
@@ -282,7 +290,7 @@ def test_normals_point_to_the_side_from_which_a_triangle_is_seen() -> None:
 
 
 def test_leaflets_have_both_sides() -> None:
-    for organ in organs_of(generate_plant("full", 0), "leaf_"):
+    for organ in organs_of(grown("full", 0), "leaf_"):
         upper, under = organ.parts[1:]
         assert upper.material.startswith("leaf_upper") and under.material.startswith("leaf_under")
         np.testing.assert_array_equal(upper.vertices, under.vertices)
@@ -318,7 +326,7 @@ def test_internodes_and_trusses_follow_the_sympodial_order() -> None:
 def test_petioles_leave_the_stem_at_the_measured_angle() -> None:
     angles = []
     for seed in range(8):
-        plant = generate_plant("full", seed)
+        plant = grown("full", seed)
         for organ in organs_of(plant, "leaf_")[:6]:
             petiole = organ.parts[0].vertices.astype(np.float64).reshape(-1, 3)
             # Five vertices a ring; the first and last of a ring coincide.
@@ -330,7 +338,7 @@ def test_petioles_leave_the_stem_at_the_measured_angle() -> None:
 
 def test_fruits_hang_below_their_truss_and_clear_of_each_other() -> None:
     for seed in range(6):
-        plant = generate_plant("full", seed)
+        plant = grown("full", seed)
         tops = {o.name: float(o.vertices[:, 2].max()) for o in organs_of(plant, "truss_")}
         counts = make_full_config().fruits_per_truss
         owner = [f"truss_{k:02d}" for k, n in enumerate(counts) for _ in range(n)]
@@ -343,7 +351,7 @@ def test_fruits_hang_below_their_truss_and_clear_of_each_other() -> None:
 
 
 def test_a_calyx_sits_on_top_of_its_fruit() -> None:
-    plant = generate_plant("one_tomato", 3)
+    plant = grown("one_tomato", 3)
     fruit = plant.fruits[0]
     (truss,) = organs_of(plant, "truss_")
     calyx = next(part for part in truss.parts if part.material == "calyx").vertices - fruit.centre
@@ -355,15 +363,13 @@ def test_a_calyx_sits_on_top_of_its_fruit() -> None:
 @pytest.mark.parametrize("preset", PRESETS)
 def test_more_density_means_more_leaf_area_and_zero_means_none(preset: str) -> None:
     for seed in range(3):
-        areas = [
-            leaf_area(generate_plant(preset, seed, leaf_density=d)) for d in (0.0, 0.3, 0.6, 1.0, 1.5, 2.0)
-        ]
+        areas = [leaf_area(grown(preset, seed, leaf_density=d)) for d in (0.0, 0.3, 0.6, 1.0, 1.5, 2.0)]
         assert areas[0] == 0.0
         assert all(np.diff(areas) > 0), areas
 
 
 def test_density_changes_neither_fruits_nor_stem_and_keeps_the_remaining_leaves() -> None:
-    whole, thin = generate_plant("full", 8), generate_plant("full", 8, leaf_density=0.5)
+    whole, thin = grown("full", 8), grown("full", 8, leaf_density=0.5)
     np.testing.assert_array_equal(whole.organs[0].vertices, thin.organs[0].vertices)
     for a, b in zip(whole.fruits, thin.fruits, strict=True):
         np.testing.assert_array_equal(a.centre, b.centre)
@@ -377,7 +383,7 @@ def test_density_changes_neither_fruits_nor_stem_and_keeps_the_remaining_leaves(
 def test_one_tomato_is_hidden_from_the_front_and_seen_whole_from_somewhere() -> None:
     front, best = [], []
     for seed in range(10):
-        plant = generate_plant("one_tomato", seed)
+        plant = grown("one_tomato", seed)
         front.append(visible_fraction(plant, 0, eye_at(plant, 0, 0.0, 0.0, 0.6)))
         views = [(a, e) for a in (-60.0, -45.0, 45.0, 60.0) for e in (-28.0, -12.0)]
         best.append(max(visible_fraction(plant, 0, eye_at(plant, 0, a, e, 0.35)) for a, e in views))
@@ -387,7 +393,7 @@ def test_one_tomato_is_hidden_from_the_front_and_seen_whole_from_somewhere() -> 
 
 
 def test_without_leaves_the_one_tomato_is_seen_from_the_front() -> None:
-    plant = generate_plant("one_tomato", 0, leaf_density=0.0)
+    plant = grown("one_tomato", 0, leaf_density=0.0)
     assert visible_fraction(plant, 0, eye_at(plant, 0, 0.0, 0.0, 0.6)) > 0.9
 
 
@@ -407,7 +413,7 @@ def test_an_unknown_preset_names_the_allowed_ones() -> None:
 @pytest.mark.parametrize("density", [-0.01, 2.01, float("nan"), float("inf")])
 def test_a_density_out_of_range_is_refused(density: float) -> None:
     with pytest.raises(InvalidInputError, match="leaf_density must be a number from 0"):
-        generate_plant("full", 0, leaf_density=density)
+        grown("full", 0, leaf_density=density)
 
 
 def test_bad_seeds_and_details_are_refused() -> None:
@@ -434,7 +440,7 @@ def test_configurations_refuse_contradictions() -> None:
 
 def test_a_configuration_of_ones_own_grows() -> None:
     config = dataclasses.replace(make_config("full"), name="cluster", fruits_per_truss=(8,))
-    plant = generate_plant(config, 0)
+    plant = grown(config, 0)
     assert plant.preset == "cluster"
     assert len(plant.fruits) == 8
 

@@ -14,7 +14,7 @@ from maniskill_tomato.plants.generator import generate_plant
 from maniskill_tomato.plants.organs import Fruit, MeshPart, Organ, Plant, Ripeness, SemanticClass
 from maniskill_tomato.raycast.scene import RayScene
 from maniskill_tomato.raycast.visibility import Visibility
-from maniskill_tomato.raycast.warp_meshes import LinkTriangles
+from maniskill_tomato.raycast.warp_meshes import CACHED_PLANTS, LinkTriangles
 from maniskill_tomato.robot.d435 import (
     CAMERA_NEAR,
     CameraIntrinsics,
@@ -477,15 +477,15 @@ def test_a_replaced_plant_is_seen_in_its_environment_only(device: str) -> None:
 
 
 def test_plants_no_longer_shown_are_let_go() -> None:
-    scene = RayScene([make_plant([(ahead(), "ripe")])], CAMERA, cached_plants=3)
+    scene = RayScene([make_plant([(ahead(), "ripe")])], CAMERA)
     shown = []
-    for _ in range(10):
+    for _ in range(CACHED_PLANTS + 7):
         plant = make_plant([(ahead(), "ripe")])
         shown.append(weakref.ref(plant))
         scene.replace_plants({0: plant})
         del plant
     gc.collect()
-    assert [ref() is not None for ref in shown] == [False] * 7 + [True] * 3
+    assert [ref() is not None for ref in shown] == [False] * 7 + [True] * CACHED_PLANTS
 
 
 def test_input_that_cannot_be_used_is_refused_with_a_reason() -> None:
@@ -497,8 +497,6 @@ def test_input_that_cannot_be_used_is_refused_with_a_reason() -> None:
         RayScene([bare], CAMERA)
     with pytest.raises(InvalidInputError, match="rays_per_side must be at least 2, got 1"):
         RayScene([plant], CAMERA, rays_per_side=1)
-    with pytest.raises(InvalidInputError, match="cached_plants must be at least 1"):
-        RayScene([plant], CAMERA, cached_plants=0)
     with pytest.raises(InvalidInputError, match="'link_0'.*got 'elbow'"):
         RayScene([plant], CAMERA, robot_meshes={"elbow": box((0, 0, 0), (1, 1, 1))})
     scene = RayScene([plant], CAMERA)

@@ -12,7 +12,14 @@ from maniskill_tomato.robot.look_at import look_at_pose
 from maniskill_tomato.segmentation.instances import Instances
 from maniskill_tomato.segmentation.masks import BinaryMask
 from maniskill_tomato.sensing.fruit_detector import FruitDetector
-from maniskill_tomato.sensing.fruit_map import NO_TRACK, FruitMap, MapConfig, outline
+from maniskill_tomato.sensing.fruit_map import (
+    GATE,
+    MERGE_GATE,
+    NO_TRACK,
+    FruitMap,
+    MapConfig,
+    outline,
+)
 from maniskill_tomato.sensing.measurement import DetectedFruit, Measurement
 from maniskill_tomato.sensing.posed_frame import PosedFrame
 from maniskill_tomato.sensing.visible_fraction.sphere import FLATNESS
@@ -150,6 +157,11 @@ def test_detections_are_assigned_jointly_not_one_after_the_other() -> None:
         view(camera, detection(second + 2 * shift, at, 0.4), detection(first + shift, at, 0.4))
     )
     assert after.tracks == before.tracks[::-1]
+
+
+def test_the_gates_are_quantiles_of_chi_square_with_four_degrees_of_freedom() -> None:
+    assert GATE == pytest.approx(chi2.ppf(0.9995, 4), abs=1e-5)
+    assert MERGE_GATE == pytest.approx(chi2.ppf(0.99, 4), abs=1e-5)
 
 
 def test_a_detection_beyond_the_gate_begins_another_track() -> None:

@@ -72,6 +72,10 @@ def test_plants_that_would_never_be_shown_are_refused_with_what_to_do() -> None:
         )
 
 
-def test_a_thesis_task_says_that_it_has_no_camera_perception() -> None:
-    with pytest.raises(InvalidInputError, match=r"has no perception=.*TomatoViewpoint-v1.*it takes.*plant"):
-        gym.make("TomatoViewpointGuided-v1", perception="segmenter", render_backend="none")
+def test_an_option_of_another_task_is_refused_with_the_tasks_that_take_it() -> None:
+    with pytest.raises(
+        InvalidInputError, match=r"has no target=.*TomatoViewpoint-v1.*it takes.*perception.*plant"
+    ):
+        gym.make(
+            "TomatoViewpointGuided-v1", perception="occlusion_model", target="map", render_backend="none"
+        )

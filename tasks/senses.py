@@ -4,8 +4,9 @@ The errors of a view follow from the episode's `noise_seed` and the number of th
 another's, and a view that is looked at again is measured the same.
 """
 
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from typing import Protocol
+from typing import Protocol, get_args
 
 import numpy as np
 import torch
@@ -14,15 +15,15 @@ from torch import Tensor
 
 from maniskill_tomato.errors import InvalidInputError
 from maniskill_tomato.raycast.view_rays import ViewRays
+from maniskill_tomato.robot.kinematics import link_transforms
 from maniskill_tomato.sensing.inspection_judge import NO_FRUIT
 from maniskill_tomato.sensing.observation import ViewpointObserver
-from maniskill_tomato.sensing.perception_kinds import RENDERED, Perception
+from maniskill_tomato.sensing.perception_kinds import MAP_NOISE, RENDERED, Association, Naming, Perception
 from maniskill_tomato.sensing.posed_frame import PosedFrame
 from maniskill_tomato.sensing.sensor_noise import SensorErrors, SensorNoise
 from maniskill_tomato.sensing.simulated_camera import make_camera
-from maniskill_tomato.tasks.row.row_config import CameraConfig
 from maniskill_tomato.tasks.world import World
-from maniskill_tomato.tasks.world_state import NOISE_SEEDS
+from maniskill_tomato.tasks.world_state import MAX_VIEWS, NOISE_SEEDS
 
 VIEWS_A_SEED = 256
 """Views of an episode are fewer than this."""
@@ -97,6 +98,65 @@ class ViewPoses:
         seeds = (noise_seed * VIEWS_A_SEED + self.look % VIEWS_A_SEED).tolist()
         looks = [True] * len(seeds) if self.mask is None else self.mask.tolist()
         return {i: int(seed) for i, (seed, looked) in enumerate(zip(seeds, looks, strict=True)) if looked}
+
+
+def new_view(world: World, mask: Tensor | None) -> ViewPoses:
+    """Counts and remembers a view from where arms stand now.
+
+    Args:
+        world: The arms.
+        mask: Which environments look; all if None. Shape (N,), bool.
+    """
+    state = world.state
+    rows = torch.arange(world.num_envs, device=world.device) if mask is None else mask.nonzero()[:, 0]
+    state.views[rows, state.view_count[rows].clamp_max(MAX_VIEWS - 1)] = state.qpos[rows]
+    view = ViewPoses(
+        T_w_camera=world.T_w_camera,
+        T_w_links=world.T_w_links,
+        qpos=state.qpos,
+        look=state.looks.clone(),
+        mask=mask,
+    )
+    state.view_count[rows] += 1
+    state.looks[rows] += 1
+    return view
+
+
+def remembered_views(world: World, env_idx: Tensor) -> Iterator[ViewPoses]:
+    """The views of the present targets of some environments again, the first ones first. Shape (b,)."""
+    state = world.state
+    count = state.view_count.clamp_max(MAX_VIEWS)
+    chosen = torch.zeros(world.num_envs, dtype=torch.bool, device=world.device)
+    chosen[env_idx] = True
+    for k in range(int(count[env_idx].max())):
+        qpos = state.views[:, k]
+        T_w_links = link_transforms(qpos)
+        yield ViewPoses(
+            T_w_camera=world.camera_poses(T_w_links),
+            T_w_links=T_w_links,
+            qpos=qpos,
+            look=state.looks - state.view_count + k,
+            mask=chosen & (k < count),
+        )
+
+
+def camera_info(measured: ViewMeasurement, full_visibility: float) -> dict[str, Tensor]:
+    """What the infos of a task tell of a camera's view beside V_f: the truth, and which fruit was taken for the target.
+
+    Args:
+        measured: By a camera.
+        full_visibility: V_f above which a fruit is fully visible.
+    """
+    assert measured.chosen_fraction is not None and measured.chosen_fruit is not None
+    assert measured.named is not None
+    return {
+        "true_visible_fraction": measured.true_fraction.clone(),
+        "true_success": measured.true_fraction > full_visibility,
+        "told_visible_fraction": measured.told_fraction.clone(),
+        "chosen_visible_fraction": measured.chosen_fraction.clone(),
+        "chosen_fruit": measured.chosen_fruit.clone(),
+        "target_named": measured.named.clone(),
+    }
 
 
 class Senses(Protocol):
@@ -181,6 +241,34 @@ class ExactSenses:
 
     def revise(self, observer: ViewpointObserver, env_idx: Tensor) -> None:
         """Nothing: where a target is believed to be does not change."""
+
+
+LARGEST_MAP_NOISE = 0.5
+"""In [m]."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class CameraConfig:
+    """How a robot that sees through a camera is told its target."""
+
+    target: Naming = "track"
+    """See `Naming`."""
+    map_noise: float = MAP_NOISE
+    """With `map`: standard deviation of each coordinate of the place that is given, in [m]."""
+    association: Association = "map"
+    """Who says which track a detection belongs to; `truth` to tell what identity costs."""
+
+    def __post_init__(self) -> None:
+        for name, value, allowed in (
+            ("target", self.target, get_args(Naming)),
+            ("association", self.association, get_args(Association)),
+        ):
+            if value not in allowed:
+                raise InvalidInputError.choice(name, value, allowed)
+        if not 0.0 <= self.map_noise <= LARGEST_MAP_NOISE:
+            raise InvalidInputError(
+                f"map_noise must be from 0 to {LARGEST_MAP_NOISE} m; got {self.map_noise!r}"
+            )
 
 
 class CameraSenses:
@@ -346,6 +434,17 @@ class CameraSenses:
         """Makes a fruit that the robot has chosen the one that its episode is judged by, if it is ripe."""
         if fruit in self._world.plant_batch.ripe_fruits[env_index]:
             self._world.set_target(torch.tensor([env_index], device=self._world.device), [fruit])
+
+    @property
+    def ripe_detected(self) -> Tensor:
+        """Whether the last views show a fruit that is believed to be ripe. Shape (N,), bool."""
+        shown = [False] * self._world.num_envs
+        for i in range(len(shown)):
+            last, fruits = self._perception.last_view(i), self._perception.map(i)
+            if last is not None:
+                tracks = (fruits.tracks.get(number) for number in last.tracks)
+                shown[i] = any(track is not None and track.is_ripe for track in tracks)
+        return torch.tensor(shown, device=self._world.device)
 
     def revise(self, observer: ViewpointObserver, env_idx: Tensor) -> None:
         """Reads the kept measurements again."""
