@@ -44,7 +44,7 @@ segmenter = "ground_truth"
 source = "twin"
 [loop]
 max_moves = 5
-threshold = 0.99
+threshold = 0.999
 """
 
 

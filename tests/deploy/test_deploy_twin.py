@@ -103,13 +103,15 @@ def looked(perception: Any, frame: Any, pose: Any, target: Any = None) -> Any:
 def test_masks_and_depth_tell_nearly_what_exact_rays_tell() -> None:
     """The route of hardware against the route of the task, on the same views: labels, distances and V_f agree."""
     agreeing, distances, fractions = [], [], []
-    for seed, noise in ((4, 0.0), (9, 0.0), (4, 1.0), (9, 1.0)):
+    for seed, noise in ((1, 0.0), (9, 0.0), (1, 1.0), (9, 1.0)):
         arm, camera = devices(seed, depth_noise=noise)
         frame = camera.read()
         pose = pose_of(arm)
         target = frame.truth.target_position
         exact = looked(TruthPerception(), frame, pose, target)
         seen = looked(ImagePerception(TRUE_MASKS, None), frame, pose, target)
+        # A fruit that is measured farther from where it is said to be has its rays about another place.
+        np.testing.assert_array_equal(seen.target_position, target)
         same = exact.rays.label == seen.rays.label
         if (
             noise
