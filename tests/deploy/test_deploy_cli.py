@@ -23,8 +23,11 @@ class Blocked:
 
 sys.meta_path.insert(0, Blocked())
 from maniskill_tomato.cli import main
+words = sys.argv[1:]
+cut = words.index("then")
 try:
-    main(sys.argv[1:])
+    main(words[:cut])
+    main(words[cut + 1:])
 finally:
     loaded = sorted(
         name for name in sys.modules
@@ -36,28 +39,23 @@ finally:
 """
 
 
-def test_the_twin_runs_without_sapien_and_maniskill(tmp_path: Path) -> None:
+def test_the_twin_runs_and_inspects_without_sapien_and_maniskill(tmp_path: Path) -> None:
     """Every import of either fails in this process, and none of the simulator's modules is loaded."""
-    command = [sys.executable, "-c", BLOCKED, "deploy", "run", "--profile", "mock", "--seed", "6"]
-    done = subprocess.run([*command, "--out", str(tmp_path)], capture_output=True, text=True, timeout=500)
+    twin = ["--profile", "mock", "--seed", "6", "--out"]
+    run = ["deploy", "run", *twin, str(tmp_path / "run")]
+    inspect = ["deploy", "inspect", *twin, str(tmp_path / "row"), "--max-moves", "2", "--no-record"]
+    command = [sys.executable, "-c", BLOCKED, *run, "then", *inspect]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=500)
     assert done.returncode == 0, done.stderr
     assert "LOADED []" in done.stdout
-    content = json.loads((tmp_path / "result.json").read_text())
+    content = json.loads((tmp_path / "run" / "result.json").read_text())
     assert content["success"] is True and content["reason"] == "success"
     assert content["visible_fraction"] > 0.8 and content["moves"] >= 1 and content["seconds"] > 0.0
-    assert (tmp_path / "report.png").stat().st_size > 10_000
-    assert (tmp_path / "run.mcap").stat().st_size > 10_000
-
-
-def test_an_inspection_runs_without_them_too(tmp_path: Path) -> None:
-    command = [sys.executable, "-c", BLOCKED, "deploy", "inspect", "--profile", "mock", "--seed", "6"]
-    options = ["--max-moves", "2", "--no-record", "--out", str(tmp_path)]
-    done = subprocess.run([*command, *options], capture_output=True, text=True, timeout=500)
-    assert done.returncode == 0, done.stderr
-    assert "LOADED []" in done.stdout
-    content = json.loads((tmp_path / "inspection.json").read_text())
-    assert (content["reason"], content["moves"], content["row_moves"]) == ("budget", 2, 2)
-    for fruit in content["fruits"]:
+    assert (tmp_path / "run" / "report.png").stat().st_size > 10_000
+    assert (tmp_path / "run" / "run.mcap").stat().st_size > 10_000
+    listed = json.loads((tmp_path / "row" / "inspection.json").read_text())
+    assert (listed["reason"], listed["moves"], listed["row_moves"]) == ("budget", 2, 2)
+    for fruit in listed["fruits"]:
         assert {"position_m", "radius_m", "ripeness", "visible_fraction"} <= fruit.keys()
 
 

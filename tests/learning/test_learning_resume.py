@@ -538,7 +538,7 @@ def start(*arguments: str) -> Any:
 
 
 REAL = (
-    *("--total-timesteps", "400", "--learning-starts", "60", "--batch-size", "32"),
+    *("--total-timesteps", "300", "--learning-starts", "60", "--batch-size", "32"),
     *("--checkpoint-every", "41", "--seed", "2"),
 )
 
@@ -569,7 +569,7 @@ def test_a_killed_run_of_the_real_task_ends_as_the_unbroken_one(
     os.kill(process.pid, number)
     process.join(500)
     assert process.exitcode == (-signal.SIGKILL if number == signal.SIGKILL else 0)
-    assert 41 <= load_checkpoint(checkpoints(run_dir)[-1])["counters"]["steps"] < 400
+    assert 41 <= load_checkpoint(checkpoints(run_dir)[-1])["counters"]["steps"] < 300
     assert (run_dir / "policy.pt").exists() == (number != signal.SIGKILL)
     process = start("train", "--resume", str(run_dir))
     process.join(500)

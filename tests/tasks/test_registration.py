@@ -95,7 +95,8 @@ def test_make_works_from_the_module_form_in_a_fresh_process(tmp_path: Path) -> N
         "    assert env.spec.id == env_id, env.spec\n"
         "    env.close()\n"
     )
-    result = run_python(code, tmp_path, *EXPECTED_IDS)
+    # One of each family.
+    result = run_python(code, tmp_path, EXPECTED_IDS[0], EXPECTED_IDS[3])
     assert result.returncode == 0, result.stderr
 
 
