@@ -61,17 +61,29 @@ def keep_renderer_alive() -> object:
 
 
 LONG_FILES = (
-    "test_learning_seeds.py",
     "test_learning_resume.py",
-    "test_cli.py",
-    "test_learning_training.py",
-    "test_examples.py",
     "test_world.py",
+    "test_cli.py",
+    "test_camera_perception.py",
+    "test_learning_seeds.py",
+    "test_deploy_loop.py",
+    "test_plants.py",
     "test_row_env.py",
-    "test_view_quality.py",
     "test_tasks_options.py",
+    "test_tasks_rendered.py",
+    "test_view_quality.py",
+    "test_learning_training.py",
+    "test_deploy_sunrise_loop.py",
+    "test_tasks_state.py",
+    "test_deploy_cli.py",
+    "test_light_segmenter.py",
+    "test_planners.py",
+    "test_examples.py",
+    "test_deploy_inspect.py",
+    "test_inspected_rows.py",
     "test_planners_env.py",
     "test_comparison.py",
+    "test_worker_pool.py",
 )
 """Those that take longest come first, so that no process is left with one of them at the end."""
 

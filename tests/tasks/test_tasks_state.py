@@ -1,5 +1,6 @@
 """Seeds, saved states and ManiSkill's wrappers around the tasks, without a renderer."""
 
+import multiprocessing
 from pathlib import Path
 from typing import Any
 
@@ -130,6 +131,8 @@ def test_async_vector_env_runs_one_environment_per_process() -> None:
         env_id = "maniskill_tomato.tasks:TomatoViewpointGuided-v1"
         return CPUGymWrapper(gymnasium.make(env_id, num_envs=1, obs_mode="state", render_backend="none"))
 
+    # Both processes begin where one has loaded the simulator.
+    multiprocessing.get_context("forkserver").set_forkserver_preload(["mani_skill.envs"])
     env = gym.vector.AsyncVectorEnv([cpu_env, cpu_env], context="forkserver")
     try:
         obs, _ = env.reset(seed=[0, 1])
