@@ -46,7 +46,7 @@ def test_a_camera_chooses_its_target_when_it_first_sees_one_and_measures_it_near
                     errors.append(float(info["told_visible_fraction"][i] - info["true_visible_fraction"][i]))
                     assert bool(info["tomato_seen"][i])
                 sure, told = float(info["visible_fraction"][i]), float(info["told_visible_fraction"][i])
-                assert sure <= told
+                assert sure < told if told > 0.0 else sure == 0.0
     assert len(offsets) >= 4
     assert np.median(offsets) < 0.015 and np.abs(errors).mean() < 0.1
 
@@ -95,7 +95,7 @@ def test_what_a_camera_cannot_know_is_refused() -> None:
         make_world(SPARSE, perception="occlusion_model", other_targets=2)
     with pytest.raises(InvalidInputError, match="association is for a robot that sees through a camera"):
         make_world(SPARSE, association="truth")
-    with pytest.raises(InvalidInputError, match=r"has no target=|an option of TomatoViewpointSparse-v1"):
+    with pytest.raises(InvalidInputError, match="an option of TomatoViewpointSparse-v1"):
         make_world(SPARSE, perception="occlusion_model", target="map")
     with pytest.raises(InvalidInputError, match=r"gymnasium\.make"):
         make_world(SPARSE, perception="segmenter")
