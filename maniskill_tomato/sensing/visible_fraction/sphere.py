@@ -402,7 +402,7 @@ def _cost(circles: Floats, evidence: _Evidence, own: float, focal: float, c: Sph
         """Of each row, halved, no square larger than that."""
         error *= error
         np.minimum(error, 2.0 * largest, out=error)
-        return error.sum(1) * np.float32(0.5 / error.shape[1])
+        return np.asarray(error.sum(1) * np.float32(0.5 / error.shape[1]))
 
     radius_m = circles[:, 2] * np.float32(own / focal)
     cost = 0.5 * (np.log(radius_m / c.radius_m) / c.radius_spread) ** 2
