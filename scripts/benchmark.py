@@ -6,6 +6,7 @@ Usage:
 
 import json
 import logging
+import math
 import os
 import platform
 import statistics
@@ -34,6 +35,7 @@ from maniskill_tomato.robot.d435 import color_intrinsics
 from maniskill_tomato.robot.iiwa14 import JOINT_LOWER, JOINT_UPPER
 from maniskill_tomato.robot.inverse_kinematics import InverseKinematics
 from maniskill_tomato.robot.kinematics import forward_kinematics
+from maniskill_tomato.segmentation.fruit_network import SIZE_MULTIPLE
 from maniskill_tomato.segmentation.instances import Instances
 from maniskill_tomato.segmentation.light_segmenter import FruitSession
 from maniskill_tomato.segmentation.segmenter import make_segmenter
@@ -185,7 +187,8 @@ def look_times(episodes: int, views: int) -> dict[str, Any]:
             perception.rays()
             observed = time.process_time()
             for scale in segmenter.scales:
-                network(torch.zeros(1, 3, round(480 * scale), round(640 * scale)))
+                sides = (math.ceil(side * scale / SIZE_MULTIPLE) * SIZE_MULTIPLE for side in (480, 640))
+                network(torch.zeros(1, 3, *sides))
             spent = np.diff([start, segmented, fitted, mapped, observed, time.process_time()])
             for name, value in zip(times, 1e3 * spent, strict=True):
                 times[name].append(float(value))
