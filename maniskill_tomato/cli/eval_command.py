@@ -48,8 +48,8 @@ class Eval:
     the plants are given."""
 
     perception: str = "ground_truth"
-    """What V_f and the target's position come from: ground_truth, occlusion_model, thesis_model, improved_model or
-    segmenter; the general tasks only."""
+    """What V_f and the target's position come from: ground_truth, occlusion_model, simulated_segmenter,
+    thesis_model, improved_model or segmenter; the general tasks only."""
     target: str | None = None
     """How the target is named to a robot that sees through a camera: track (the default), map or any;
     TomatoViewpoint-v1 only."""

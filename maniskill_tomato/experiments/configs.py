@@ -109,8 +109,9 @@ class RowBenchmarkConfig:
     transits: str = "both"
     """When the arm goes by its ready posture: none, target, refused or both."""
     perception: Perception = "ground_truth"
-    """What the robot knows: ground_truth, or what it sees through a camera (occlusion_model, segmenter, thesis_model or
-    improved_model); it then chooses its targets itself, and its inspection list is judged."""
+    """What the robot knows: ground_truth, or what it sees through a camera (occlusion_model, simulated_segmenter,
+    segmenter, thesis_model or improved_model); it then chooses its targets itself, and its inspection list is
+    judged."""
     jobs: int = 1
     """Processes at a time."""
     out: Path = Path("runs/rows")

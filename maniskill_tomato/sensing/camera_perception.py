@@ -412,9 +412,9 @@ class CameraPerception:
 def _slimmed(view: MappedView) -> MappedView:
     """An earlier view without what only the last one is asked for, its colours and the truth: a row has a hundred."""
     frame = view.measurement.frame
-    if frame.rgb is None and frame.true_fruits is None:
+    if frame.rgb is None and frame.true_fruits is None and frame.told_fruits is None:
         return view
-    frame = replace(frame, rgb=None, true_fruits=None, true_numbers=())
+    frame = replace(frame, rgb=None, true_fruits=None, told_fruits=None, true_numbers=())
     return replace(view, measurement=replace(view.measurement, frame=frame))
 
 

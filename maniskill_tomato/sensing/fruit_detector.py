@@ -40,7 +40,8 @@ class FruitDetector:
         """Keeps both parts.
 
         Args:
-            segmenter: Finds fruits in colours and depth; None takes `PosedFrame.true_fruits`.
+            segmenter: Finds fruits in colours and depth; None takes `PosedFrame.told_fruits`, or where there are none
+                the ripe ones of `PosedFrame.true_fruits`.
             model: Estimates V_f and centre; by default `SphereModel` with the size of the tasks' tomatoes.
         """
         self._segmenter = segmenter
@@ -88,7 +89,7 @@ class FruitDetector:
         scores: NDArray[np.float32],
     ) -> tuple[DetectedFruit, ...]:
         depth = frame.measured_m
-        if self._segmenter is not None:
+        if self._segmenter is not None or frame.told_fruits is not None:
             masks = own_pixels(masks, depth, frame.filled_m)
         rgb = np.zeros((*depth.shape, 3), np.uint8) if frame.rgb is None else frame.rgb
         view = SegmentedImage(
@@ -108,6 +109,8 @@ class FruitDetector:
 
     def _segmented(self, frame: PosedFrame) -> Instances:
         if self._segmenter is None:
+            if frame.told_fruits is not None:
+                return frame.told_fruits
             if frame.true_fruits is None:
                 raise InvalidInputError("perfect masks need a simulated camera; choose a segmenter")
             ripe = [category in RIPE_CATEGORIES for category in frame.true_fruits.categories]

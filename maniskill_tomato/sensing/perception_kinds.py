@@ -2,11 +2,15 @@
 
 from typing import Final, Literal
 
-Perception = Literal["ground_truth", "occlusion_model", "thesis_model", "improved_model", "segmenter"]
+Perception = Literal[
+    "ground_truth", "occlusion_model", "simulated_segmenter", "thesis_model", "improved_model", "segmenter"
+]
 """What reward, observation and the target's position come from.
 
-`occlusion_model`: `SphereModel` on a perfect mask and noisy depth. `thesis_model`, `improved_model`: those models on
-the same and rendered colours. `segmenter`: the light segmenter's masks in rendered colours, then `SphereModel`."""
+`occlusion_model`: `SphereModel` on a perfect mask and noisy depth. `simulated_segmenter`: the same on masks with the
+light segmenter's errors (`sensing.simulated_segmenter`), of fruits of every ripeness. `thesis_model`,
+`improved_model`: those models on perfect masks and rendered colours. `segmenter`: the light segmenter's masks in
+rendered colours, then `SphereModel`."""
 
 RENDERED: Final[tuple[Perception, ...]] = ("thesis_model", "improved_model", "segmenter")
 """Those that need colours, and so a renderer."""

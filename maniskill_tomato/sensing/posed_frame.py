@@ -30,6 +30,8 @@ class PosedFrame:
     """Where the picture shows the robot itself, if that is known. Shape (H, W)."""
     true_fruits: Instances | None = None
     """The fruits that a simulated camera knows to be in the picture, for perfect segmentation."""
+    told_fruits: Instances | None = None
+    """What a simulated segmenter finds in it; a detector without a segmenter takes these."""
     true_numbers: tuple[int, ...] = ()
     """Which these are, as indices in `Plant.fruits`; empty where that is not known."""
 

@@ -1,6 +1,7 @@
 """The wrist cameras of N simulated environments: depth with the D435's faults, and masks or rendered colours."""
 
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Final
 
 import numpy as np
@@ -24,6 +25,7 @@ from maniskill_tomato.sensing.camera_perception import CameraPerception
 from maniskill_tomato.sensing.fruit_detector import FruitDetector
 from maniskill_tomato.sensing.perception_kinds import RENDERED, Perception
 from maniskill_tomato.sensing.posed_frame import PosedFrame
+from maniskill_tomato.sensing.simulated_segmenter import SegmenterErrors, flat_colours, simulated_masks
 from maniskill_tomato.sensing.visible_fraction.estimate import UInt8
 from maniskill_tomato.sensing.visible_fraction.occlusion_models import make_occlusion_model
 
@@ -46,6 +48,7 @@ class SimulatedCamera:
         intrinsics: CameraIntrinsics | None = None,
         noise: DepthNoise | None = None,
         picture: Callable[[int], UInt8] | None = None,
+        errors: SegmenterErrors | None = None,
     ) -> None:
         """Prepares the images.
 
@@ -54,7 +57,9 @@ class SimulatedCamera:
             intrinsics: Of the images; `IMAGE_SIZE` of the colour camera if None.
             noise: Faults of the depth, the defaults if None.
             picture: Renders the colours of an environment by its index, shape (H, W, 3); if None there are none.
+            errors: Of a simulated segmenter, whose pictures have flat colours; if None there is none.
         """
+        self._errors = errors
         self._scene = scene
         self._intrinsics = intrinsics or color_intrinsics(*IMAGE_SIZE)
         self._noise = noise or DepthNoise()
@@ -94,17 +99,26 @@ class SimulatedCamera:
                 exact.astype(np.float64), self._intrinsics, self._noise, generator, stereo=DEPTH_MODE
             )
             fruits, numbers = true_fruits(cast, self._scene.plant(k))
-            frames.append(
-                PosedFrame(
-                    depth_m=depth.astype(np.float32),
-                    intrinsics=self._intrinsics,
-                    T_world_camera=T_world_camera[k].double().cpu().numpy(),
-                    rgb=None if self._picture is None else self._picture(k),
-                    robot_mask=cast.labels == ROBOT_LABEL,
-                    true_fruits=fruits,
-                    true_numbers=numbers,
-                )
+            frame = PosedFrame(
+                depth_m=depth.astype(np.float32),
+                intrinsics=self._intrinsics,
+                T_world_camera=T_world_camera[k].double().cpu().numpy(),
+                rgb=None if self._picture is None else self._picture(k),
+                robot_mask=cast.labels == ROBOT_LABEL,
+                true_fruits=fruits,
+                true_numbers=numbers,
             )
+            if self._errors is not None:
+                shown, pose = self._scene.plant(k).fruits, T_world_plant[k].double().cpu().numpy()
+                told = simulated_masks(
+                    frame,
+                    {j: pose[:3, :3] @ shown[j].centre + pose[:3, 3] for j in numbers},
+                    {j: shown[j].radius for j in numbers},
+                    generator,
+                    self._errors,
+                )
+                frame = replace(frame, told_fruits=told, rgb=flat_colours(frame))
+            frames.append(frame)
         return frames
 
 
@@ -146,7 +160,9 @@ def make_camera(
     if perception in RENDERED:
         camera = SimulatedCamera(scene, intrinsics=intrinsics, picture=picture)
     else:
-        camera = SimulatedCamera(scene)
+        camera = SimulatedCamera(
+            scene, errors=SegmenterErrors() if perception == "simulated_segmenter" else None
+        )
     return camera, CameraPerception(
         scene.num_envs, detector, true_association=true_association, device=scene.device
     )

@@ -86,7 +86,7 @@ def test_every_environment_plays_as_it_would_alone(
 
 
 def test_rows_with_cameras_play_as_they_would_alone() -> None:
-    play_beside_single_worlds(ROW, {**POOL, "perception": "occlusion_model"}, 2)
+    play_beside_single_worlds(ROW, {**POOL, "perception": "simulated_segmenter"}, 2)
 
 
 def play_beside_single_worlds(env_id: str, options: dict[str, Any], num_envs: int) -> None:

@@ -19,6 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from maniskill_tomato.errors import InvalidInputError
+from maniskill_tomato.robot.d435 import CameraIntrinsics
 from maniskill_tomato.segmentation.masks import BinaryMask
 from maniskill_tomato.sensing.visible_fraction.estimate import (
     Estimate,
@@ -102,6 +103,25 @@ def round_outline(up: Float64 | None, ray: Float64) -> Float64:
     direction = across / max(float(np.linalg.norm(across)), 1e-9)
     height = float(np.sqrt(FLATNESS**2 * (1.0 - along**2) + along**2))
     return np.asarray(np.eye(2) + (1.0 / height - 1.0) * np.outer(direction, direction))
+
+
+def silhouette_pixels(centre: Float64, radius: float, intrinsics: CameraIntrinsics, up: Float64) -> float:
+    """Pixels of the outline of a hanging tomato, in the picture or outside.
+
+    Args:
+        centre: In the optical frame, in [m]. Shape (3,).
+        radius: Of its width, in [m].
+        intrinsics: The camera's.
+        up: Unit vector upwards in the optical frame. Shape (3,).
+
+    Returns:
+        Infinity for one that reaches behind the camera.
+    """
+    if centre[2] <= radius:
+        return float("inf")
+    tangent = radius**2 / (centre[2] ** 2 - radius**2)
+    height = 1.0 / float(np.linalg.det(round_outline(up, centre)))
+    return float(np.pi * intrinsics.fx * intrinsics.fy * tangent * height)
 
 
 @dataclass(frozen=True, kw_only=True)
