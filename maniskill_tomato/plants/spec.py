@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 
 from maniskill_tomato.errors import InvalidInputError
 from maniskill_tomato.plants.generator import generate_plant
+from maniskill_tomato.plants.kinds import KINDS, PLANT_NAMES
 from maniskill_tomato.plants.organs import Plant
-from maniskill_tomato.plants.plant_config import PRESETS
 from maniskill_tomato.plants.row import generate_row, leaf_density_of
 
 SEED_SPLITS: dict[str, tuple[int, int]] = {
@@ -34,7 +34,7 @@ class PlantSpec:
     """The identity of a plant, or a rule that draws a new one at every reset."""
 
     preset: str = "one_tomato"
-    """One of `maniskill_tomato.plants.plant_config.PRESETS`."""
+    """One of `maniskill_tomato.plants.kinds.PLANT_NAMES`."""
     seed: int | str = 0
     """The plant's seed, or the name of a split of `SEED_SPLITS`: then each reset draws a seed from it."""
     pool: int | None = None
@@ -50,8 +50,8 @@ class PlantSpec:
     `ROW_NEIGHBOURS` seeds of the same split."""
 
     def __post_init__(self) -> None:
-        if self.preset not in PRESETS:
-            raise InvalidInputError.choice("plant preset", self.preset, PRESETS)
+        if self.preset not in PLANT_NAMES:
+            raise InvalidInputError.choice("plant preset", self.preset, PLANT_NAMES)
         if isinstance(self.seed, str):
             if self.seed not in SEED_SPLITS:
                 raise InvalidInputError(
@@ -121,7 +121,8 @@ class PlantSpec:
         if isinstance(value, PlantSpec):
             return value
         if isinstance(value, str):
-            return replace(default, preset=value)
+            density = None if value in KINDS else default.leaf_density  # Each kind has its own.
+            return replace(default, preset=value, leaf_density=density)
         if isinstance(value, Mapping):
             names = [f.name for f in fields(cls)]
             unknown = sorted(set(value) - set(names))
@@ -130,11 +131,13 @@ class PlantSpec:
                     f"plant has no field {', '.join(map(repr, unknown))}; the fields are {', '.join(names)}"
                 )
             replaced = dict(value)
+            if replaced.get("preset") in KINDS:
+                replaced.setdefault("leaf_density", None)  # Each kind has its own.
             if not isinstance(replaced.get("seed", ""), str):
                 replaced.setdefault("pool", None)  # The default's pool is one of its split.
             return cls(**{**asdict(default), **replaced})
         raise InvalidInputError(
-            f"plant must be None, a preset's name ({', '.join(PRESETS)}) or a mapping of "
+            f"plant must be None, a preset's name ({', '.join(PLANT_NAMES)}) or a mapping of "
             f"{', '.join(f.name for f in fields(cls))}; got {value!r}"
         )
 
