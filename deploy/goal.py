@@ -42,7 +42,7 @@ class Goal(Protocol):
     max_moves: int
     """The most moves for one target: the length of the policy's episodes."""
 
-    def look(self, frame: Frame, T_world_camera: Float64, joints: Float64, moves: int) -> Look | None:
+    def look(self, frame: Frame, T_world_camera: Float64, joints: Float64, moves: int) -> Look:
         """Takes in a picture; once for every look.
 
         Args:
@@ -50,9 +50,6 @@ class Goal(Protocol):
             T_world_camera: Pose of the optical frame when it was taken. Shape (4, 4).
             joints: The arm's then, in [rad]. Shape (7,).
             moves: Moves so far.
-
-        Returns:
-            None if there is no target, and the picture shows none.
 
         Raises:
             PerceptionError: The picture cannot be used.
@@ -91,8 +88,8 @@ class OneFruit:
         Args:
             perception: Turns pictures into sightings.
             config: When the run ends.
-            target_position: Where the target is, world frame, in [m]; None to choose one that the first picture shows.
-                Shape (3,).
+            target_position: Where the target is, world frame, in [m]; None to choose one that a picture shows. Shape
+                (3,).
         """
         self.max_moves = config.max_moves
         self._perception, self._config = perception, config
@@ -102,11 +99,9 @@ class OneFruit:
         self._is_first = True
         perception.begin(target_position)
 
-    def look(self, frame: Frame, T_world_camera: Float64, joints: Float64, moves: int) -> Look | None:
+    def look(self, frame: Frame, T_world_camera: Float64, joints: Float64, moves: int) -> Look:
         """The sighting, and whether it ends the run; see `Goal`."""
         view = self._perception.look(frame, T_world_camera)
-        if view is None:
-            return None
         self._lost_in_a_row = 0 if view.target_seen else self._lost_in_a_row + 1
         is_first, self._is_first = self._is_first, False
         return Look(
@@ -132,12 +127,17 @@ class OneFruit:
             return End(reason="success", detail=f"{fraction} after {moves} moves")
         if moves >= config.max_moves:
             return End(reason="budget", detail=f"{fraction} after all {config.max_moves} moves")
-        if self._lost_in_a_row >= config.lost_after:
+        if self._lost_in_a_row < config.lost_after:
+            return None
+        if not view.has_target:
             return End(
-                reason="target_lost",
-                detail=f"{self._lost_in_a_row} looks in a row showed nothing of the target",
+                reason="no_target",
+                detail=f"{self._lost_in_a_row} looks in a row showed no ripe fruit; start where one is in view",
             )
-        return None
+        return End(
+            reason="target_lost",
+            detail=f"{self._lost_in_a_row} looks in a row showed nothing of the target",
+        )
 
     def _true_fraction(self, frame: Frame, view: Sighting) -> float | None:
         """Of the fruit that was named, or of the one that was chosen, which is the one that its mask shows."""

@@ -61,6 +61,8 @@ class Sighting:
     """Where the target is believed to be, world frame, in [m]. Shape (3,)."""
     recall: Callable[[ViewpointObserver], None] | None = None
     """Makes a memory of earlier views anew, if the target turned out to stand elsewhere."""
+    has_target: bool = True
+    """Whether there is a target; without one the robot looks for one about `target_position`."""
 
     @property
     def target_seen(self) -> bool:
@@ -78,20 +80,17 @@ class Perception(Protocol):
         """Forgets all views.
 
         Args:
-            target_position: Where the target is, world frame, in [m]; None to choose one that the first picture shows.
+            target_position: Where the target is, world frame, in [m]; None to choose one that a picture shows.
                 Shape (3,).
         """
         ...
 
-    def look(self, frame: Frame, T_world_camera: Float64) -> Sighting | None:
+    def look(self, frame: Frame, T_world_camera: Float64) -> Sighting:
         """What a picture tells.
 
         Args:
             frame: The picture.
             T_world_camera: Pose of the optical frame when it was taken. Shape (4, 4).
-
-        Returns:
-            None if there is no target yet, and the picture shows none.
 
         Raises:
             PerceptionError: The picture cannot be used.
@@ -115,8 +114,11 @@ class ImagePerception:
         self.begin(None)
 
     def begin(self, target_position: Float64 | None) -> None:
-        """Forgets all views; without a position the largest sure ripe fruit of the first picture is the target, of
-        those that it does not show fully if there are any."""
+        """Forgets all views; without a position the largest sure ripe fruit of a picture becomes the target, of those
+        that it does not show fully if there are any.
+
+        It is the first picture that shows one. When a target turns out not to be there, another one is chosen.
+        """
         self._perception = CameraPerception(1, self._detector)
         self._perception.begin(0, target_position, place_error=PLACE_ERROR)
         self._chooses = target_position is None
@@ -127,17 +129,14 @@ class ImagePerception:
         self._chooses = False
         return self._perception
 
-    def look(self, frame: Frame, T_world_camera: Float64) -> Sighting | None:
+    def look(self, frame: Frame, T_world_camera: Float64) -> Sighting:
         """The sighting by masks and depth; see `Perception`."""
         perception = self._perception
         moved = self.take(frame, T_world_camera)
-        if self._chooses:
-            perception.choose(0, FULL_VISIBILITY)
+        if self._chooses and perception.target(0) is None:
+            moved |= perception.choose(0, FULL_VISIBILITY)
             if perception.target(0) is None:
-                perception.choose(0, 1.0)
-            if perception.target(0) is None:
-                return None
-            self._chooses, moved = False, True
+                moved |= perception.choose(0, 1.0)
         return self.sighting(moved)
 
     def take(self, frame: Frame, T_world_camera: Float64) -> bool:
@@ -167,6 +166,7 @@ class ImagePerception:
             fruits_seen=sum(fruit.is_ripe for fruit in perception.views(0)[-1].fruits),
             target_position=perception.position_w(0),
             recall=self._recall if moved else None,
+            has_target=perception.target(0) is not None,
         )
 
     @property
@@ -217,7 +217,7 @@ class TruthPerception:
     def begin(self, target_position: Float64 | None) -> None:
         self._target = target_position
 
-    def look(self, frame: Frame, T_world_camera: Float64) -> Sighting | None:
+    def look(self, frame: Frame, T_world_camera: Float64) -> Sighting:
         truth = frame.truth
         if truth is None:
             raise PerceptionError(

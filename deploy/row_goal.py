@@ -51,7 +51,7 @@ class WholeRow:
         """The inspection list so far."""
         return self._inspection.fruits(self._mapper.map(0))
 
-    def look(self, frame: Frame, T_world_camera: Float64, joints: Float64, moves: int) -> Look | None:
+    def look(self, frame: Frame, T_world_camera: Float64, joints: Float64, moves: int) -> Look:
         """Maps the picture, and turns to another fruit when it is time; see `Goal`."""
         self._places = None
         moved = self._map(frame, T_world_camera, joints) or self._moved

@@ -64,9 +64,9 @@ class MapConfig:
     ripe fruits have 0.58 or more and turning ones 0.44 or less."""
     redness_slope: float = 60.0
     """Log-odds of being ripe that a redness larger by 1 adds."""
-    single_error: float = 0.15
+    single_error: float = 0.10
     """Standard error of one image's V_f of a fruit that is half visible; see `fraction_error`."""
-    fused_error: float = 0.10
+    fused_error: float = 0.065
     """The same for V_f by the map's sphere."""
     error_scale: float = 1.0
     """Standard error of both together over that of two independent estimates."""
@@ -420,7 +420,7 @@ class FruitMap:
             if a not in self.tracks or b not in self.tracks:
                 continue
             first, second = self.tracks[a], self.tracks[b]
-            if b in first.apart_from or a in second.apart_from:
+            if (b in first.apart_from or a in second.apart_from) and not _is_same_place(first, second):
                 continue
             if not self._is_one(first, second):
                 continue
@@ -516,6 +516,10 @@ LARGEST_COLOUR: Final = 4.0
 SMALLEST_LOG_ODDS: Final = -2.0
 """A track with a smaller log-odds of existence is forgotten."""
 
+SAME_PLACE: Final = 0.25
+"""Tracks that were detected beside each other are one fruit when they are nearer than this share of the sum of their
+radii."""
+
 SURE_VIEWS: Final = 2
 """A mask is divided only among tracks that were detected in so many views."""
 
@@ -588,6 +592,12 @@ def fraction_error(fraction: float, half: float) -> float:
         half: The error at V_f = 0.5.
     """
     return float(LEAST_FRACTION_ERROR + half * (4.0 * fraction * (1.0 - fraction)) ** 0.7)
+
+
+def _is_same_place(first: Track, second: Track) -> bool:
+    """Whether two tracks cannot be two solids: a leaf across one fruit makes two detections of it."""
+    apart = float(np.linalg.norm(first.position_w - second.position_w))
+    return apart < SAME_PLACE * (first.radius_m + second.radius_m)
 
 
 def _covered(mask: BinaryMask, circle: tuple[float, float, float]) -> float:

@@ -33,7 +33,7 @@ LISTED_ERROR: Final = 0.01
 LOST_AFTER: Final = 6
 """A fruit is given up after so many views in a row that do not show it."""
 
-STALE_AFTER: Final = 8
+STALE_AFTER: Final = 5
 """It is given up, too, after so many views in a row that do not show more of it than those before."""
 
 LITTLE: Final = 0.15
@@ -223,7 +223,7 @@ class Inspection:
             # A fruit that turned up is worth more than the rest of the scan.
             return moves > 0 or not self._is_unscanned(self.aim)
         track = fruits.tracks.get(number)
-        if track is None or not track.is_ripe or self.is_full(number):
+        if track is None or not track.is_ripe or self.is_full(number) or self._is_known(track, fruits):
             return True
         share = 0.5 if self._most < LITTLE else 1.0
         if moves >= max_moves or self._lost >= share * LOST_AFTER or self._stale >= share * STALE_AFTER:
@@ -269,11 +269,10 @@ class Inspection:
 
     def _open(self, fruits: FruitMap, lattice: ViewLattice) -> list[Track]:
         """The fruits in reach that are worth a look."""
-        full = [track for track in fruits.tracks.values() if self.is_full(track.number)]
         tracks = [
             track
             for track in fruits.tracks.values()
-            if self._is_open(track) and not any(_are_one(track, other) for other in full)
+            if self._is_open(track) and not self._is_known(track, fruits)
         ]
         positions = np.array([track.position_w for track in tracks]).reshape(-1, 3)
         fits = lattice.in_reach(torch.as_tensor(positions, dtype=torch.float32, device=lattice.device))
@@ -325,6 +324,15 @@ class Inspection:
             and _position_error(track) < largest
             and not self.is_full(track.number)
             and self.given_up.get(track.number, 0) < chances
+        )
+
+    def _is_known(self, track: Track, fruits: FruitMap) -> bool:
+        """Whether a track is one fruit with a better known one: one that is fully seen, or was detected more often."""
+        known = (self.is_full(track.number), track.views, -track.number)
+        return any(
+            _are_one(track, other) and (self.is_full(other.number), other.views, -other.number) > known
+            for other in fruits.tracks.values()
+            if other is not track and other.is_ripe and other.existence_log_odds > 0.0
         )
 
     def _is_unscanned(self, aim: Aim) -> bool:

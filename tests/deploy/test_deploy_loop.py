@@ -234,7 +234,7 @@ class TrueMasks(ImagePerception):
         super().__init__(TRUE_MASKS, None)
         self.looks = 0
 
-    def look(self, frame: Frame, T_world_camera: Any) -> Sighting | None:
+    def look(self, frame: Frame, T_world_camera: Any) -> Sighting:
         self.looks += 1
         assert frame.truth is not None
         ripe = self.found(list(frame.truth.ripe_labels), frame.truth.target_label)
@@ -265,6 +265,17 @@ class Withheld(TrueMasks):
 
     def found(self, ripe: list[int], target: int) -> list[int]:
         return [label for label in ripe if label != target]
+
+
+class Late(TrueMasks):
+    """A segmenter that finds no fruit in the first pictures, or in none."""
+
+    def __init__(self, first: int | None) -> None:
+        super().__init__()
+        self.first = first
+
+    def found(self, ripe: list[int], target: int) -> list[int]:
+        return [] if self.first is None or self.looks < self.first else ripe
 
 
 def with_perception(of: Profile, perception: Any, policy: Policy) -> RunResult:
@@ -309,6 +320,17 @@ def test_a_neighbour_does_not_pass_for_a_target_that_is_not_found(seed: int) -> 
     assert not result.success and not result.is_fault
     assert max(step.view.fruits_seen for step in kept.steps) > 0
     assert result.best_visible_fraction < 0.3, "a sliver at most, where a fruit can hardly be located"
+
+
+def test_a_robot_whose_first_pictures_show_no_fruit_looks_round_for_one() -> None:
+    text = TEXT.format(twin="", loop="lost_after = 4").replace('source = "twin"', 'source = "seen"')
+    seen = parse_profile(text, Path("seen.toml"))
+    nothing = with_perception(seen, Late(None), open_policy("nbv", env_id=TASK))
+    assert (nothing.reason, nothing.is_fault) == ("no_target", False), nothing.detail
+    assert nothing.moves == 3 and nothing.best_visible_fraction == 0.0
+    late = with_perception(seen, Late(3), open_policy("nbv", env_id=TASK))
+    assert late.visible_fractions[:2] == (0.0, 0.0)
+    assert late.reason in ("success", "budget") and late.best_visible_fraction > 0.5, late.detail
 
 
 def test_without_a_given_target_the_largest_fruit_in_the_picture_is_taken() -> None:

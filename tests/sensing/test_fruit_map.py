@@ -216,6 +216,18 @@ def test_two_tracks_of_one_sphere_become_one_and_keep_the_name_that_was_given() 
     assert fruits.current(number) == only(fruits)
 
 
+def test_two_pieces_of_one_fruit_become_one_track_again_and_two_that_touch_do_not() -> None:
+    camera = np.array(CAMERAS[0])
+    for apart, left in ((0.008, 1), (0.045, 2)):
+        fruits, beside = FruitMap(), FRUIT + [0.0, apart, 0.0]
+        # A leaf across a fruit makes two masks of it, whose spheres are fitted to less of it.
+        first = fruits.update(view(CAMERAS[0], detection(FRUIT, camera), detection(beside, camera)))
+        assert len(set(first.tracks)) == left
+        for place in CAMERAS[1:]:
+            fruits.update(view(place, detection(FRUIT, np.array(place)), detection(beside, np.array(place))))
+        assert len(fruits.tracks) == left
+
+
 def test_a_mask_over_two_known_fruits_is_divided_between_them() -> None:
     fruits = FruitMap(divide=DETECTOR.divide)
     for camera in CAMERAS[:3]:

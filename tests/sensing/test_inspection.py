@@ -8,7 +8,7 @@ from maniskill_tomato.robot.d435 import color_intrinsics
 from maniskill_tomato.segmentation.instances import Instances
 from maniskill_tomato.sensing.fruit_detector import FruitDetector
 from maniskill_tomato.sensing.fruit_map import FruitMap, MapConfig, Track
-from maniskill_tomato.sensing.inspection import LOST_AFTER, Inspection
+from maniskill_tomato.sensing.inspection import LOST_AFTER, Aim, Inspection
 
 torch = pytest.importorskip("torch")
 
@@ -117,6 +117,16 @@ def test_a_fruit_that_is_seen_fully_is_done_and_its_fragments_are_not_looked_at(
     assert row.is_full(number) and row.is_done(fruits, 2, 20)
     fruits.tracks[9] = track(9, (0.765, 0.02, 0.5))
     assert row.next(fruits, HERE, lattice) is None and row.is_over
+
+
+def test_of_two_tracks_that_are_one_fruit_only_the_better_known_is_looked_at(lattice: ViewLattice) -> None:
+    known, fragment = track(1, (0.8, 0.0, 0.5)), track(2, (0.78, 0.0, 0.5))
+    known.views, fragment.views = 9, 2
+    fruits, looks = map_of(known, fragment), inspection()
+    aim = looks.next(fruits, HERE, lattice)
+    assert aim is not None and aim.track == 1, "though the fragment is nearer"
+    looks.aim = Aim(fragment.position_w, 2)
+    assert looks.is_done(fruits, moves=1, max_moves=20)
 
 
 def test_the_list_tells_where_a_fruit_is_and_from_where_it_is_seen_fully() -> None:
