@@ -26,6 +26,7 @@ from mani_skill.utils.registration import register_env
 from mani_skill.utils.structs.types import SimConfig
 
 import maniskill_tomato  # noqa: F401
+from maniskill_tomato.experiments.camera_views import rendered_views
 from maniskill_tomato.plants.generator import generate_plant
 from maniskill_tomato.raycast.scene import RayScene
 from maniskill_tomato.rendering.vulkan_probe import rendering_available
@@ -33,6 +34,12 @@ from maniskill_tomato.robot.d435 import color_intrinsics
 from maniskill_tomato.robot.iiwa14 import JOINT_LOWER, JOINT_UPPER
 from maniskill_tomato.robot.inverse_kinematics import InverseKinematics
 from maniskill_tomato.robot.kinematics import forward_kinematics
+from maniskill_tomato.segmentation.instances import Instances
+from maniskill_tomato.segmentation.light_segmenter import FruitSession
+from maniskill_tomato.segmentation.segmenter import make_segmenter
+from maniskill_tomato.sensing.camera_perception import CameraPerception
+from maniskill_tomato.sensing.fruit_detector import FruitDetector
+from maniskill_tomato.sensing.posed_frame import PosedFrame
 from maniskill_tomato.tasks.plant_batch import GROWN_PLANTS
 
 GUIDED = "TomatoViewpointGuided-v1"
@@ -52,6 +59,8 @@ class Args:
     """Steps over which memory must not grow."""
     memory_resets: int = 500
     """Resets with new plants over which memory must not grow."""
+    look_episodes: int = 5
+    """Episodes whose rendered views a camera's look is timed on, four views each."""
 
 
 @register_env(EMPTY, max_episode_steps=10**9)
@@ -144,6 +153,54 @@ def rays_rate(rays_per_side: int) -> float:
     return rays_per_side**2 * per_second(lambda: scene.visibility(pose, target, plant_pose), 400)
 
 
+def look_times(episodes: int, views: int) -> dict[str, Any]:
+    """Processor time of a look at 640 x 480 by its parts, in [ms], and over that of the segmenter's network alone.
+
+    Medians over rendered views of validation episodes.
+
+    Args:
+        episodes: Of the validation list, from its first.
+        views: Of each.
+    """
+    frames: dict[int, list[PosedFrame]] = {}
+    for view in rendered_views(range(episodes), views):
+        frames.setdefault(view.episode, []).append(view.frame)
+    segmenter: Any = make_segmenter("light")
+    found: list[Instances] = []
+    network = FruitSession(segmenter.network)
+    detector = FruitDetector(lambda image, depth_m=None: found[-1])
+    times: dict[str, list[float]] = {name: [] for name in ("segment", "fit", "map", "observe", "network")}
+    fruits = []
+    for seen in frames.values():
+        perception = CameraPerception(1, detector)
+        perception.begin(0)
+        for frame in seen:
+            start = time.process_time()
+            found.append(segmenter(frame.rgb, frame.depth_m))
+            segmented = time.process_time()
+            measurement = detector.measure(frame)
+            fitted = time.process_time()
+            perception.add(0, measurement)
+            mapped = time.process_time()
+            perception.rays()
+            observed = time.process_time()
+            for scale in segmenter.scales:
+                network(torch.zeros(1, 3, round(480 * scale), round(640 * scale)))
+            spent = np.diff([start, segmented, fitted, mapped, observed, time.process_time()])
+            for name, value in zip(times, 1e3 * spent, strict=True):
+                times[name].append(float(value))
+            fruits.append(len(measurement.fruits))
+    whole = [sum(parts[:4]) for parts in zip(*times.values(), strict=True)]
+    medians = {name: statistics.median(values) for name, values in times.items()}
+    return {
+        "views": len(whole),
+        "fruits": statistics.median(fruits),
+        **{f"{name}_ms": round(value, 1) for name, value in medians.items()},
+        "look_ms": round(statistics.median(whole), 1),
+        "look_over_network": round(statistics.median(whole) / medians["network"], 2),
+    }
+
+
 def main(args: Args) -> int:
     """Runs every measurement and writes the file."""
     logging.getLogger("mani_skill").setLevel(logging.ERROR)
@@ -215,9 +272,10 @@ def main(args: Args) -> int:
             "steps": growth(step_or_reset, args.memory_steps),
             "resets_with_new_plants": growth(new_plants.reset, args.memory_resets),
         },
+        "look": look_times(args.look_episodes, 4) if rendered else None,
         "left_out": []
         if rendered
-        else ["guided_rendered_128_steps: no Vulkan device; `make vulkan` installs one"],
+        else ["guided_rendered_128_steps, look: no Vulkan device; `make vulkan` installs one"],
     }
     for env in (empty, guided, new_plants, rendered):
         if env is not None:

@@ -16,6 +16,7 @@ from torch import Tensor
 from maniskill_tomato.errors import InvalidInputError
 from maniskill_tomato.raycast.view_rays import ViewRays
 from maniskill_tomato.robot.kinematics import link_transforms
+from maniskill_tomato.sensing.camera_perception import CameraPerception
 from maniskill_tomato.sensing.inspection_judge import NO_FRUIT
 from maniskill_tomato.sensing.observation import ViewpointObserver
 from maniskill_tomato.sensing.perception_kinds import MAP_NOISE, RENDERED, Association, Naming, Perception
@@ -336,6 +337,11 @@ class CameraSenses:
             chooses=config.target == "any",
             threshold=self._full_visibility,
         )
+
+    @property
+    def perception(self) -> CameraPerception:
+        """What the camera has measured."""
+        return self._perception
 
     def known_target(self) -> Tensor:
         """Where the targets were measured, or are thought to be. Shape (N, 3)."""

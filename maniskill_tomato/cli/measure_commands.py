@@ -21,7 +21,7 @@ from maniskill_tomato.experiments.configs import (
 from maniskill_tomato.experiments.variants import choose_variants, experiments, find_variant
 from maniskill_tomato.learning.rl.presets import PRESETS
 from maniskill_tomato.plants.episode_list import EPISODE_LISTS
-from maniskill_tomato.plants.spec import SEED_SPLITS
+from maniskill_tomato.plants.seed_splits import SEED_SPLITS
 from maniskill_tomato.sensing.perception_kinds import Perception
 from maniskill_tomato.tasks import TASK_IDS
 

@@ -48,6 +48,8 @@ class MeshPart:
     """Vertex indices, counter-clockwise from outside. Shape (F, 3)."""
     material: str
     """Name of the material, a key of `materials.MATERIALS`."""
+    two_sided: bool = False
+    """Whether a renderer, which draws only what faces the camera, must draw both sides; rays meet both anyway."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -91,9 +93,10 @@ class Fruit:
 
 @dataclass(frozen=True, eq=False)
 class Plant:
-    """A generated plant."""
+    """A plant, generated or read from a mesh file."""
 
     preset: str
+    """Name of the preset, or of the mesh file without its ending."""
     seed: int
     detail: Literal["training", "picture"]
     organs: tuple[Organ, ...]

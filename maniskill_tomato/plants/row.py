@@ -88,17 +88,28 @@ def generate_row(
     if not 0.2 <= spacing <= 2.0:
         raise InvalidInputError(f"spacing must be from 0.2 to 2 m, got {spacing}")
     middle = generate_plant(preset, seed, detail, leaf_density_of(leaf_density, seed))
-    beside = neighbour_seeds(seed, seeds)
+    left, right = (
+        _single(preset, neighbour, detail, leaf_density_of(leaf_density, neighbour))
+        for neighbour in neighbour_seeds(seed, seeds)
+    )
+    return stand_in_row(middle, left, right, spacing)
+
+
+def stand_in_row(middle: Plant, left: Plant, right: Plant, spacing: float = ROW_SPACING) -> Row:
+    """A plant between two others; its seed draws their exact places and turns. See `generate_row`.
+
+    Args:
+        middle: The plant that the row is about.
+        left: At -y.
+        right: At +y.
+        spacing: Distance between the stems, in [m].
+    """
     organs, fruits = list(middle.organs), list(middle.fruits)
-    for i, (side, neighbour) in enumerate(zip(SIDES, beside, strict=True)):
-        rng = stream(seed, Stream.NEIGHBOUR, 2 + i)
+    for i, (side, neighbour) in enumerate(zip(SIDES, (left, right), strict=True)):
+        rng = stream(middle.seed, Stream.NEIGHBOUR, 2 + i)
         place = np.array([normal(rng, 0.0, PLACE_SPREAD), side * spacing + normal(rng, 0.0, PLACE_SPREAD), 0])
         turn = radians(normal(rng, 0.0, TURN_SPREAD_DEG))
-        moved = _moved(
-            _single(preset, neighbour, detail, leaf_density_of(leaf_density, neighbour)),
-            place.astype(np.float32),
-            turn,
-        )
+        moved = _moved(neighbour, place.astype(np.float32), turn)
         prefix = "left" if side < 0 else "right"
         fruits += [replace(f, organ_index=f.organ_index + len(organs)) for f in moved.fruits]
         organs += [replace(organ, name=f"{prefix}/{organ.name}") for organ in moved.organs]
@@ -110,7 +121,7 @@ def generate_row(
         fruits=tuple(fruits),
         middle_fruits=len(middle.fruits),
         middle_organs=len(middle.organs),
-        neighbour_seeds=beside,
+        neighbour_seeds=(left.seed, right.seed),
     )
 
 

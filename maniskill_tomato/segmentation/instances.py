@@ -1,6 +1,5 @@
 """Fruits found in one image: boxes, scores, categories, masks."""
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -127,19 +126,6 @@ class Instances:
         size = np.maximum(self.amodal_boxes[:, 2:] - self.amodal_boxes[:, :2], 1)
         visible = self.masks.sum(axis=(1, 2))
         return np.asarray(np.minimum(visible / (np.pi / 4 * size.prod(axis=1)), 1), np.float32)
-
-
-def joined(parts: Sequence[Instances]) -> Instances:
-    """The instances of several passes over one image, best score first; whole boxes only if all passes have them."""
-    whole = [part.amodal_boxes for part in parts if part.amodal_boxes is not None]
-    together = Instances(
-        boxes=np.concatenate([part.boxes for part in parts]),
-        scores=np.concatenate([part.scores for part in parts]),
-        categories=tuple(category for part in parts for category in part.categories),
-        masks=np.concatenate([part.masks for part in parts]),
-        amodal_boxes=np.concatenate(whole) if len(whole) == len(parts) else None,
-    )
-    return together.chosen(np.argsort(-together.scores, kind="stable"))
 
 
 def check_image(image: Image, depth_m: NDArray[np.float32] | None = None) -> None:

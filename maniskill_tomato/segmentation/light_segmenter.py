@@ -1,12 +1,14 @@
 """The light segmenter that ships: one small network, boxes, masks, ripeness and whole boxes in one pass on a CPU."""
 
 import warnings
-from dataclasses import fields, replace
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, fields
 from importlib.util import find_spec
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any
+from typing import Any, TypeVar
 
+import cv2
 import numpy as np
 import onnxruntime
 import torch
@@ -31,9 +33,10 @@ from maniskill_tomato.segmentation.instances import (
     Instances,
     box_ellipse,
     check_image,
-    joined,
 )
 from maniskill_tomato.segmentation.weights import load_weights
+
+_Number = TypeVar("_Number", bound=np.generic)
 
 SHIPPED_WEIGHTS = "perception/light_segmenter.pt"
 
@@ -149,26 +152,43 @@ class LightSegmenter:
         height, width = image.shape[:2]
         largest = min(1.0, self.longest_side / max(height, width))
         x = torch.from_numpy(np.ascontiguousarray(image)).permute(2, 0, 1)[None].float()
-        parts, peaks = [], []
+        passes, kept = [], []
         with torch.inference_mode():
             for number, scale in enumerate(self.scales):
-                found, voted = self._found_at(x, largest * scale)
+                found = self._found_at(x, largest * scale)
                 sides = (found.boxes[:, 2:] - found.boxes[:, :2]) * largest * scale
-                kept = np.ones(len(found), bool)
+                chosen = np.ones(len(sides), bool)
                 if number > 0:
-                    kept &= sides.min(axis=1, initial=np.inf) >= COARSE_SIDES[0]
+                    chosen &= sides.min(axis=1, initial=np.inf) >= COARSE_SIDES[0]
                 if number + 1 < len(self.scales):
-                    kept &= sides.max(axis=1, initial=0) <= COARSE_SIDES[1]
-                peaks.append(found.boxes[kept])
-                parts.append(replace(found, boxes=voted).chosen(kept))
-        together = joined(parts)
+                    chosen &= sides.max(axis=1, initial=0) <= COARSE_SIDES[1]
+                passes.append(found)
+                kept.append(np.flatnonzero(chosen))
         # Which fruits are the same, and their masks, keep to the boxes at the peaks: fruits that touch stay two.
-        order = np.argsort(-np.concatenate([part.scores for part in parts]), kind="stable")
-        boxes, scores = torch.from_numpy(np.concatenate(peaks)[order]), torch.from_numpy(together.scores)
-        return together.chosen(best_apart(boxes, scores, self.overlap_threshold).numpy())
+        of_pass = np.repeat(np.arange(len(passes)), [len(indices) for indices in kept])
+        index = np.concatenate(kept)
+        scores = _picked([part.scores for part in passes], kept)
+        order = np.argsort(-scores, kind="stable")
+        boxes = _picked([part.boxes for part in passes], kept)
+        best = best_apart(
+            torch.from_numpy(boxes[order]), torch.from_numpy(scores[order]), self.overlap_threshold
+        )
+        order = order[best.numpy()]
+        masks = np.empty((len(order), height, width), np.bool_)
+        for number, part in enumerate(passes):
+            mine = of_pass[order] == number
+            masks[mine] = part.masks(index[order][mine])
+        kinds = _picked([part.kinds for part in passes], kept)[order].tolist()
+        return Instances(
+            boxes=_picked([part.voted for part in passes], kept)[order],
+            scores=scores[order],
+            categories=tuple(TOMATO if self.boxes_only else FRUIT_CATEGORIES[kind] for kind in kinds),
+            masks=masks,
+            amodal_boxes=None if self.boxes_only else _picked([part.whole for part in passes], kept)[order],
+        )
 
-    def _found_at(self, x: Tensor, factor: float) -> tuple[Instances, NDArray[np.float32]]:
-        """The fruits in an image (1, 3, H, W) that is scaled by a factor, and their `voted_boxes` in its pixels."""
+    def _found_at(self, x: Tensor, factor: float) -> "_Pass":
+        """The fruits in an image (1, 3, H, W) that is scaled by a factor."""
         height, width = x.shape[2:]
         size = max(round(height * factor), 1), max(round(width * factor), 1)
         if size != (height, width):
@@ -187,21 +207,43 @@ class LightSegmenter:
         )
         kept = ((boxes[:, 2:] - boxes[:, :2]) >= 1).all(1)
         boxes, voted = boxes[kept], voted[kept]
-        whole = found["whole"][kept] * scale
-        if self.boxes_only:
-            masks = ellipses(voted, height, width)
-        else:
+
+        def masks(chosen: NDArray[np.int64]) -> NDArray[np.bool_]:
+            if self.boxes_only:
+                return ellipses(voted[torch.from_numpy(chosen)], height, width)
             fruit, votes = full_maps(maps, size, (height, width))
-            masks = split_by_votes(fruit, votes, boxes.numpy())
-        kinds = found["category"][kept].tolist()
-        instances = Instances(
+            return split_by_votes(fruit, votes, boxes.numpy(), chosen=chosen)
+
+        return _Pass(
             boxes=boxes.numpy(),
+            voted=voted.numpy(),
+            whole=enclosing(found["whole"][kept] * scale, voted).numpy(),
             scores=found["scores"][kept].numpy(),
-            categories=tuple(TOMATO if self.boxes_only else FRUIT_CATEGORIES[k] for k in kinds),
+            kinds=found["category"][kept].numpy(),
             masks=masks,
-            amodal_boxes=None if self.boxes_only else enclosing(whole, voted).numpy(),
         )
-        return instances, voted.numpy()
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class _Pass:
+    """The fruits that one size of an image shows, in the image's pixels."""
+
+    boxes: NDArray[np.float32]
+    """Of the peaks. Shape (N, 4)."""
+    voted: NDArray[np.float32]
+    """`voted_boxes` of them. Shape (N, 4)."""
+    whole: NDArray[np.float32]
+    """Of the whole fruits. Shape (N, 4)."""
+    scores: NDArray[np.float32]
+    """Shape (N,)."""
+    kinds: NDArray[np.int64]
+    """Indices of `FRUIT_CATEGORIES`. Shape (N,)."""
+    masks: Callable[[NDArray[np.int64]], NDArray[np.bool_]]
+    """Makes the masks of some of them, by their indices."""
+
+
+def _picked(parts: Sequence[NDArray[_Number]], indices: Sequence[NDArray[np.int64]]) -> NDArray[_Number]:
+    return np.concatenate([part[i] for part, i in zip(parts, indices, strict=True)])
 
 
 def mirror(maps: FruitMaps) -> FruitMaps:
@@ -235,14 +277,14 @@ def full_maps(
     """
     x, y = place_centres(maps.vote.shape[2], maps.vote.shape[3])
     votes = torch.stack([x, y]) + maps.vote[0]
-    both = torch.cat([maps.fruit[0], votes])[None]
-    padded = both.shape[2] * STRIDE, both.shape[3] * STRIDE
-    both = functional.interpolate(both, padded, mode="bilinear", align_corners=False)
-    both = both[:, :, : size[0], : size[1]]
-    if size != full:
-        both = functional.interpolate(both, full, mode="bilinear", align_corners=False)
-    scale = torch.tensor([full[1] / size[1], full[0] / size[0]])
-    return (both[0, 0] > 0).numpy(), (both[0, 1:] * scale[:, None, None]).numpy()
+    scales = 1.0, full[1] / size[1], full[0] / size[0]
+    resized = []
+    for channel, scale in zip(torch.cat([maps.fruit[0], votes]).numpy(), scales, strict=True):
+        # The same as PyTorch's bilinear interpolation, in a fraction of its time.
+        wide = cv2.resize(channel, (channel.shape[1] * STRIDE, channel.shape[0] * STRIDE))
+        wide = wide[: size[0], : size[1]]
+        resized.append((wide if size == full else cv2.resize(wide, full[::-1])) * np.float32(scale))
+    return resized[0] > 0, np.stack(resized[1:])
 
 
 def open_light(weights: Path | str | None = None, **options: Any) -> LightSegmenter:
@@ -280,7 +322,8 @@ def find_fruits(maps: FruitMaps, score_threshold: float, overlap_threshold: floa
         boxes (N, 4) and whole (N, 4) as left, top, right, bottom in the network's [px], scores (N,), category (N,).
     """
     heat = maps.centre[0, 0].sigmoid()
-    peak = functional.max_pool2d(heat[None, None], 3, 1, 1)[0, 0] == heat
+    # Eight times as quick as PyTorch's pooling.
+    peak = torch.from_numpy(cv2.dilate(heat.numpy(), np.ones((3, 3), np.uint8))) == heat
     scores = torch.where(peak, heat, torch.zeros_like(heat)).flatten()
     scores, places = scores.topk(min(MOST_FRUITS, scores.numel()))
     chosen = scores >= max(score_threshold, 1e-6)
@@ -340,7 +383,11 @@ def voted_boxes(maps: FruitMaps, boxes: Tensor) -> Tensor:
 
 
 def split_by_votes(
-    fruit: NDArray[np.bool_], votes: NDArray[np.float32], boxes: NDArray[np.float32], margin: float = 0.1
+    fruit: NDArray[np.bool_],
+    votes: NDArray[np.float32],
+    boxes: NDArray[np.float32],
+    margin: float = 0.1,
+    chosen: NDArray[np.int64] | None = None,
 ) -> NDArray[np.bool_]:
     """Gives each fruit pixel to the fruit, among those whose box it lies in, whose centre its vote is nearest to.
 
@@ -351,13 +398,15 @@ def split_by_votes(
         votes: Where each says that its fruit is centred, x and y in [px]. Shape (2, H, W).
         boxes: Left, top, right, bottom of each fruit in [px]. Shape (N, 4).
         margin: Share of its size by which a box is widened on each side.
+        chosen: Indices of those whose masks are wanted; all if None. Shape (K,).
 
     Returns:
-        Masks of shape (N, H, W).
+        Masks of shape (K, H, W).
     """
     height, width = fruit.shape
     nearest = np.full((height, width), np.inf, np.float32)
-    owner = np.full((height, width), -1)
+    owner = np.full((height, width), -1, np.int16)
+    windows = []
     for index, (left, top, right, bottom) in enumerate(boxes):
         size_x, size_y = right - left, bottom - top
         rows = slice(max(int(top - margin * size_y), 0), min(int(np.ceil(bottom + margin * size_y)), height))
@@ -370,9 +419,14 @@ def split_by_votes(
         closer = distance < nearest[rows, columns]
         nearest[rows, columns][closer] = distance[closer]
         owner[rows, columns][closer] = index
-    masks: NDArray[np.bool_] = (owner[None] == np.arange(len(boxes))[:, None, None]) & fruit
-    for empty in np.flatnonzero(~masks.any(axis=(1, 2))).tolist():
-        masks[empty] = box_ellipse(boxes[empty], height, width)
+        windows.append((rows, columns))
+    wanted = np.arange(len(boxes)) if chosen is None else chosen
+    masks = np.zeros((len(wanted), height, width), np.bool_)
+    for mask, index in zip(masks, wanted.tolist(), strict=True):
+        window = windows[index]
+        mask[window] = (owner[window] == index) & fruit[window]
+        if not mask[window].any():
+            mask[...] = box_ellipse(boxes[index], height, width)
     return masks
 
 

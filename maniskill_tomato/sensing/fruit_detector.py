@@ -1,7 +1,6 @@
 """From a frame to the fruits in it: masks by a segmenter, V_f and place by an occlusion model."""
 
 from collections.abc import Sequence
-from dataclasses import replace
 from typing import Final
 
 import numpy as np
@@ -54,12 +53,14 @@ class FruitDetector:
             InvalidInputError: The frame lacks the colours or the true fruits that the segmentation needs.
         """
         found = self._segmented(frame)
-        kept = found.scores >= LEAST_SCORE
-        if len(found):
-            kept = kept & (np.count_nonzero(found.masks, axis=(1, 2)) >= FEWEST_PIXELS)
-        found = found.chosen(kept)
-        masks = tuple(np.ascontiguousarray(mask) for mask in found.masks)
-        return Measurement(frame=frame, fruits=self._fruits(frame, masks, found.categories, found.scores))
+        kept = [
+            k
+            for k, mask in enumerate(found.masks)
+            if found.scores[k] >= LEAST_SCORE and np.count_nonzero(mask) >= FEWEST_PIXELS
+        ]
+        masks = tuple(np.ascontiguousarray(found.masks[k]) for k in kept)
+        categories = [found.categories[k] for k in kept]
+        return Measurement(frame=frame, fruits=self._fruits(frame, masks, categories, found.scores[kept]))
 
     def divide(self, measurement: Measurement, index: int, parts: Sequence[BinaryMask]) -> Measurement:
         """A view measured anew with a detection's mask divided.
@@ -86,17 +87,18 @@ class FruitDetector:
         categories: Sequence[str],
         scores: NDArray[np.float32],
     ) -> tuple[DetectedFruit, ...]:
-        depth = frame.depth_m.astype(np.float64)
+        depth = frame.measured_m
+        if self._segmenter is not None:
+            masks = own_pixels(masks, depth, frame.filled_m)
         rgb = np.zeros((*depth.shape, 3), np.uint8) if frame.rgb is None else frame.rgb
         view = SegmentedImage(
             rgb=rgb,
             depth_m=depth,
+            filled_m=frame.filled_m,
             masks=masks,
             intrinsics=frame.intrinsics,
             up_optical=frame.T_world_camera[2, :3],
         )
-        if self._segmenter is not None:
-            view = replace(view, masks=own_pixels(masks, view.depth_m))
         return tuple(
             _fruit(frame, view, mask, estimate, category, float(score))
             for mask, estimate, category, score in zip(
@@ -129,7 +131,8 @@ def _fruit(
     pixel = np.array([left + columns.mean() + 0.5, top + rows.mean() + 0.5])
     ray = frame.intrinsics.ray_directions(pixel)
     rotation = frame.T_world_camera[:3, :3]
-    centre = _centre(estimate, view, mask, ray)
+    own_depth = fruit_depth(view.depth_m[top:bottom, left:right], crop)
+    centre = _centre(estimate, own_depth, ray)
     if centre is None:
         # Where neither it nor what is round it has depth, its size tells how far away it is.
         distance = USUAL_RADIUS * frame.intrinsics.fx / (0.5 * max(crop.shape))
@@ -142,9 +145,9 @@ def _fruit(
         visible_fraction=estimate.visible_fraction,
         centre_w=rotation @ centre + frame.T_world_camera[:3, 3],
         radius_m=estimate.radius_m,
-        is_depth_measured=bool(np.isfinite(fruit_depth(view.depth_m, mask))),
+        is_depth_measured=bool(np.isfinite(own_depth)),
         direction_w=rotation @ (ray / np.linalg.norm(ray)),
-        redness=_redness(frame, mask),
+        redness=_redness(None if frame.rgb is None else frame.rgb[top:bottom, left:right][crop]),
     )
 
 
@@ -152,19 +155,22 @@ DARK: Final = 30.0
 """Sum of red and green below which a colour says nothing, of 510."""
 
 
-def _redness(frame: PosedFrame, mask: BinaryMask) -> float:
-    """(R - G) / (R + G) of the mean colour of a mask; NaN without colours, and where it is too dark to tell."""
-    if frame.rgb is None:
+def _redness(colours: NDArray[np.uint8] | None) -> float:
+    """(R - G) / (R + G) of the mean of colours; NaN without any, and where it is too dark to tell. Shape (N, 3)."""
+    if colours is None:
         return float("nan")
-    red, green, _ = frame.rgb[mask].mean(axis=0)
+    red, green, _ = colours.mean(axis=0)
     return float((red - green) / (red + green)) if red + green > DARK else float("nan")
 
 
-def _centre(
-    estimate: Estimate, view: SegmentedImage, mask: BinaryMask, ray: NDArray[np.float64]
-) -> Position | None:
-    """Centre in the optical frame, in [m]: the model's, or one behind the middle of the mask. Shape (3,)."""
+def _centre(estimate: Estimate, z: float, ray: NDArray[np.float64]) -> Position | None:
+    """Centre in the optical frame, in [m]: the model's, or one behind the middle of the mask. Shape (3,).
+
+    Args:
+        estimate: Of the model.
+        z: Depth of the visible surface, in [m]; NaN if it was not measured.
+        ray: Through the middle of the visible pixels, 1 m along the optical axis. Shape (3,).
+    """
     if estimate.centre_optical is not None:
         return np.array(estimate.centre_optical)
-    z = fruit_depth(view.depth_m, mask)
     return ray * (z + SURFACE_SHARE * USUAL_RADIUS) if np.isfinite(z) else None

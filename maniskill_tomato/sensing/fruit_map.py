@@ -451,9 +451,16 @@ class FruitMap:
         """The view with masks that cover several known fruits divided among these."""
         if self._divide is None:
             return measurement
-        index = 0
+        frame, index = measurement.frame, 0
+        known = [
+            circle
+            for track in self.tracks.values()
+            if track.views >= SURE_VIEWS
+            and track.existence_log_odds > 0.0
+            and (circle := outline(track.mean, frame.T_world_camera, frame.intrinsics)) is not None
+        ]
         while index < len(measurement.fruits):
-            parts = self._parts(measurement, index)
+            parts = self._parts(measurement, index, known)
             if parts is None:
                 index += 1
             else:
@@ -461,16 +468,19 @@ class FruitMap:
                 index += len(parts)
         return measurement
 
-    def _parts(self, measurement: Measurement, index: int) -> list[BinaryMask] | None:
-        """A detection's mask divided among the well-known tracks that it covers; None if it is of one fruit."""
-        frame = measurement.frame
+    def _parts(
+        self, measurement: Measurement, index: int, known: Sequence[tuple[float, float, float]]
+    ) -> list[BinaryMask] | None:
+        """A detection's mask divided among the well-known tracks that it covers, by their outlines; None if it is of
+        one fruit."""
+        pixels = measurement.fruits[index].pixels
+        near = [circle for circle in known if pixels > COVERED_SHARE * np.pi * circle[2] ** 2]
+        if len(near) < 2:
+            return None
         circles: list[tuple[float, float, float]] = []
         mask = measurement.mask(index)
-        for track in self.tracks.values():
-            if track.views < SURE_VIEWS or track.existence_log_odds <= 0.0:
-                continue
-            circle = outline(track.mean, frame.T_world_camera, frame.intrinsics)
-            if circle is None or _covered(mask, circle) <= COVERED_SHARE:
+        for circle in near:
+            if _covered(mask, circle) <= COVERED_SHARE:
                 continue
             if all(np.hypot(circle[0] - x, circle[1] - y) > max(circle[2], r) for x, y, r in circles):
                 circles.append(circle)

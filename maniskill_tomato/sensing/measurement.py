@@ -11,7 +11,7 @@ from maniskill_tomato.raycast.view_rays import ViewRays
 from maniskill_tomato.segmentation.masks import BinaryMask
 from maniskill_tomato.sensing.posed_frame import PosedFrame
 from maniskill_tomato.sensing.view_pattern import sample_view
-from maniskill_tomato.sensing.visible_fraction.estimate import filled_depth, fruit_depth
+from maniskill_tomato.sensing.visible_fraction.estimate import fruit_depth
 
 Position = NDArray[np.float64]
 
@@ -83,15 +83,15 @@ class Measurement:
 
         Shapes (H, W) and (H, W), and one number a fruit, NaN where none was measured.
         """
-        raw = self.frame.depth_m
-        measured = np.where(np.isfinite(raw) & (raw > 0), raw, 0.0).astype(np.float64)
-        depth, pixels, owns = filled_depth(measured), np.zeros(raw.shape, np.bool_), []
-        for k in range(len(self.fruits)):
-            mask = self.mask(k)
-            owns.append(fruit_depth(measured, mask))
+        measured, depth = self.frame.measured_m, self.frame.filled_m.copy()
+        pixels, owns = np.zeros(depth.shape, np.bool_), []
+        for fruit in self.fruits:
+            (top, left), crop = fruit.corner, fruit.crop
+            window = (slice(top, top + crop.shape[0]), slice(left, left + crop.shape[1]))
+            owns.append(fruit_depth(measured[window], crop))
             if np.isfinite(owns[-1]):
-                depth[mask] = owns[-1]
-            pixels |= mask
+                depth[window][crop] = owns[-1]
+            pixels[window] |= crop
         return depth, pixels, tuple(owns)
 
     def rays(self, target_position: Position, fruit: int | None) -> ViewRays:

@@ -14,7 +14,6 @@ from maniskill_tomato.sensing.visible_fraction.estimate import (
     LEAST_MEASURED_SHARE,
     USUAL_RADIUS,
     Float64,
-    filled_depth,
 )
 
 SURFACE_SPAN: Final = 1.2 * USUAL_RADIUS
@@ -24,18 +23,29 @@ SMALLEST_PATCH: Final = 3
 """Strips thinner than this stay: masks and depth disagree by a pixel or two at edges, in [px]."""
 
 
-def own_pixels(masks: tuple[BinaryMask, ...], depth_m: Float64) -> tuple[BinaryMask, ...]:
+def own_pixels(masks: tuple[BinaryMask, ...], depth_m: Float64, filled_m: Float64) -> tuple[BinaryMask, ...]:
     """The pixels of each mask that lie at the depth of most of it.
 
     Args:
         masks: A segmenter's. Each of shape (H, W).
         depth_m: In [m], 0 where there is no measurement. Shape (H, W).
+        filled_m: The same without holes (`filled_depth`). Shape (H, W).
 
     Returns:
         As many masks; one of which too little is measured is left as it is. Each of shape (H, W).
     """
-    filled = filled_depth(depth_m)
-    return tuple(_own(mask, depth_m, filled) for mask in masks)
+    kept = []
+    for mask in masks:
+        left, top, width, height = cv2.boundingRect(mask.view(np.uint8))
+        # A margin, so that the edge of the window is no edge of the mask.
+        window = (
+            slice(max(top - SMALLEST_PATCH, 0), top + height + SMALLEST_PATCH),
+            slice(max(left - SMALLEST_PATCH, 0), left + width + SMALLEST_PATCH),
+        )
+        own = mask.copy()
+        own[window] = _own(mask[window], depth_m[window], filled_m[window])
+        kept.append(own)
+    return tuple(kept)
 
 
 def _own(mask: BinaryMask, depth_m: Float64, filled: Float64) -> BinaryMask:

@@ -1,7 +1,9 @@
 """A camera's picture with depth and the pose that it was taken from: all that sensing asks of a device."""
 
 from dataclasses import dataclass
+from functools import cached_property
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -9,6 +11,7 @@ from maniskill_tomato.errors import InvalidInputError
 from maniskill_tomato.robot.d435 import CameraIntrinsics
 from maniskill_tomato.segmentation.instances import Instances
 from maniskill_tomato.segmentation.masks import BinaryMask
+from maniskill_tomato.sensing.visible_fraction.estimate import Float64, filled_depth
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -41,6 +44,17 @@ class PosedFrame:
             if array is not None and array.shape != shape:
                 raise InvalidInputError(f"{name} must have shape {shape}, got {array.shape}")
 
+    @cached_property
+    def measured_m(self) -> Float64:
+        """Depth in [m], 0 where there is no measurement. Shape (H, W)."""
+        raw = self.depth_m
+        return np.where(np.isfinite(raw) & (raw > 0), raw, 0.0).astype(np.float64)
+
+    @cached_property
+    def filled_m(self) -> Float64:
+        """The same without holes (`filled_depth`). Shape (H, W)."""
+        return filled_depth(self.measured_m)
+
     def shown_fruit(self, mask: BinaryMask) -> int | None:
         """Which fruit most pixels of a mask show, as an index in `Plant.fruits`.
 
@@ -52,6 +66,9 @@ class PosedFrame:
         """
         if self.true_fruits is None or not self.true_numbers:
             return None
-        shared = (self.true_fruits.masks & mask).sum(axis=(1, 2))
+        left, top, width, height = cv2.boundingRect(mask.view(np.uint8))
+        window = (slice(top, top + height), slice(left, left + width))
+        crop = mask[window]
+        shared = [np.count_nonzero(fruit[window] & crop) for fruit in self.true_fruits.masks]
         best = int(np.argmax(shared))
-        return self.true_numbers[best] if 2 * shared[best] >= np.count_nonzero(mask) else None
+        return self.true_numbers[best] if 2 * shared[best] >= np.count_nonzero(crop) else None

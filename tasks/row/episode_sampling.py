@@ -23,7 +23,7 @@ def draw_episodes(split: str, count: int, first_seed: int = 0, taken: Collection
     """Episodes of `TomatoViewpoint-v1` on different plants of a split, as their list replays them.
 
     Args:
-        split: A name of `plants.spec.SEED_SPLITS`.
+        split: A name of `SEED_SPLITS`.
         count: How many.
         first_seed: Seed of the first reset; the next ones follow.
         taken: Seeds of plants that are not drawn.
@@ -58,7 +58,7 @@ def extend_episodes(
     """A longer list, the given one first.
 
     Args:
-        split: A name of `plant_choice.SEED_SPLITS`.
+        split: A name of `SEED_SPLITS`.
         episodes: What there is.
         count: How many there are to be.
         on_block: Called with the list after every `CHUNK` episodes.

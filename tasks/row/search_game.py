@@ -16,6 +16,7 @@ from maniskill_tomato.robot.look_at import camera_to_viewpoint
 from maniskill_tomato.robot.rotations import FORWARD_RPY
 from maniskill_tomato.robot.transit import TRANSIT_MOVES
 from maniskill_tomato.sensing.belief import Belief
+from maniskill_tomato.sensing.camera_perception import CameraPerception
 from maniskill_tomato.sensing.observation import ObservationLayout, ViewpointObserver
 from maniskill_tomato.sensing.perception_kinds import Perception
 from maniskill_tomato.sensing.sensor_noise import SensorNoise
@@ -103,6 +104,16 @@ class SearchGame:
         """Episodes so far that no drawn start made as hard as asked for."""
 
     # ---------------------------------------------------------------- episode
+
+    @property
+    def perception(self) -> CameraPerception:
+        """What a camera has measured.
+
+        Raises:
+            AttributeError: There is none.
+        """
+        perception: CameraPerception = self._senses.perception  # type: ignore[attr-defined]
+        return perception
 
     @property
     def belief(self) -> Belief:

@@ -35,6 +35,8 @@ class SegmentedImage:
     """The colour camera's; the depth is aligned to it."""
     up_optical: Float64 | None = None
     """Unit vector upwards in the optical frame; None if it is not known. Shape (3,)."""
+    filled_m: Float64 | None = None
+    """`filled_depth` of the depth, where it was worked out before. Shape (height, width)."""
 
     def __post_init__(self) -> None:
         if self.rgb.dtype != np.uint8 or self.rgb.ndim != 3 or self.rgb.shape[2] != 3 or self.rgb.size == 0:
@@ -135,16 +137,15 @@ def filled_depth(depth_m: Float64) -> Float64:
 
     A D435's holes beside an edge are the shadow of the nearer side, so that they show the farther one.
     """
-    valid = depth_m > 0
-    width = depth_m.shape[1]
-    columns = np.arange(width, dtype=np.int32)[None]
-    left = np.maximum.accumulate(np.where(valid, columns, np.int32(-1)), axis=1)
-    right = np.minimum.accumulate(np.where(valid, columns, np.int32(width))[:, ::-1], axis=1)[:, ::-1]
     filled = np.array(depth_m, dtype=np.float64)
-    rows, holes = np.nonzero(~valid)
-    from_left, from_right = left[rows, holes], right[rows, holes]
-    filled[rows, holes] = np.maximum(
-        np.where(from_left >= 0, depth_m[rows, np.maximum(from_left, 0)], 0.0),
-        np.where(from_right < width, depth_m[rows, np.minimum(from_right, width - 1)], 0.0),
-    )
+    hole = ~(depth_m > 0)
+    height, width = hole.shape
+    bounds = np.zeros((height, width + 2), np.bool_)
+    bounds[:, 1:-1] = hole
+    changes = np.flatnonzero(bounds[:, 1:] != bounds[:, :-1])
+    rows, first = np.divmod(changes[::2], width + 1)
+    after = changes[1::2] % (width + 1)
+    before = np.where(first > 0, filled[rows, np.maximum(first - 1, 0)], 0.0)
+    behind = np.where(after < width, filled[rows, np.minimum(after, width - 1)], 0.0)
+    filled[hole] = np.repeat(np.maximum(before, behind), after - first)
     return filled

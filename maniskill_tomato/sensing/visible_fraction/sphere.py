@@ -118,7 +118,7 @@ class _Evidence:
     def stretched(self, stretch: Float64) -> "_Evidence":
         """The same in a stretched picture. Shape (2, 2)."""
         return _Evidence(
-            **{k: np.column_stack([v[:, :2] @ stretch, v[:, 2:]]) for k, v in vars(self).items()}
+            **{k: np.concatenate([v[:, :2] @ stretch, v[:, 2:]], 1) for k, v in vars(self).items()}
         )
 
 
@@ -131,7 +131,7 @@ class SphereModel:
 
     def __call__(self, view: SegmentedImage) -> list[Estimate]:
         """Estimates V and T of every mask; an empty one has failed. Without depth the outline alone decides."""
-        depth = filled_depth(view.depth_m)
+        depth = filled_depth(view.depth_m) if view.filled_m is None else view.filled_m
         fits = [_Fit.prepare(view, depth, mask, self.config) for mask in view.masks]
         for fit in fits:
             if fit is not None:
@@ -286,21 +286,22 @@ def whole_silhouette(
     x, y, radius = circle
     low_x, low_y = int(np.floor(x - radius)) - 1, int(np.floor(y - radius)) - 1
     side = int(np.ceil(2 * radius)) + 3
-    u, v = np.meshgrid(low_x + np.arange(side) + 0.5, low_y + np.arange(side) + 0.5)
-    away = np.stack([u - x, v - y], -1) @ (np.eye(2) if stretch is None else stretch)
-    disc = (away**2).sum(-1) < radius**2
+    s = np.eye(2) if stretch is None else stretch
+    u = low_x + np.arange(side) + 0.5 - x
+    v = (low_y + np.arange(side) + 0.5 - y)[:, None]
+    disc = (u * s[0, 0] + v * s[1, 0]) ** 2 + (u * s[0, 1] + v * s[1, 1]) ** 2 < radius**2
     height, width = mask.shape
-    inside = (u >= 0) & (u < width) & (v >= 0) & (v < height)
-    outside = int(np.count_nonzero(disc & ~inside))
-    chosen = disc & inside
-    rows, columns = v[chosen].astype(int), u[chosen].astype(int)
+    rows = slice(max(low_y, 0), max(min(low_y + side, height), 0))
+    columns = slice(max(low_x, 0), max(min(low_x + side, width), 0))
+    inside = disc[
+        rows.start - low_y : max(rows.stop - low_y, 0), columns.start - low_x : max(columns.stop - low_x, 0)
+    ]
+    outside = int(np.count_nonzero(disc)) - int(np.count_nonzero(inside))
     if np.isfinite(farthest):
-        there = depth[rows, columns]
         limit = np.where(fruits[rows, columns], farthest_fruit, farthest)
-        hidden = there <= limit
-        rows, columns = rows[hidden], columns[hidden]
+        inside = inside & (depth[rows, columns] <= limit)
     whole = mask.copy()
-    whole[rows, columns] = True
+    whole[rows, columns] |= inside
     return whole, outside
 
 
@@ -317,37 +318,47 @@ def _collect(
         size: Its radius, in [px], about.
         step: By how much the image gets deeper at an outline, in [m].
     """
-    image = here.astype(np.uint8)
-    ring = np.ones((3, 3), np.uint8)
-    inner_edge = (image > 0) & (cv2.erode(image, ring, borderValue=1) == 0)
+    image = here.view(np.uint8)
+    inner_edge = here & (cv2.erode(image, np.ones((3, 3), np.uint8), borderValue=1) == 0)
     # Masks and depth disagree by a pixel or two at edges, so that the depth is asked a little further out.
     beyond = cv2.GaussianBlur(image.astype(np.float32), (0, 0), 2.0)
-    gy, gx = np.gradient(beyond)
-    ey, ex = np.nonzero(inner_edge)
-    length = np.hypot(gx[ey, ex], gy[ey, ex]) + 1e-9
-    deeper = np.ones(len(ey), dtype=bool)
+    height, width = here.shape
+    rim = _pixels(inner_edge)
+    ex, ey = rim.T
+    down, up, right, left = (
+        np.minimum(ey + 1, height - 1),
+        np.maximum(ey - 1, 0),
+        np.minimum(ex + 1, width - 1),
+        np.maximum(ex - 1, 0),
+    )
+    gx = (beyond[ey, right] - beyond[ey, left]) / np.maximum(right - left, 1)
+    gy = (beyond[down, ex] - beyond[up, ex]) / np.maximum(down - up, 1)
+    length = np.hypot(gx, gy) + 1e-9
+    gx, gy = gx / length, gy / length
+    deeper = np.ones(len(ex), dtype=bool)
     probe = float(np.clip(0.12 * size, 1.5, 3.0))
     for distance in (probe, 1.7 * probe):
-        ox = np.round(ex - distance * gx[ey, ex] / length).astype(int)
-        oy = np.round(ey - distance * gy[ey, ex] / length).astype(int)
-        in_window = (ox >= 0) & (oy >= 0) & (ox < here.shape[1]) & (oy < here.shape[0])
-        out = z[np.clip(oy, 0, here.shape[0] - 1), np.clip(ox, 0, here.shape[1] - 1)]
+        ox = np.round(ex - distance * gx).astype(int)
+        oy = np.round(ey - distance * gy).astype(int)
+        in_window = (ox >= 0) & (oy >= 0) & (ox < width) & (oy < height)
+        out = z[np.clip(oy, 0, height - 1), np.clip(ox, 0, width - 1)]
         deeper &= in_window & ((out > own + step) | (out == 0))
-    edge = np.stack([ex + 0.5, ey + 0.5], 1).astype(np.float64)[deeper]
-    grown = cv2.dilate(image, np.ones((5, 5), np.uint8)) > 0
-    behind = (z > own + 2 * step) & ~grown
-    core = cv2.erode(image, np.ones((5, 5), np.uint8)) > 0
-    my, mx = np.nonzero(here)
-    cy, cx = np.nonzero(core & (measured > 0))
-    by, bx = np.nonzero(behind)
-    centres = np.stack([mx + 0.5, my + 0.5], 1).astype(np.float64)
-    rim = np.stack([ex + 0.5, ey + 0.5], 1).astype(np.float64)
+    patch = np.ones((5, 5), np.uint8)
+    behind = (z > own + 2 * step) & (cv2.dilate(image, patch) == 0)
+    core = (cv2.erode(image, patch) > 0) & (measured > 0)
+    inner = _thinned(_pixels(core))
     return _Evidence(
-        edge=_thinned(edge),
-        mask=_thinned(rim if len(rim) else centres),
-        background=_thinned(np.stack([bx + 0.5, by + 0.5], 1).astype(np.float64), 2 * SAMPLES),
-        mask_depth=_thinned(np.stack([cx + 0.5, cy + 0.5, measured[cy, cx]], 1).astype(np.float64)),
+        edge=_thinned(rim[deeper]) + 0.5,
+        mask=_thinned(rim if len(rim) else _pixels(here)) + 0.5,
+        background=_thinned(_pixels(behind), 2 * SAMPLES) + 0.5,
+        mask_depth=np.concatenate([inner + 0.5, measured[inner[:, 1], inner[:, 0]][:, None]], 1),
     )
+
+
+def _pixels(mask: BinaryMask) -> NDArray[np.int64]:
+    """Column and row of each true pixel, row by row. Shape (N, 2)."""
+    rows, columns = np.divmod(np.flatnonzero(mask), mask.shape[1])
+    return np.stack([columns, rows], 1)
 
 
 def _fit(evidence: _Evidence, own: float, focal: float, c: SphereConfig) -> Float64:
@@ -377,6 +388,7 @@ def _fit(evidence: _Evidence, own: float, focal: float, c: SphereConfig) -> Floa
 def _cost(circles: Floats, evidence: _Evidence, own: float, focal: float, c: SphereConfig) -> Float64:
     """Negative log likelihood of circles. Shape (N,)."""
     radius = circles[:, 2:3]
+    inverse = 1.0 / radius
 
     def away(points: Floats) -> Floats:
         # Several times as quick as np.hypot.
@@ -386,25 +398,51 @@ def _cost(circles: Floats, evidence: _Evidence, own: float, focal: float, c: Sph
         across += down
         return np.asarray(np.sqrt(across, out=across))
 
-    radius_m = circles[:, 2] * own / focal
+    def mean_square(error: Floats, largest: float) -> Floats:
+        """Of each row, halved, no square larger than that."""
+        error *= error
+        np.minimum(error, 2.0 * largest, out=error)
+        return np.asarray(error.sum(1) * np.float32(0.5 / error.shape[1]))
+
+    radius_m = circles[:, 2] * np.float32(own / focal)
     cost = 0.5 * (np.log(radius_m / c.radius_m) / c.radius_spread) ** 2
     if len(evidence.edge):
-        error = (away(evidence.edge) / radius - 1) / c.edge_error
+        error = away(evidence.edge)
+        error -= radius
+        error *= inverse * np.float32(1.0 / c.edge_error)
         # Points of the outline are not independent: together they weigh as a few dozen.
-        cost = cost + 24 * (len(evidence.edge) / SAMPLES) * np.mean(np.minimum(0.5 * error**2, 4.5), 1)
-    error = np.maximum(away(evidence.mask) / radius - 1, 0) / c.inside_error
-    cost = cost + 24 * np.mean(np.minimum(0.5 * error**2, 8.0), 1)
+        cost = cost + 24 * (len(evidence.edge) / SAMPLES) * mean_square(error, 4.5)
+    error = away(evidence.mask)
+    error -= radius
+    np.maximum(error, 0, out=error)
+    error *= inverse * np.float32(1.0 / c.inside_error)
+    cost = cost + 24 * mean_square(error, 8.0)
     if len(evidence.background):
-        error = np.maximum(1 - away(evidence.background) / radius, 0) / c.inside_error
-        cost = cost + 24 * np.mean(np.minimum(0.5 * error**2, 8.0), 1)
+        error = away(evidence.background)
+        np.subtract(radius, error, out=error)
+        np.maximum(error, 0, out=error)
+        error *= inverse * np.float32(1.0 / c.inside_error)
+        cost = cost + 24 * mean_square(error, 8.0)
     if len(evidence.mask_depth) >= 12:
-        z = evidence.mask_depth[:, 2]
-        across = away(evidence.mask_depth) * own / focal
-        bulge = np.sqrt(np.maximum(radius_m[:, None] ** 2 - across**2, 0))
-        centre = z + bulge
-        error = (centre - np.median(centre, 1, keepdims=True)) / c.depth_error_m
-        cost = cost + 12 * np.mean(np.minimum(0.5 * error**2, 4.5), 1)
+        centre = away(evidence.mask_depth)
+        centre *= np.float32(own / focal)
+        centre *= centre
+        np.subtract(radius_m[:, None] ** 2, centre, out=centre)
+        np.maximum(centre, 0, out=centre)
+        np.sqrt(centre, out=centre)
+        centre += evidence.mask_depth[:, 2]
+        centre -= _medians(centre)
+        centre *= np.float32(1.0 / c.depth_error_m)
+        cost = cost + 12 * mean_square(centre, 4.5)
     return np.asarray(cost)
+
+
+def _medians(values: Floats) -> Floats:
+    """The median of each row; `np.median` takes several times as long. Shape (N, 1)."""
+    half = values.shape[1] // 2
+    ordered = np.partition(values, half, axis=1)
+    upper = ordered[:, half : half + 1]
+    return upper if values.shape[1] % 2 else (upper + ordered[:, :half].max(1, keepdims=True)) / 2
 
 
 def _centre_depth(points: Floats, circle: Float64, own: float, focal: float) -> float:
@@ -416,7 +454,7 @@ def _centre_depth(points: Floats, circle: Float64, own: float, focal: float) -> 
     return float(np.median(points[:, 2] + np.sqrt(np.maximum(radius_m**2 - across**2, 0))))
 
 
-def _thinned(points: Float64, count: int = SAMPLES) -> Float64:
+def _thinned(points: NDArray[np.int64], count: int = SAMPLES) -> NDArray[np.int64]:
     if len(points) <= count:
         return points
     return np.asarray(points[np.linspace(0, len(points) - 1, count).astype(int)])
