@@ -33,6 +33,12 @@ BEYOND_SHARE: Final = 0.35
 LEAST_BEYOND: Final = 3
 """At least so many of them do."""
 
+GREENHOUSE_SHARE: Final = 0.3
+"""Share of the plants of `varied` that are the pruned vines of the preset `full`."""
+
+GREENHOUSE_DENSITY: Final = (0.8, 1.8)
+"""Their foliage, that of the general task."""
+
 BUSH_SHARE: Final = 0.35
 """Share of the plants that are bushes of several shoots instead of one vine."""
 
@@ -104,6 +110,8 @@ def draw_kind(seed: int, *, is_other: bool = False) -> PlantConfig:
     rng = stream(seed, Stream.KIND)
     v = _traits(rng, is_other)
     is_bush = bool(rng.random() < BUSH_SHARE)
+    if not is_other and rng.random() < GREENHOUSE_SHARE:
+        return replace(PRESETS["full"](), name="varied", leaf_density=uniform(rng, GREENHOUSE_DENSITY))
     shoots = 2 + int(3 * rng.random()) if is_bush else 1
     radius, around, leaf = v["fruit_radius"], 0.08, v["leaf_length"]
     fruits = max(round(v["fruits"]), 1)
