@@ -1,6 +1,7 @@
 """Plants of many kinds: what is drawn, and that it grows."""
 
 import dataclasses
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -97,3 +98,15 @@ def test_a_task_takes_the_density_of_the_kind_unless_another_is_asked_for() -> N
 def test_a_number_out_of_range_is_named(field: str, value: Any) -> None:
     with pytest.raises(InvalidInputError, match=field):
         dataclasses.replace(PlantConfig(), **{field: value})
+
+
+def test_the_plants_page_lists_every_trait_with_its_ranges() -> None:
+    page = (Path(__file__).parents[2] / "docs" / "plants.md").read_text(encoding="utf-8")
+    page = page.split("## Plants of many kinds\n")[1].split("\n## ")[0]
+    for trait in TRAITS:
+        (row,) = [line for line in page.splitlines() if line.startswith(f"| `{trait.name}` |")]
+        learnt, beyond = (
+            ", ".join(f"{low:g} to {high:g}" for low, high in ranges)
+            for ranges in ([trait.learnt], trait.beyond)
+        )
+        assert row.split("|")[2:4] == [f" {learnt} ", f" {beyond} "]
