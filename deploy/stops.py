@@ -69,6 +69,10 @@ class Stops:
     def beat(self) -> str | None:
         """Says that the loop is alive; why it has to stop, or None."""
         self._last_beat = time.monotonic()
+        return self.asked()
+
+    def asked(self) -> str | None:
+        """Why to stop, or None, without saying that the loop is alive."""
         if self._reason is None and self._stop_file is not None and self._stop_file.exists():
             self.request(f"stop file {self._stop_file}")
         if self._reason is None and self._keyboard and select.select([sys.stdin], [], [], 0)[0]:
