@@ -9,7 +9,7 @@ import numpy as np
 
 from maniskill_tomato.errors import InvalidInputError
 from maniskill_tomato.plants.generator import Detail, generate_plant
-from maniskill_tomato.plants.organs import Float32, Fruit, MeshPart, Organ, Plant
+from maniskill_tomato.plants.organs import Float32, Plant, placed
 from maniskill_tomato.plants.random_streams import Stream, normal, stream
 
 ROW_SPACING = 0.5
@@ -141,11 +141,4 @@ def _single(preset: str, seed: int, detail: Detail, leaf_density: float | None) 
 def _moved(plant: Plant, place: Float32, turn: float) -> Plant:
     """The plant turned about its stem by `turn` [rad] and then moved to `place` [m]."""
     c, s = cos(turn), sin(turn)
-    rotation = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]], dtype=np.float32)
-
-    def part(p: MeshPart) -> MeshPart:
-        return replace(p, vertices=p.vertices @ rotation.T + place, normals=p.normals @ rotation.T)
-
-    organs: list[Organ] = [replace(o, parts=tuple(part(p) for p in o.parts)) for o in plant.organs]
-    fruits: list[Fruit] = [replace(f, centre=rotation @ f.centre + place) for f in plant.fruits]
-    return replace(plant, organs=tuple(organs), fruits=tuple(fruits))
+    return placed(plant, np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]], dtype=np.float32), place)

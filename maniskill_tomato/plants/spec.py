@@ -10,9 +10,9 @@ from numpy.typing import NDArray
 
 from maniskill_tomato.errors import InvalidInputError, did_you_mean
 from maniskill_tomato.plants.generator import generate_plant
+from maniskill_tomato.plants.kinds import KINDS, PLANT_NAMES
 from maniskill_tomato.plants.mesh_set import ALL, RULE_NAMES, MeshSource
 from maniskill_tomato.plants.organs import Plant
-from maniskill_tomato.plants.plant_config import PRESETS
 from maniskill_tomato.plants.row import generate_row, leaf_density_of, neighbour_seeds, stand_in_row
 from maniskill_tomato.plants.seed_splits import SEED_SPLITS
 
@@ -28,7 +28,7 @@ class PlantSpec:
     """The identity of a plant, or a rule that draws a new one at every reset."""
 
     preset: str = "one_tomato"
-    """One of `maniskill_tomato.plants.plant_config.PRESETS`."""
+    """One of `maniskill_tomato.plants.kinds.PLANT_NAMES`."""
     seed: int | str = 0
     """The plant's seed, or the name of a split of `SEED_SPLITS`: then each reset draws a seed from it."""
     pool: int | None = None
@@ -50,8 +50,8 @@ class PlantSpec:
         if self.mesh is not None:
             self._check_mesh(self.mesh)
             return
-        if self.preset not in PRESETS:
-            raise InvalidInputError.choice("plant preset", self.preset, PRESETS)
+        if self.preset not in PLANT_NAMES:
+            raise InvalidInputError.choice("plant preset", self.preset, PLANT_NAMES)
         if isinstance(self.seed, str):
             if self.seed not in SEED_SPLITS:
                 raise InvalidInputError(
@@ -164,7 +164,8 @@ class PlantSpec:
         if isinstance(value, PlantSpec):
             return value
         if isinstance(value, str):
-            return replace(default, preset=value)
+            density = None if value in KINDS else default.leaf_density  # Each kind has its own.
+            return replace(default, preset=value, leaf_density=density)
         if isinstance(value, Mapping):
             if value.get("mesh") is not None:
                 return cls._parse_mesh(value)
@@ -176,11 +177,13 @@ class PlantSpec:
                     f"plant has no field {', '.join(map(repr, unknown))}{of_mesh}; the fields are {', '.join(names)}"
                 )
             replaced = dict(value)
+            if replaced.get("preset") in KINDS:
+                replaced.setdefault("leaf_density", None)  # Each kind has its own.
             if not isinstance(replaced.get("seed", ""), str):
                 replaced.setdefault("pool", None)  # The default's pool is one of its split.
             return cls(**{**{name: getattr(default, name) for name in names}, **replaced})
         raise InvalidInputError(
-            f"plant must be None, a preset's name ({', '.join(PRESETS)}) or a mapping of "
+            f"plant must be None, a preset's name ({', '.join(PLANT_NAMES)}) or a mapping of "
             f"{', '.join(f.name for f in fields(cls))}; got {value!r}"
         )
 
