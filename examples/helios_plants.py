@@ -94,15 +94,19 @@ def _fruit_organs(context: Any, fruits: list[int], species: Species) -> dict[str
 
 def _triangles(context: Any, number: int) -> tuple[Float64, Float64, list[int]]:
     """Corners (F, 3, 3), colours (F, 3) and numbers of the triangles of an object."""
-    corners, colours, numbers = [], [], []
-    for triangle in context.getPrimitivesInfoForObject(number):
-        points = [[p.x, p.y, p.z] for p in triangle.vertices]
-        # A patch of four corners is two triangles.
-        for chosen in ([0, 1, 2], [0, 2, 3])[: len(points) - 2]:
-            corners.append([points[i] for i in chosen])
-            colours.append([triangle.color.r, triangle.color.g, triangle.color.b])
-            numbers.append(triangle.uuid)
-    return np.array(corners).reshape(-1, 3, 3), np.array(colours).reshape(-1, 3), numbers
+    numbers = list(context.getObjectPrimitiveUUIDs(number))
+    colours = np.asarray(context.getPrimitiveColor(numbers), dtype=np.float64)
+    flat, offsets = context.getPrimitiveVertices(numbers)
+    counts = np.diff(np.asarray(offsets, dtype=np.int64)) // 3
+    points = np.asarray(flat, dtype=np.float64).reshape(-1, 3)
+    first = np.cumsum(counts) - counts
+    # A patch of four corners is two triangles.
+    rows = np.concatenate([np.arange(len(numbers)), np.flatnonzero(counts == 4)])
+    second = np.where(np.arange(len(rows)) < len(numbers), 1, 2)
+    corners = np.stack(
+        [points[first[rows]], points[first[rows] + second], points[first[rows] + second + 1]], 1
+    )
+    return corners, colours[rows], [numbers[row] for row in rows]
 
 
 def _leaves(stalks: list[Float64], blades: list[Float64]) -> list[list[Float64]]:
@@ -128,14 +132,11 @@ _alpha: dict[str, Float64] = {}
 def _cut_out(context: Any, number: int) -> Float64:
     """The triangles of a leaf without what its texture leaves transparent. Shape (F, 3, 3)."""
     corners, _, numbers = _triangles(context, number)
+    files = context.getPrimitiveTextureFile(numbers)
+    solids = context.getPrimitiveSolidFraction(numbers)
     kept = []
-    for triangle, uuid in zip(corners, numbers, strict=True):
-        file = context.getPrimitiveTextureFile(uuid)
-        if not file or not context.primitiveTextureHasTransparencyChannel(uuid):
-            kept.append(triangle[None])
-            continue
-        solid = context.getPrimitiveSolidFraction(uuid)
-        if solid > 0.98:
+    for triangle, uuid, file, solid in zip(corners, numbers, files, solids, strict=True):
+        if not file or solid > 0.98:
             kept.append(triangle[None])
         elif solid > 0.02:
             uv = np.array([[p.x, p.y] for p in context.getPrimitiveTextureUV(uuid)])

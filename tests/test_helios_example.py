@@ -47,36 +47,39 @@ class Context:
     def seedRandomGenerator(self, seed: int) -> None:
         self.seed = seed
 
-    def getPrimitivesInfoForObject(self, number: int) -> list[Any]:
+    def getObjectPrimitiveUUIDs(self, number: int) -> list[int]:
+        return [100 * number + k for k in range(len(self.shapes(number)))]
+
+    def shapes(self, number: int) -> list[tuple[Any, Any]]:
         upright = [
             np.array([[0, 0, 0], [0.02, 0, 0], [0, 0, 0.5]]),
             np.array([[0, 0, 0.2], [0.02, 0, 0.2], [0, 0, 1]]),
         ]
         blade = [np.array([[0.0, 0, 0.4], [0.2, 0, 0.4], [0.2, 0.2, 0.4]]), upright[1] * 0.1 + [0, 0, 0.4]]
-        shapes: dict[int, list[tuple[Any, Any]]] = {
-            STEM: [(t, GREEN) for t in upright],
+        patch = np.array([[0.0, 0.01, 0.5], [0.0, 0.02, 0.5], [0.0, 0.02, 0.7], [0.0, 0.01, 0.7]])
+        return {
+            STEM: [(upright[0], GREEN), (patch, GREEN), (upright[1], GREEN)],
             PETIOLE: [(upright[0] * 0.1 + [0, 0, 0.4], GREEN)],
             LEAF: [(t, GREEN) for t in blade],
             RIPE: [*((t, RED) for t in octahedron(0.45)), (octahedron(0.5, 0.01)[0], GREEN)],
             PICKED: [(t, RED) for t in octahedron(0.2)],
-        }
-        return [
-            SimpleNamespace(
-                vertices=[SimpleNamespace(x=x, y=y, z=z) for x, y, z in corners],
-                color=SimpleNamespace(r=r, g=g, b=b),
-                uuid=100 * number + k,
-            )
-            for k, (corners, (r, g, b)) in enumerate(shapes[number])
-        ]
+        }[number]
 
-    def getPrimitiveTextureFile(self, uuid: int) -> str:
-        return "leaf.png" if uuid == 100 * LEAF else ""
+    def shape(self, uuid: int) -> tuple[Any, Any]:
+        return self.shapes(uuid // 100)[uuid % 100]
 
-    def primitiveTextureHasTransparencyChannel(self, uuid: int) -> bool:
-        return True
+    def getPrimitiveVertices(self, uuids: list[int]) -> tuple[Any, Any]:
+        corners = [np.ravel(self.shape(uuid)[0]) for uuid in uuids]
+        return np.concatenate(corners), np.cumsum([0, *map(len, corners)], dtype=np.uint32)
 
-    def getPrimitiveSolidFraction(self, uuid: int) -> float:
-        return 0.5
+    def getPrimitiveColor(self, uuids: list[int]) -> Any:
+        return np.array([self.shape(uuid)[1] for uuid in uuids], dtype=np.float32)
+
+    def getPrimitiveTextureFile(self, uuids: list[int]) -> list[str]:
+        return ["leaf.png" if uuid == 100 * LEAF else "" for uuid in uuids]
+
+    def getPrimitiveSolidFraction(self, uuids: list[int]) -> Any:
+        return np.full(len(uuids), 0.5)
 
     def getPrimitiveTextureUV(self, uuid: int) -> list[Any]:
         return [SimpleNamespace(x=u, y=v) for u, v in ((0, 0), (1, 0), (1, 1))]
@@ -123,6 +126,8 @@ def test_a_set_of_plants_is_written_that_the_tasks_read(
     assert list(plants.files) == [1_000_000, 1_000_001]
     plant = plants.grow(1_000_000)
     assert {organ.name for organ in plant.organs} == {"stem", "leaf_000", "fruit_ripe_00", "stem_calyx_00"}
+    stem = next(organ for organ in plant.organs if organ.name == "stem")
+    assert len(stem.faces) == 4  # Two triangles, and a patch of four corners.
     (fruit,) = plant.fruits
     assert fruit.ripeness == "ripe" and 0.68 <= float(fruit.centre[2]) <= 0.88
     told = json.loads((tmp_path / "plants_validation.json").read_text())

@@ -19,6 +19,9 @@ from maniskill_tomato.tables import read_table
 RULES_FILE: Final = "mesh.toml"
 """The rules of all files of its folder."""
 
+KEPT_PLANTS: Final = 64
+"""Plants of mesh files that are kept, so that all who show one share its triangles; large ones take 30 MB."""
+
 ALL: Final = "all"
 """Every plant of a set, whatever its split."""
 
@@ -106,7 +109,7 @@ class MeshSet:
             InvalidInputError: There is no such plant, or its file is refused.
         """
         self.check(seed)
-        return plant_from_mesh(self.files[seed], self.rules, seed)
+        return _read_plant(self.files[seed], self.rules, seed)
 
     def check(self, seed: int) -> None:
         """Accepts the seed of a plant.
@@ -141,6 +144,11 @@ class MeshSet:
             if seeds:
                 told.append(f"{seeds[0]}{f' to {seeds[-1]}' if len(seeds) > 1 else ''} ({split})")
         return ", ".join(told)
+
+
+@lru_cache(maxsize=KEPT_PLANTS)
+def _read_plant(path: Path, rules: MeshRules, seed: int) -> Plant:
+    return plant_from_mesh(path, rules, seed)
 
 
 @lru_cache(maxsize=16)
