@@ -11,6 +11,8 @@ from pathlib import Path
 from types import FrameType, TracebackType
 from typing import Any, Self
 
+from maniskill_tomato.deploy.deploy_errors import StoppedError
+
 KEYS = ("q", "s", " ")
 """Followed by Enter, each of these stops a run in a terminal."""
 
@@ -83,7 +85,11 @@ class Stops:
 
     @contextmanager
     def waiting_for_a_person(self) -> Iterator[None]:
-        """While inside, nobody expects a beat: people take their time."""
+        """While inside, nobody expects a beat: people take their time. A signal ends the waiting.
+
+        Raises:
+            StoppedError: A signal asked to stop.
+        """
         self._waiting = True
         try:
             yield
@@ -98,6 +104,9 @@ class Stops:
 
     def _on_signal(self, number: int, frame: FrameType | None) -> None:
         self.request(signal.Signals(number).name)
+        if self._waiting:
+            # Python takes a read of the terminal up again after a signal, unless its handler raises.
+            raise StoppedError(signal.Signals(number).name)
 
     def _watch_heartbeat(self) -> None:
         while not self._ended.wait(min(1.0, self._heartbeat_s / 4)):
