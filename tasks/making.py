@@ -40,7 +40,8 @@ class WorldOptions:
     """Options of all tasks."""
 
     plant: PlantSpec | Mapping[str, object] | str | None = None
-    """A preset's name or a mapping of `PlantSpec` fields; the task's own if None."""
+    """A preset's name, a mapping of `PlantSpec` fields, or one with `mesh` and `MeshRules` fields; the task's own if
+    None."""
     plant_pose: PlantPose | Sequence[float] | None = None
     """`(x, y, yaw)` of the stem in the world frame, in [m, m, rad]; the task's own if None."""
     plant_pose_noise: Sequence[float] | None = None
@@ -290,7 +291,7 @@ def _search_setup(options: SearchOptions) -> TaskSetup:
     episodes = EpisodeChoice(options.episodes)
     plant = PlantSpec.parse(options.plant, task.plant)
     if episodes.episodes is not None:
-        plant = replace(plant, seed=episodes.split, pool=None)
+        plant = plant.of_any_seed(episodes.split)
     layout = options.layout
     if layout is not None and not isinstance(layout, ObservationLayout):
         layout = ObservationLayout(parts=tuple(layout))  # type: ignore[arg-type]

@@ -9,7 +9,7 @@ from torch import Tensor
 from torch.nn.functional import pad
 
 from maniskill_tomato.plants.organs import Plant
-from maniskill_tomato.plants.spec import SEED_SPLITS, PlantSpec
+from maniskill_tomato.plants.spec import PlantSpec
 from maniskill_tomato.tasks.world_state import WorldState
 
 GROWN_PLANTS = 128
@@ -45,7 +45,7 @@ class PlantBatch:
         """Indices of the ripe fruits of each environment's plant."""
         self._fruit_centre_p = torch.zeros(n, 1, 3, device=device)
         self._fruit_organ = torch.zeros(n, 1, dtype=torch.int64, device=device)
-        seed = spec.seed if isinstance(spec.seed, int) else SEED_SPLITS[spec.seed][0]
+        seed = spec.first_seed
         self.plants, self.ripe_fruits = [grow(spec, seed)] * n, [[]] * n
         self.show(dict.fromkeys(range(n), seed))
 

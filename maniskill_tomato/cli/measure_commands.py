@@ -7,7 +7,7 @@ from typing import Annotated, get_args
 
 import tyro
 
-from maniskill_tomato.cli.early_checks import check_choice, check_folder, check_policies
+from maniskill_tomato.cli.early_checks import check_choice, check_folder, check_place, check_policies
 from maniskill_tomato.cli.shared_options import say
 from maniskill_tomato.errors import InvalidInputError
 from maniskill_tomato.experiments.configs import (
@@ -21,7 +21,7 @@ from maniskill_tomato.experiments.configs import (
 from maniskill_tomato.experiments.variants import choose_variants, experiments, find_variant
 from maniskill_tomato.learning.rl.presets import PRESETS
 from maniskill_tomato.plants.episode_list import EPISODE_LISTS
-from maniskill_tomato.plants.spec import SEED_SPLITS
+from maniskill_tomato.plants.seed_splits import SEED_SPLITS
 from maniskill_tomato.sensing.perception_kinds import Perception
 from maniskill_tomato.tasks import TASK_IDS
 
@@ -33,7 +33,9 @@ class Benchmark(BenchmarkConfig):
     def run(self) -> None:
         """Runs what is missing and says where the results are."""
         check_policies("--policies", self.policies)
-        if not Path(self.episode_list).is_file():
+        if self.plants is not None:
+            check_place("--plants", self.plants)
+        elif not Path(self.episode_list).is_file():
             check_choice("--episode-list", self.episode_list, (*EPISODE_LISTS, "FILE.json"))
 
         from maniskill_tomato.experiments.viewpoint_benchmark import run_benchmark

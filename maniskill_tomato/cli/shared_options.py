@@ -10,7 +10,7 @@ from typing import Annotated, Any, Literal
 import tyro
 
 from maniskill_tomato.errors import InvalidInputError, did_you_mean
-from maniskill_tomato.plants.spec import SEED_SPLITS
+from maniskill_tomato.plants.seed_splits import SEED_SPLITS
 from maniskill_tomato.tasks import TASK_IDS
 
 EnvId = Annotated[

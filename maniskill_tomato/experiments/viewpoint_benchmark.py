@@ -1,6 +1,7 @@
 """The benchmark: policies on the same held-out episodes, and sweeps over one difficulty at a time."""
 
 import os
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -8,11 +9,13 @@ from typing import Any
 import maniskill_tomato
 from maniskill_tomato.errors import InvalidInputError
 from maniskill_tomato.experiments.benchmark_report import BenchmarkFigures, summarise_runs, write_benchmark
+from maniskill_tomato.experiments.certified_episodes import certified_list, parse_place
 from maniskill_tomato.experiments.configs import BenchmarkConfig
 from maniskill_tomato.experiments.policy_runs import Condition, PolicySpec, parse_policies, run_policies
 from maniskill_tomato.experiments.result_store import ResultStore
 from maniskill_tomato.experiments.view_grid import draw_view_grid
 from maniskill_tomato.plants.episode_list import EPISODE_LISTS, load_episodes
+from maniskill_tomato.plants.mesh_set import MeshSource
 from maniskill_tomato.policies.registry import PRIVILEGED
 from maniskill_tomato.rendering import vulkan_probe
 from maniskill_tomato.tasks.row.row_config import GeneralTaskConfig
@@ -61,20 +64,22 @@ def run_benchmark(config: BenchmarkConfig) -> BenchmarkResult:
         InvalidInputError: An option cannot be used, or the folder holds another benchmark.
     """
     specs = parse_policies(config.policies)
-    main = main_condition(config.episode_list, config.contact_free_oracle)
-    swept = _swept_conditions(config, main)
-    _check_counts(config, main, bool(swept))
     sweep_specs = _chosen_policies(config, specs)
-    settings = {
-        "env_id": main.env_id,
-        "package_version": maniskill_tomato.__version__,
-        "contact_free_oracle": config.contact_free_oracle,
-    }
-    store = ResultStore(config.out, settings, {f"policy {spec.label}": spec.fingerprint for spec in specs})
+    processes = config.jobs or len(os.sched_getaffinity(0))
+    if config.plants is None:
+        main = main_condition(config.episode_list, config.contact_free_oracle)
+        facts: dict[str, Any] = {}
+        swept = _swept_conditions(config, main)
+        _check_counts(config, main, bool(swept))
+        store = _open_store(config, specs)
+    else:
+        source, split = _checked_plants(config, config.plants)
+        store = _open_store(config, specs, plants=[source.plants.fingerprint, split])
+        main, facts = _on_plants(config, config.plants, store, processes)
+        swept = []
     numbers = range(config.seed, config.seed + config.episodes)
     few = range(config.seed, config.seed + config.sweep_episodes)
     plan = [(main, specs, numbers), *((condition, sweep_specs, few) for condition in swept)]
-    processes = config.jobs or len(os.sched_getaffinity(0))
     run_policies(store, plan, processes, config.num_envs)
     runs = {
         condition.name: {spec.label: store.episodes(condition.name, spec.label, n) for spec in some}
@@ -95,10 +100,59 @@ def run_benchmark(config: BenchmarkConfig) -> BenchmarkResult:
         threshold=task.full_visibility,
         horizon=task.max_moves,
         privileged=[spec.label for spec in specs if spec.source in PRIVILEGED],
-        facts={"first episode": config.seed, "processes": processes},
+        facts={"first episode": config.seed, "processes": processes, **facts},
         pictures=pictures,
     )
     return BenchmarkResult(figures=figures, table=table, page=page, left_out=left_out)
+
+
+def _open_store(config: BenchmarkConfig, specs: Sequence[PolicySpec], **settings: Any) -> ResultStore:
+    """The folder of the results, and what they depend on."""
+    common = {
+        "env_id": "TomatoViewpoint-v1",
+        "package_version": maniskill_tomato.__version__,
+        "contact_free_oracle": config.contact_free_oracle,
+    }
+    members = {f"policy {spec.label}": spec.fingerprint for spec in specs}
+    return ResultStore(config.out, {**common, **settings}, members)
+
+
+def _checked_plants(config: BenchmarkConfig, place: str) -> tuple[MeshSource, str]:
+    """The plants of `--plants` and their split, if nothing else contradicts them.
+
+    Raises:
+        InvalidInputError: There are none, or an option is for our own plants.
+    """
+    if _words(config.sweeps) or config.episode_list != MAIN:
+        raise InvalidInputError("--plants draws its own episodes; leave out --sweeps and --episode-list")
+    if config.episodes < 1 or config.seed < 0:
+        raise InvalidInputError(
+            f"--episodes must be 1 or more and --seed 0 or more; got {config.episodes} and {config.seed}"
+        )
+    source, split = parse_place(place)
+    source.plants.seeds(split)
+    return source, split
+
+
+def _on_plants(
+    config: BenchmarkConfig, place: str, store: ResultStore, processes: int
+) -> tuple[Condition, dict[str, Any]]:
+    """The condition of plants from mesh files, with facts about its episodes."""
+    listed = certified_list(
+        place,
+        config.seed + config.episodes,
+        store,
+        config.out,
+        contact_free=config.contact_free_oracle,
+        processes=processes,
+    )
+    condition = Condition(
+        name="plants",
+        env_options={"episodes": str(listed.path), "plant": listed.plant},
+        episode_list=str(listed.path),
+        contact_free=config.contact_free_oracle,
+    )
+    return condition, listed.facts
 
 
 def main_condition(episode_list: str = MAIN, contact_free: bool = False) -> Condition:

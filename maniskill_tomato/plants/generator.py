@@ -7,17 +7,24 @@ from typing import Literal, get_args
 import numpy as np
 
 from maniskill_tomato.errors import InvalidInputError
+from maniskill_tomato.plants.clutter import clutter_organs
 from maniskill_tomato.plants.fruit import berry_patch, draw_berry
 from maniskill_tomato.plants.hiding import choose_clear_directions, clear_view, hang_curtain
-from maniskill_tomato.plants.leaf import Leaf, draw_leaf, draw_rachis, leaf_parts
+from maniskill_tomato.plants.kinds import config_of
+from maniskill_tomato.plants.leaf import Leaf, draw_leaf, draw_rachis, leaf_parts, wilted
 from maniskill_tomato.plants.meshing import Float64, join
-from maniskill_tomato.plants.organs import Fruit, Organ, Plant, Ripeness, SemanticClass
-from maniskill_tomato.plants.plant_config import PlantConfig, make_config
-from maniskill_tomato.plants.random_streams import Stream, normal, stream
+from maniskill_tomato.plants.organs import Fruit, Organ, Plant, Ripeness, SemanticClass, placed
+from maniskill_tomato.plants.plant_config import PlantConfig
+from maniskill_tomato.plants.random_streams import Stream, normal, stream, uniform
 from maniskill_tomato.plants.stem import Shoot, grow_shoot, stem_patch
 from maniskill_tomato.plants.truss import Hanging, Truss, draw_truss, truss_parts
 
 Detail = Literal["training", "picture"]
+
+SIDE_ANGLES_DEG = (40.0, 75.0, 110.0)
+"""Angle of the side-shoot leaves of a node to its leaf, in [deg]: as many as `MAX_LEAF_DENSITY` asks for; [looks]."""
+
+SIDE_TURNS = len(SIDE_ANGLES_DEG)
 
 FRUIT_CLASS: dict[Ripeness, SemanticClass] = {
     "ripe": SemanticClass.FRUIT_RIPE,
@@ -63,13 +70,14 @@ def _grow_leaves(config: PlantConfig, shoot: Shoot, seed: int, fruits: list[Hang
     lowest = max(shoot.truss_nodes[0] + 1 - config.leaves_kept_below_truss, 0)
     last = len(shoot.heights) - 1
     curtains = {shoot.truss_nodes[i] + 1: i for i in range(len(hidden))}
-    density = config.leaf_density
+    density, wilting = config.leaf_density, wilted(config.leaf)
     leaves = []
-    for kind in (Stream.LEAF, Stream.SIDE_LEAF):
-        side_shoot = kind is Stream.SIDE_LEAF
-        share = density - 1.0 if side_shoot else sqrt(density)
+    for turn in range(SIDE_TURNS + 1):
+        side_shoot = turn > 0
+        kind = Stream.SIDE_LEAF if side_shoot else Stream.LEAF
+        share = density - turn if side_shoot else sqrt(density)
         for node in range(lowest, last + 1):
-            rng = stream(seed, kind, node)
+            rng = stream(seed, kind, node + 1000 * max(turn - 1, 0))
             # Drawn first, so that the foliage of a lower density is part of that of a higher one.
             if rng.random() >= share:
                 continue
@@ -77,18 +85,23 @@ def _grow_leaves(config: PlantConfig, shoot: Shoot, seed: int, fruits: list[Hang
             vigour = min(1.0, youngest + (1.0 - youngest) * (last - node) / max(config.leaf.young_leaves, 1))
             azimuth = float(shoot.azimuths[node])
             if side_shoot:
-                azimuth += radians(40.0) * (1.0 if rng.random() < 0.5 else -1.0)
+                azimuth += radians(SIDE_ANGLES_DEG[turn - 1]) * (1.0 if rng.random() < 0.5 else -1.0)
                 vigour *= 0.75
             base = _on_stem(shoot, float(shoot.heights[node]), azimuth)
             if hiding and node in curtains and not side_shoot:
                 leaf = hang_curtain(hiding, config.leaf, seed, node, base, hidden, curtains[node])
             else:
-                rachis = draw_rachis(config.leaf, rng, base, azimuth, vigour)
-                leaf = draw_leaf(config.leaf, rng, rachis, vigour)
+                dying = config.wilted_share > 0.0 and bool(
+                    stream(seed, Stream.WILTED, 100 * node + turn).random() < config.wilted_share
+                )
+                numbers = wilting if dying else config.leaf
+                rachis = draw_rachis(numbers, rng, base, azimuth, vigour)
+                leaf = replace(draw_leaf(numbers, rng, rachis, vigour), is_wilted=dying)
                 if hiding:
                     leaf = leaf.keeping(clear_view(hiding, leaf, hidden))
             keep = [
-                side_shoot or rank < sqrt(density) for rank in rng.random(16).tolist()[: len(leaf.leaflets)]
+                side_shoot or rank < sqrt(density)
+                for rank in rng.random(max(16, len(leaf.leaflets))).tolist()[: len(leaf.leaflets)]
             ]
             leaf = leaf.keeping(keep)
             if leaf.leaflets:
@@ -96,36 +109,9 @@ def _grow_leaves(config: PlantConfig, shoot: Shoot, seed: int, fruits: list[Hang
     return leaves
 
 
-def generate_plant(
-    preset: str | PlantConfig = "full",
-    seed: int = 0,
-    detail: Detail = "training",
-    leaf_density: float | None = None,
-) -> Plant:
-    """Grows a tomato plant; one seed gives the same plant on every machine.
-
-    Args:
-        preset: Name of a preset of `config.PRESETS`, or a configuration.
-        seed: Which plant, 0 or greater.
-        detail: `training` keeps a plant of the default density under 15,000 triangles, `picture` is finer.
-            Both have the same organs at the same places.
-        leaf_density: Replaces the configuration's foliage, 0 (no leaves) to 2; 1 is the preset as it is.
-
-    Returns:
-        The plant in its own frame: origin at the foot of the stem, z up, the robot at -x; metres.
-
-    Raises:
-        InvalidInputError: If a name is unknown, the seed is negative or the density out of range.
-    """
-    config = make_config(preset) if isinstance(preset, str) else preset
-    if detail not in get_args(Detail):
-        raise InvalidInputError.choice("detail", detail, get_args(Detail))
-    if isinstance(seed, bool) or not isinstance(seed, int | np.integer) or seed < 0:
-        raise InvalidInputError(f"seed must be an integer of 0 or more, got {seed!r}")
-    if leaf_density is not None:
-        config = replace(config, leaf_density=float(leaf_density))
-    seed, picture = int(seed), detail == "picture"
-
+def _shoot(config: PlantConfig, seed: int, detail: Detail) -> Plant:
+    """One shoot with all that grows on it."""
+    picture = detail == "picture"
     shoot = grow_shoot(config, seed)
     trusses = _grow_trusses(config, shoot, seed)
     fruits = [hanging for truss in trusses for hanging in truss.fruits]
@@ -149,3 +135,59 @@ def generate_plant(
         described.append(Fruit(len(organs), centre.astype(np.float32), radius, berry.ripeness))
         organs.append(Organ(f"fruit_{i:02d}", FRUIT_CLASS[berry.ripeness], (skin,)))
     return Plant(preset=config.name, seed=seed, detail=detail, organs=tuple(organs), fruits=tuple(described))
+
+
+def _bush(config: PlantConfig, seed: int, detail: Detail) -> Plant:
+    """Several shoots that lean away from their middle."""
+    rng = stream(seed, Stream.SHOOT)
+    first = 2 * pi * rng.random()
+    organs: list[Organ] = []
+    fruits: list[Fruit] = []
+    for k in range(config.shoots):
+        # The first shoot leans too; each has random numbers of its own.
+        own = seed if k == 0 else int(stream(seed, Stream.SHOOT, k).integers(2**31))
+        away = first + 2 * pi * k / config.shoots + normal(rng, 0.0, 0.25)
+        lean = radians(uniform(rng, config.shoot_lean_range_deg))
+        turn = np.array([[cos(away), -sin(away), 0.0], [sin(away), cos(away), 0.0], [0.0, 0.0, 1.0]])
+        tilt = np.array([[cos(lean), 0.0, sin(lean)], [0.0, 1.0, 0.0], [-sin(lean), 0.0, cos(lean)]])
+        rotation = (turn @ tilt @ turn.T).astype(np.float32)
+        place = np.array([0.02 * cos(away), 0.02 * sin(away), 0.0], dtype=np.float32)
+        shoot = placed(_shoot(config, own, detail), rotation, place)
+        fruits += [replace(f, organ_index=f.organ_index + len(organs)) for f in shoot.fruits]
+        organs += [replace(o, name=f"shoot_{k}/{o.name}") for o in shoot.organs]
+    return Plant(preset=config.name, seed=seed, detail=detail, organs=tuple(organs), fruits=tuple(fruits))
+
+
+def generate_plant(
+    preset: str | PlantConfig = "full",
+    seed: int = 0,
+    detail: Detail = "training",
+    leaf_density: float | None = None,
+) -> Plant:
+    """Grows a tomato plant; one seed gives the same plant on every machine.
+
+    Args:
+        preset: Name of a preset of `kinds.PLANT_NAMES`, or a configuration.
+        seed: Which plant, 0 or greater.
+        detail: `training` keeps a plant of the default density under 15,000 triangles, `picture` is finer.
+            Both have the same organs at the same places.
+        leaf_density: Replaces the configuration's foliage, 0 (no leaves) to 4; 1 is the preset as it is.
+
+    Returns:
+        The plant in its own frame: origin at the foot of the stem, z up, the robot at -x; metres.
+
+    Raises:
+        InvalidInputError: If a name is unknown, the seed is negative or the density out of range.
+    """
+    if detail not in get_args(Detail):
+        raise InvalidInputError.choice("detail", detail, get_args(Detail))
+    if isinstance(seed, bool) or not isinstance(seed, int | np.integer) or seed < 0:
+        raise InvalidInputError(f"seed must be an integer of 0 or more, got {seed!r}")
+    config = config_of(preset, int(seed)) if isinstance(preset, str) else preset
+    if leaf_density is not None:
+        config = replace(config, leaf_density=float(leaf_density))
+    seed = int(seed)
+    plant = _shoot(config, seed, detail) if config.shoots == 1 else _bush(config, seed, detail)
+    if not config.clutter:
+        return plant
+    return replace(plant, organs=(*plant.organs, *clutter_organs(seed, config.clutter)))

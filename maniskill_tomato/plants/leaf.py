@@ -53,6 +53,8 @@ class Leaf:
     """Start and end of each leaflet's own stalk, in [m]; as many as leaflets."""
     variant: int
     """Which leaf texture it has."""
+    is_wilted: bool = False
+    """Whether it is dying."""
 
     def keeping(self, keep: list[bool]) -> "Leaf":
         """The leaf with some of its leaflets left out."""
@@ -200,6 +202,18 @@ def draw_leaf(
     )
 
 
+def wilted(config: LeafConfig) -> LeafConfig:
+    """The numbers of leaves that are dying: they hang, and their leaflets fold and roll up; [looks]."""
+    return replace(
+        config,
+        end_angle_range_deg=(158.0, 176.0),
+        leaflet_curl_range_deg=(70.0, 120.0),
+        leaflet_droop_range=(1.5, 3.0),
+        leaflet_aspect=0.6 * config.leaflet_aspect,
+        fold=0.5,
+    )
+
+
 def leaflet_points(leaflet: Leaflet) -> Float64:
     """Points spread over a leaflet's blade, the same for every level of detail. Shape (N, 3)."""
     triangles = coarse_triangles(leaflet)
@@ -222,6 +236,7 @@ def leaf_parts(leaf: Leaf, *, picture: bool) -> tuple[MeshPart, ...]:
     sides = [both_sides(leaflet, picture=picture) for leaflet in leaf.leaflets]
     parts = [join(stalks, "petiole")]
     if sides:
-        parts.append(join([upper for upper, _ in sides], f"leaf_upper_{leaf.variant}"))
-        parts.append(join([under for _, under in sides], f"leaf_under_{leaf.variant}"))
+        state = "wilted_" if leaf.is_wilted else ""
+        parts.append(join([upper for upper, _ in sides], f"leaf_{state}upper_{leaf.variant}"))
+        parts.append(join([under for _, under in sides], f"leaf_{state}under_{leaf.variant}"))
     return tuple(parts)

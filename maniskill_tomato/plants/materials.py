@@ -6,7 +6,14 @@ from functools import cached_property, partial
 
 from maniskill_tomato.plants.fruit import SKIN_VARIANTS
 from maniskill_tomato.plants.leaf import LEAF_VARIANTS
-from maniskill_tomato.plants.textures import UInt8, calyx_texture, leaf_texture, skin_texture, stalk_texture
+from maniskill_tomato.plants.textures import (
+    UInt8,
+    calyx_texture,
+    leaf_texture,
+    skin_texture,
+    stalk_texture,
+    wilted_texture,
+)
 
 
 @dataclass(frozen=True)
@@ -36,6 +43,10 @@ def _make_materials() -> dict[str, Material]:
     for k in range(LEAF_VARIANTS):
         materials[f"leaf_upper_{k}"] = Material(partial(leaf_texture, k, upper=True), 0.55, 0.4)
         materials[f"leaf_under_{k}"] = Material(partial(leaf_texture, k, upper=False), 0.8, 0.25)
+        materials[f"leaf_wilted_upper_{k}"] = Material(partial(wilted_texture, k, upper=True), 0.85, 0.2)
+        materials[f"leaf_wilted_under_{k}"] = Material(partial(wilted_texture, k, upper=False), 0.9, 0.2)
+    for k, colour in enumerate(((168, 150, 120), (205, 205, 200), (70, 92, 120))):
+        materials[f"object_{k}"] = Material(partial(stalk_texture, 10 + k, colour, streak=0.05), 0.8, 0.3)
     for ripeness, variants in SKIN_VARIANTS.items():
         for k in range(variants):
             roughness = 0.22 if ripeness == "ripe" else 0.27

@@ -5,7 +5,7 @@ robot stands at -x.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import IntEnum
 from functools import cached_property
 from typing import Literal
@@ -30,6 +30,8 @@ class SemanticClass(IntEnum):
     FRUIT_TURNING = 4
     FRUIT_GREEN = 5
     ROBOT = 6
+    OBJECT = 7
+    """Things that are neither plant nor robot."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,6 +48,8 @@ class MeshPart:
     """Vertex indices, counter-clockwise from outside. Shape (F, 3)."""
     material: str
     """Name of the material, a key of `materials.MATERIALS`."""
+    two_sided: bool = False
+    """Whether a renderer, which draws only what faces the camera, must draw both sides; rays meet both anyway."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -89,9 +93,10 @@ class Fruit:
 
 @dataclass(frozen=True, eq=False)
 class Plant:
-    """A generated plant."""
+    """A plant, generated or read from a mesh file."""
 
     preset: str
+    """Name of the preset, or of the mesh file without its ending."""
     seed: int
     detail: Literal["training", "picture"]
     organs: tuple[Organ, ...]
@@ -111,3 +116,22 @@ class Plant:
     def organ_of_face(self) -> Int32:
         """Index into `organs` for every triangle. Shape (F,)."""
         return np.repeat(np.arange(len(self.organs)), [len(o.faces) for o in self.organs]).astype(np.int32)
+
+
+def placed(plant: Plant, rotation: Float32, place: Float32) -> Plant:
+    """The plant turned about its origin and then moved.
+
+    Args:
+        plant: The plant.
+        rotation: Shape (3, 3).
+        place: In [m]. Shape (3,).
+    """
+
+    def part(p: MeshPart) -> MeshPart:
+        return replace(p, vertices=p.vertices @ rotation.T + place, normals=p.normals @ rotation.T)
+
+    return replace(
+        plant,
+        organs=tuple(replace(o, parts=tuple(part(p) for p in o.parts)) for o in plant.organs),
+        fruits=tuple(replace(f, centre=rotation @ f.centre + place) for f in plant.fruits),
+    )

@@ -14,7 +14,7 @@ from math import isfinite
 
 from maniskill_tomato.errors import InvalidInputError
 
-MAX_LEAF_DENSITY = 2.0
+MAX_LEAF_DENSITY = 4.0
 
 
 def check_positive(config: object, *names: str) -> None:
@@ -324,7 +324,15 @@ class PlantConfig:
     """Leaves left below the lowest truss; growers take them off as it ripens; [practice]."""
     leaf_density: float = 1.0
     """Foliage relative to the preset: 0 none, below 1 leaves and leaflets are left out, above 1 side-shoot
-    leaves."""
+    leaves, at 4 three at every node."""
+    shoots: int = 1
+    """Shoots from the ground: 1 for a vine, more for a bush."""
+    shoot_lean_range_deg: tuple[float, float] = (6.0, 24.0)
+    """Lean of a bush's shoots away from its middle, in [deg]; [looks]."""
+    wilted_share: float = 0.0
+    """Share of the leaves that are dying: they hang, are rolled up and yellow."""
+    clutter: int = 0
+    """Things about the plant that are no plant: boards, boxes, strings, loose triangles."""
 
     def __post_init__(self) -> None:
         check_ranges(self)
@@ -333,6 +341,14 @@ class PlantConfig:
                 f"leaf_density must be a number from 0 (no leaves) to {MAX_LEAF_DENSITY:g}, "
                 f"got {self.leaf_density}"
             )
+        if not 1 <= self.shoots <= 8:
+            raise InvalidInputError(f"shoots must be from 1 to 8, got {self.shoots}")
+        if self.shoots > 1 and self.hiding is not None:
+            raise InvalidInputError("hiding needs a single shoot; leave shoots at 1")
+        if not 0.0 <= self.wilted_share <= 1.0:
+            raise InvalidInputError(f"wilted_share must be from 0 to 1, got {self.wilted_share}")
+        if not 0 <= self.clutter <= 40:
+            raise InvalidInputError(f"clutter must be from 0 to 40, got {self.clutter}")
         if (
             not self.fruits_per_truss
             or any(n < 0 for n in self.fruits_per_truss)
@@ -394,14 +410,3 @@ PRESETS: dict[str, Callable[[], PlantConfig]] = {
     "full": make_full_config,
 }
 """The plants of the thesis by name."""
-
-
-def make_config(preset: str) -> PlantConfig:
-    """The configuration of a preset.
-
-    Raises:
-        InvalidInputError: If there is no such preset.
-    """
-    if preset not in PRESETS:
-        raise InvalidInputError.choice("preset", preset, PRESETS)
-    return PRESETS[preset]()

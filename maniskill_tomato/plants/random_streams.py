@@ -17,6 +17,10 @@ class Stream(IntEnum):
     CURTAIN = 6
     NEIGHBOUR = 7
     DENSITY = 8
+    KIND = 9
+    CLUTTER = 10
+    SHOOT = 11
+    WILTED = 12
 
 
 def stream(seed: int, kind: Stream, index: int = 0) -> Generator:

@@ -9,7 +9,7 @@ import numpy as np
 
 from maniskill_tomato.errors import InvalidInputError
 from maniskill_tomato.plants.generator import Detail, generate_plant
-from maniskill_tomato.plants.organs import Float32, Fruit, MeshPart, Organ, Plant
+from maniskill_tomato.plants.organs import Float32, Plant, placed
 from maniskill_tomato.plants.random_streams import Stream, normal, stream
 
 ROW_SPACING = 0.5
@@ -88,17 +88,28 @@ def generate_row(
     if not 0.2 <= spacing <= 2.0:
         raise InvalidInputError(f"spacing must be from 0.2 to 2 m, got {spacing}")
     middle = generate_plant(preset, seed, detail, leaf_density_of(leaf_density, seed))
-    beside = neighbour_seeds(seed, seeds)
+    left, right = (
+        _single(preset, neighbour, detail, leaf_density_of(leaf_density, neighbour))
+        for neighbour in neighbour_seeds(seed, seeds)
+    )
+    return stand_in_row(middle, left, right, spacing)
+
+
+def stand_in_row(middle: Plant, left: Plant, right: Plant, spacing: float = ROW_SPACING) -> Row:
+    """A plant between two others; its seed draws their exact places and turns. See `generate_row`.
+
+    Args:
+        middle: The plant that the row is about.
+        left: At -y.
+        right: At +y.
+        spacing: Distance between the stems, in [m].
+    """
     organs, fruits = list(middle.organs), list(middle.fruits)
-    for i, (side, neighbour) in enumerate(zip(SIDES, beside, strict=True)):
-        rng = stream(seed, Stream.NEIGHBOUR, 2 + i)
+    for i, (side, neighbour) in enumerate(zip(SIDES, (left, right), strict=True)):
+        rng = stream(middle.seed, Stream.NEIGHBOUR, 2 + i)
         place = np.array([normal(rng, 0.0, PLACE_SPREAD), side * spacing + normal(rng, 0.0, PLACE_SPREAD), 0])
         turn = radians(normal(rng, 0.0, TURN_SPREAD_DEG))
-        moved = _moved(
-            _single(preset, neighbour, detail, leaf_density_of(leaf_density, neighbour)),
-            place.astype(np.float32),
-            turn,
-        )
+        moved = _moved(neighbour, place.astype(np.float32), turn)
         prefix = "left" if side < 0 else "right"
         fruits += [replace(f, organ_index=f.organ_index + len(organs)) for f in moved.fruits]
         organs += [replace(organ, name=f"{prefix}/{organ.name}") for organ in moved.organs]
@@ -110,7 +121,7 @@ def generate_row(
         fruits=tuple(fruits),
         middle_fruits=len(middle.fruits),
         middle_organs=len(middle.organs),
-        neighbour_seeds=beside,
+        neighbour_seeds=(left.seed, right.seed),
     )
 
 
@@ -130,11 +141,4 @@ def _single(preset: str, seed: int, detail: Detail, leaf_density: float | None) 
 def _moved(plant: Plant, place: Float32, turn: float) -> Plant:
     """The plant turned about its stem by `turn` [rad] and then moved to `place` [m]."""
     c, s = cos(turn), sin(turn)
-    rotation = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]], dtype=np.float32)
-
-    def part(p: MeshPart) -> MeshPart:
-        return replace(p, vertices=p.vertices @ rotation.T + place, normals=p.normals @ rotation.T)
-
-    organs: list[Organ] = [replace(o, parts=tuple(part(p) for p in o.parts)) for o in plant.organs]
-    fruits: list[Fruit] = [replace(f, centre=rotation @ f.centre + place) for f in plant.fruits]
-    return replace(plant, organs=tuple(organs), fruits=tuple(fruits))
+    return placed(plant, np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]], dtype=np.float32), place)

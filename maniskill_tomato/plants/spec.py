@@ -2,25 +2,19 @@
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, fields, replace
-from typing import Literal
+from dataclasses import dataclass, fields, replace
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
-from maniskill_tomato.errors import InvalidInputError
+from maniskill_tomato.errors import InvalidInputError, did_you_mean
 from maniskill_tomato.plants.generator import generate_plant
+from maniskill_tomato.plants.kinds import KINDS, PLANT_NAMES
+from maniskill_tomato.plants.mesh_set import ALL, RULE_NAMES, MeshSource
 from maniskill_tomato.plants.organs import Plant
-from maniskill_tomato.plants.plant_config import PRESETS
-from maniskill_tomato.plants.row import generate_row, leaf_density_of
-
-SEED_SPLITS: dict[str, tuple[int, int]] = {
-    "train": (0, 1_000_000),
-    "validation": (1_000_000, 2_000_000),
-    "held_out": (2_000_000, 3_000_000),
-}
-"""Half-open, disjoint ranges of plant seeds; a choice with a split's name as seed takes a new plant at every
-reset."""
+from maniskill_tomato.plants.row import generate_row, leaf_density_of, neighbour_seeds, stand_in_row
+from maniskill_tomato.plants.seed_splits import SEED_SPLITS
 
 ROW_NEIGHBOURS = 32
 """Neighbours in a row are among this number of plants of each split, so that a new row takes one new plant."""
@@ -34,7 +28,7 @@ class PlantSpec:
     """The identity of a plant, or a rule that draws a new one at every reset."""
 
     preset: str = "one_tomato"
-    """One of `maniskill_tomato.plants.plant_config.PRESETS`."""
+    """One of `maniskill_tomato.plants.kinds.PLANT_NAMES`."""
     seed: int | str = 0
     """The plant's seed, or the name of a split of `SEED_SPLITS`: then each reset draws a seed from it."""
     pool: int | None = None
@@ -48,10 +42,16 @@ class PlantSpec:
     row: bool = False
     """Whether the plant stands between two neighbours of its row (`plants.row`), drawn by its seed from the first
     `ROW_NEIGHBOURS` seeds of the same split."""
+    mesh: MeshSource | None = None
+    """Mesh files to take the plants from instead of growing them; preset, leaf density and detail then say nothing,
+    seeds are those of `MeshSet`, and the split `all` has every plant."""
 
     def __post_init__(self) -> None:
-        if self.preset not in PRESETS:
-            raise InvalidInputError.choice("plant preset", self.preset, PRESETS)
+        if self.mesh is not None:
+            self._check_mesh(self.mesh)
+            return
+        if self.preset not in PLANT_NAMES:
+            raise InvalidInputError.choice("plant preset", self.preset, PLANT_NAMES)
         if isinstance(self.seed, str):
             if self.seed not in SEED_SPLITS:
                 raise InvalidInputError(
@@ -75,6 +75,20 @@ class PlantSpec:
         if self.detail not in ("training", "picture"):
             raise InvalidInputError.choice("plant detail", self.detail, ("training", "picture"))
 
+    def _check_mesh(self, mesh: MeshSource) -> None:
+        """Checks what does not depend on a split, which a list of episodes may replace."""
+        if isinstance(self.seed, bool) or not isinstance(self.seed, str | int):
+            raise InvalidInputError(
+                f"plant seed must be a plant's number or a split's name; got {self.seed!r}"
+            )
+        if isinstance(self.seed, int):
+            mesh.plants.check(self.seed)
+        elif self.seed not in (*SEED_SPLITS, ALL):
+            raise InvalidInputError.choice("plant seed", self.seed, (*SEED_SPLITS, ALL))
+        pool = self.pool
+        if pool is not None and (isinstance(pool, bool) or not isinstance(pool, int) or pool < 1):
+            raise InvalidInputError(f"plant pool must be an integer of 1 or more; got {pool!r}")
+
     def _pool_fits(self) -> bool:
         if not isinstance(self.seed, str) or not isinstance(self.pool, int) or isinstance(self.pool, bool):
             return False
@@ -86,8 +100,28 @@ class PlantSpec:
         """Whether every reset draws a new plant."""
         return isinstance(self.seed, str)
 
+    @property
+    def first_seed(self) -> int:
+        """The seed itself, or the first that may be drawn.
+
+        Raises:
+            InvalidInputError: The mesh files have no plants of the split.
+        """
+        return self.seed if isinstance(self.seed, int) else self._seeds()[0]
+
+    def of_any_seed(self, split: str) -> "PlantSpec":
+        """The same plants where a list of episodes says which: those of a split, or all of mesh files."""
+        return replace(self, seed=split if self.mesh is None else ALL, pool=None)
+
     def grow(self, seed: int) -> Plant:
-        """Grows the plant of a seed, with its neighbours if it has any."""
+        """Grows the plant of a seed, or reads it from its file, with its neighbours if it has any."""
+        if self.mesh is not None:
+            plants = self.mesh.plants
+            if not self.row:
+                return plants.grow(seed)
+            beside = plants.seeds(plants.split_of(seed))[:ROW_NEIGHBOURS]
+            left, right = (plants.grow(beside[k]) for k in neighbour_seeds(seed, (0, len(beside))))
+            return stand_in_row(plants.grow(seed), left, right)
         if not self.row:
             return generate_plant(self.preset, seed, self.detail, leaf_density_of(self.leaf_density, seed))
         low = next((low for low, high in SEED_SPLITS.values() if low <= seed < high), 0)
@@ -98,8 +132,16 @@ class PlantSpec:
         """The seed itself, or one drawn from the split with `rng`."""
         if isinstance(self.seed, int):
             return self.seed
+        seeds = self._seeds()
+        return int(seeds[rng.randint(len(seeds))])
+
+    def _seeds(self) -> Sequence[int]:
+        """The seeds that are drawn from."""
+        assert isinstance(self.seed, str)
+        if self.mesh is not None:
+            return self.mesh.plants.seeds(self.seed)[: self.pool]
         low, high = SEED_SPLITS[self.seed]
-        return int(rng.randint(low, high if self.pool is None else low + self.pool))
+        return range(low, high if self.pool is None else low + self.pool)
 
     @classmethod
     def parse(
@@ -109,8 +151,9 @@ class PlantSpec:
 
         Args:
             value: None for the default; a preset's name; a mapping with any of this class's fields, which
-            replace the
-                default's.
+                replace the default's. With `mesh`, the path of a mesh file or of a folder of them, it may also hold
+                values of `MeshRules`, and the default's fields do not count: the plant is alone, and drawn from the
+                training plants of a folder.
             default: The task's own plant.
 
         Raises:
@@ -121,21 +164,43 @@ class PlantSpec:
         if isinstance(value, PlantSpec):
             return value
         if isinstance(value, str):
-            return replace(default, preset=value)
+            density = None if value in KINDS else default.leaf_density  # Each kind has its own.
+            return replace(default, preset=value, leaf_density=density)
         if isinstance(value, Mapping):
+            if value.get("mesh") is not None:
+                return cls._parse_mesh(value)
             names = [f.name for f in fields(cls)]
             unknown = sorted(set(value) - set(names))
             if unknown:
+                of_mesh = "; it goes with mesh=" if unknown[0] in RULE_NAMES else ""
                 raise InvalidInputError(
-                    f"plant has no field {', '.join(map(repr, unknown))}; the fields are {', '.join(names)}"
+                    f"plant has no field {', '.join(map(repr, unknown))}{of_mesh}; the fields are {', '.join(names)}"
                 )
             replaced = dict(value)
+            if replaced.get("preset") in KINDS:
+                replaced.setdefault("leaf_density", None)  # Each kind has its own.
             if not isinstance(replaced.get("seed", ""), str):
                 replaced.setdefault("pool", None)  # The default's pool is one of its split.
-            return cls(**{**asdict(default), **replaced})
+            return cls(**{**{name: getattr(default, name) for name in names}, **replaced})
         raise InvalidInputError(
-            f"plant must be None, a preset's name ({', '.join(PRESETS)}) or a mapping of "
+            f"plant must be None, a preset's name ({', '.join(PLANT_NAMES)}) or a mapping of "
             f"{', '.join(f.name for f in fields(cls))}; got {value!r}"
+        )
+
+    @classmethod
+    def _parse_mesh(cls, value: Mapping[str, Any]) -> "PlantSpec":
+        own = ("seed", "pool", "row")
+        allowed = ("mesh", *own, *RULE_NAMES)
+        for name in value:
+            if name not in allowed:
+                raise InvalidInputError(
+                    f"plant has no field {name!r} beside mesh, whose plants are not grown; the fields are "
+                    f"{', '.join(allowed)}{did_you_mean(name, allowed)}"
+                )
+        mesh = MeshSource.parse(value["mesh"], {n: v for n, v in value.items() if n in RULE_NAMES})
+        is_file = list(mesh.plants.files) == [0] and mesh.plants.path.is_file()
+        return cls(
+            mesh=mesh, **{"seed": 0 if is_file else "train", **{n: value[n] for n in own if n in value}}
         )
 
 

@@ -77,6 +77,18 @@ def leaf_texture(variant: int, *, upper: bool, size: int = 256) -> UInt8:
     return _rgba(base[..., 0], base[..., 1], base[..., 2])
 
 
+def wilted_texture(variant: int, *, upper: bool, size: int = 256) -> UInt8:
+    """A dying leaf: the fresh one's veins on yellow, brown from the margin inward."""
+    fresh = leaf_texture(variant, upper=upper, size=size)[..., :3].astype(np.float64)
+    rng = _generator(7 if upper else 8, variant)
+    across = np.abs(2 * (np.arange(size) + 0.5) / size - 1)[:, None]
+    patches = cloud(rng, size, size, 4)
+    shade = fresh.mean(-1, keepdims=True) / fresh.mean()
+    base = shade * np.array([178, 168, 78])
+    base = _blend(base, (126, 92, 52), np.clip(1.1 * across + 0.6 * patches - 0.35, 0, 1))
+    return _rgba(base[..., 0], base[..., 1], base[..., 2])
+
+
 def stalk_texture(kind: int, colour: Colour, *, streak: float, size: int = 128) -> UInt8:
     """A stem, petiole or peduncle: lengthwise streaks, pale fine hairs, a darker tint here and there."""
     rng = _generator(2, kind)

@@ -51,11 +51,16 @@ def make_render_shape(
     if part.material not in materials:
         made = MATERIALS[part.material]
         materials[part.material] = textured_material(made.base_color, made.roughness, made.specular)
+    vertices, normals, uvs, faces = part.vertices, part.normals, part.uvs, part.faces
+    if part.two_sided:
+        faces = np.concatenate([faces, faces[:, ::-1] + len(vertices)])
+        vertices, uvs = np.tile(vertices, (2, 1)), np.tile(uvs, (2, 1))
+        normals = np.concatenate([normals, -normals])
     return sapien.render.RenderShapeTriangleMesh(
-        vertices=part.vertices,
-        triangles=part.faces.astype(np.uint32),
-        normals=part.normals,
-        uvs=part.uvs,
+        vertices=vertices,
+        triangles=faces.astype(np.uint32),
+        normals=normals,
+        uvs=uvs,
         material=materials[part.material],
     )
 

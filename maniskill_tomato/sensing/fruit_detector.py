@@ -29,6 +29,10 @@ FEWEST_PIXELS: Final = 12
 LEAST_SCORE: Final = 0.3
 """A fruit with a lower score is left out. Low, because fruits that are mostly hidden get low scores."""
 
+ONE_SHARE: Final = 0.4
+"""Centres nearer to each other than this share of the sum of their radii belong to one fruit. Fruits that touch have
+0.85 or more, and the centre of a small piece is off by a third of a radius."""
+
 SURFACE_SHARE: Final = 0.7
 """The centre of a fruit lies this share of a radius behind the median depth of its visible surface."""
 
@@ -61,7 +65,22 @@ class FruitDetector:
         ]
         masks = tuple(np.ascontiguousarray(found.masks[k]) for k in kept)
         categories = [found.categories[k] for k in kept]
-        return Measurement(frame=frame, fruits=self._fruits(frame, masks, categories, found.scores[kept]))
+        fruits = self._fruits(frame, masks, categories, found.scores[kept])
+        measurement = Measurement(frame=frame, fruits=fruits)
+        return measurement if self._segmenter is None else self._joined(measurement)
+
+    def _joined(self, measurement: Measurement) -> Measurement:
+        """The view with pieces of one fruit, which a segmenter takes for several, measured as one."""
+        fruits = list(measurement.fruits)
+        for pieces in _pieces(fruits):
+            whole = max((fruits[k] for k in pieces), key=lambda fruit: fruit.pixels)
+            mask = np.logical_or.reduce([measurement.mask(k) for k in pieces])
+            score = np.array([max(fruits[k].score for k in pieces)], np.float32)
+            (joined,) = self._fruits(measurement.frame, (mask,), (whole.category,), score)
+            for k in pieces:
+                fruits[k] = joined
+        kept = tuple(dict.fromkeys(fruits))
+        return measurement if len(kept) == len(fruits) else Measurement(frame=measurement.frame, fruits=kept)
 
     def divide(self, measurement: Measurement, index: int, parts: Sequence[BinaryMask]) -> Measurement:
         """A view measured anew with a detection's mask divided.
@@ -118,6 +137,26 @@ class FruitDetector:
         if frame.rgb is None:
             raise InvalidInputError("a segmenter needs a picture with colours")
         return self._segmenter(frame.rgb, frame.depth_m)
+
+
+def _pieces(fruits: Sequence[DetectedFruit]) -> list[list[int]]:
+    """Detections that are pieces of one fruit, by their indices: two or more each.
+
+    Two fruits are solid; spheres of which one's centre lies well inside the other are one.
+    """
+    groups: list[list[int]] = []
+    for k, fruit in enumerate(fruits):
+        if not fruit.is_depth_measured:
+            continue
+        own = [group for group in groups if any(_is_one(fruit, fruits[j]) for j in group)]
+        groups = [group for group in groups if group not in own]
+        groups.append([j for group in own for j in group] + [k])
+    return [sorted(group) for group in groups if len(group) > 1]
+
+
+def _is_one(a: DetectedFruit, b: DetectedFruit) -> bool:
+    radii = sum(f.radius_m if np.isfinite(f.radius_m) else USUAL_RADIUS for f in (a, b))
+    return bool(np.linalg.norm(a.centre_w - b.centre_w) < ONE_SHARE * radii)
 
 
 def _fruit(

@@ -112,7 +112,7 @@ class SimulatedCamera:
                 shown, pose = self._scene.plant(k).fruits, T_world_plant[k].double().cpu().numpy()
                 told = simulated_masks(
                     frame,
-                    {j: pose[:3, :3] @ shown[j].centre + pose[:3, 3] for j in numbers},
+                    {j: pose[:3, :3] @ shown[j].centre.astype(np.float64) + pose[:3, 3] for j in numbers},
                     {j: shown[j].radius for j in numbers},
                     generator,
                     self._errors,

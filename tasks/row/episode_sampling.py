@@ -23,7 +23,7 @@ def draw_episodes(split: str, count: int, first_seed: int = 0, taken: Collection
     """Episodes of `TomatoViewpoint-v1` on different plants of a split, as their list replays them.
 
     Args:
-        split: A name of `plants.spec.SEED_SPLITS`.
+        split: A name of `SEED_SPLITS`.
         count: How many.
         first_seed: Seed of the first reset; the next ones follow.
         taken: Seeds of plants that are not drawn.
@@ -43,7 +43,7 @@ def draw_episodes(split: str, count: int, first_seed: int = 0, taken: Collection
             if plant_seed in plants or game.soft_starts > soft:
                 continue
             plants.add(plant_seed)
-            drawn.append(_episode(world, plant_seed))
+            drawn.append(episode_of(world))
         replayed = make_world("TomatoViewpoint-v1", episodes=drawn)
         for i, episode in enumerate(drawn):
             replayed.reset(options={"episode": i})
@@ -58,7 +58,7 @@ def extend_episodes(
     """A longer list, the given one first.
 
     Args:
-        split: A name of `plant_choice.SEED_SPLITS`.
+        split: A name of `SEED_SPLITS`.
         episodes: What there is.
         count: How many there are to be.
         on_block: Called with the list after every `CHUNK` episodes.
@@ -75,7 +75,12 @@ def extend_episodes(
     return longer
 
 
-def _episode(world: World, plant_seed: int) -> Episode:
+def episode_of(world: World) -> Episode:
+    """The episode that the first environment of a world has just begun, as a list replays it.
+
+    Its V_f of the first view is left at 0: rounded numbers begin a little elsewhere.
+    """
+    plant_seed = int(world.state.plant_seed[0])
     x, y, yaw = world.state.plant_pose[0].tolist()
     camera = world.belief.camera_position[0].tolist()
     density = leaf_density_of(world.plant_batch.spec.leaf_density, plant_seed)

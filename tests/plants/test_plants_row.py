@@ -6,7 +6,8 @@ import pytest
 from maniskill_tomato.errors import InvalidInputError
 from maniskill_tomato.plants.generator import generate_plant
 from maniskill_tomato.plants.row import ROW_SPACING, generate_row, leaf_density_of, neighbour_seeds
-from maniskill_tomato.plants.spec import ROW_NEIGHBOURS, SEED_SPLITS, PlantSpec
+from maniskill_tomato.plants.seed_splits import SEED_SPLITS
+from maniskill_tomato.plants.spec import ROW_NEIGHBOURS, PlantSpec
 
 
 def test_the_middle_of_a_row_is_the_plant_of_its_seed() -> None:

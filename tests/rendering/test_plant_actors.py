@@ -1,9 +1,12 @@
 """Plants in a ManiSkill scene: every organ has its own segmentation id, with and without a renderer."""
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 import sapien
 import torch
+import trimesh
 from mani_skill.envs.scene import ManiSkillScene
 from mani_skill.envs.utils.system.backend import parse_sim_and_render_backend
 from mani_skill.render import PREBUILT_SHADER_CONFIGS, set_shader_pack
@@ -11,6 +14,8 @@ from mani_skill.utils.structs.actor import Actor
 from numpy.typing import NDArray
 
 from maniskill_tomato.plants.generator import generate_plant
+from maniskill_tomato.plants.mesh_plant import plant_from_mesh
+from maniskill_tomato.plants.mesh_rules import MeshRules
 from maniskill_tomato.plants.organs import Plant
 from maniskill_tomato.rendering.plant_actors import build_plant_actors
 
@@ -104,3 +109,21 @@ def test_a_fruit_is_drawn_where_the_plant_says() -> None:
     assert abs(np.median(columns) - 159.5) < 3
     assert abs(np.ptp(columns) / 2 - fruit.radius * pixels_per_metre) < 3
     assert abs(np.mean([rows.min(), rows.max()]) - 159.5) < 6
+
+
+@pytest.mark.render
+def test_an_open_sheet_of_a_mesh_file_is_drawn_from_both_sides(tmp_path: Path) -> None:
+    """Over the fruit a sheet of one side: it covers the fruit for both cameras, as rays say it does."""
+    ball = trimesh.creation.icosphere(subdivisions=2, radius=0.03)
+    ball.apply_translation([0.0, 0.0, 0.5])
+    sheets = [[[x, -0.2, 0.3], [x, 0.2, 0.3], [x, 0.0, 0.9]] for x in (-0.1, 0.1)]
+    np.savez(
+        tmp_path / "a.npz", fruit_0=ball.triangles, leaf_0=np.array(sheets), stem=np.array(sheets[:1]) * 0.1
+    )
+    plant = plant_from_mesh(tmp_path / "a.npz", MeshRules())
+    scene = make_scene("cpu")
+    fruit, leaf, _ = (int(actor.per_scene_id[0]) for actor in build(scene, plant))
+    for side in (-1.0, 1.0):
+        image = photograph(scene, [-0.7 * side, 0.0, 0.5], np.array([side, 0.0, 0.0]))
+        assert leaf in image and fruit not in image
+    assert fruit in photograph(scene, [0.0, -0.7, 0.5], np.array([0.0, 1.0, 0.0]))

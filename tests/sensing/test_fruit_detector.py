@@ -117,3 +117,36 @@ def test_what_segmentation_needs_must_be_in_the_frame() -> None:
             T_world_camera=np.eye(4),
             robot_mask=np.zeros((60, 81), np.bool_),
         )
+
+
+def test_pieces_of_one_fruit_are_measured_as_one_and_two_that_touch_are_not() -> None:
+    rows, columns = np.mgrid[:60, :80]
+    camera, radius = color_intrinsics(80, 60), 0.027
+    rays = camera.ray_directions(camera.pixel_centres())
+    depth = np.full((60, 80), 0.6, np.float32)
+    discs = []
+    for centre in (np.array([-0.03, 0.0, 0.3]), np.array([0.023, 0.0, 0.3])):
+        along, square = rays @ centre, (rays**2).sum(-1)
+        inside = along**2 - square * (centre @ centre - radius**2)
+        hit = np.where(inside > 0.0, (along - np.sqrt(np.maximum(inside, 0.0))) / square, np.inf)
+        disc = hit < depth
+        depth = np.minimum(depth, hit).astype(np.float32)
+        discs.append(disc)
+    middle = int(columns[discs[0]].mean())
+    masks = np.stack([discs[0] & (columns <= middle), discs[0] & (columns > middle), discs[1]])
+    scores, kinds = np.array([0.5, 0.8, 0.9], np.float32), ("tomato_ripe",) * 3
+    found = Instances.from_masks(masks, scores, kinds)
+    view = PosedFrame(
+        depth_m=depth,
+        intrinsics=camera,
+        # Looked down on, a flat fruit has a round outline.
+        T_world_camera=np.diag([1.0, -1.0, -1.0, 1.0]),
+        rgb=np.zeros((60, 80, 3), np.uint8),
+    )
+    measured = FruitDetector(lambda image, depth_m=None: found).measure(view)
+    assert len(measured.fruits) == 2
+    for k, (disc, score) in enumerate(zip(reversed(discs), (0.9, 0.8), strict=True)):
+        np.testing.assert_array_equal(measured.mask(k), disc)
+        fruit = measured.fruits[k]
+        assert fruit.visible_fraction > 0.9
+        assert (fruit.score, fruit.radius_m) == pytest.approx((score, radius), abs=0.003)

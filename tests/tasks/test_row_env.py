@@ -19,7 +19,7 @@ from maniskill_tomato.plants.episode_list import (
     read_episodes,
     write_episodes,
 )
-from maniskill_tomato.plants.spec import SEED_SPLITS
+from maniskill_tomato.plants.seed_splits import SEED_SPLITS
 from maniskill_tomato.raycast.scene import RayScene
 from maniskill_tomato.robot.iiwa14 import NUM_JOINTS
 from maniskill_tomato.robot.kinematics import forward_kinematics

@@ -13,7 +13,8 @@ import torch
 
 import maniskill_tomato  # noqa: F401
 from maniskill_tomato.errors import InvalidInputError, RenderingUnavailableError
-from maniskill_tomato.plants.spec import SEED_SPLITS, PlantPose, PlantSpec
+from maniskill_tomato.plants.seed_splits import SEED_SPLITS
+from maniskill_tomato.plants.spec import PlantPose, PlantSpec
 from maniskill_tomato.tasks import TASK_IDS
 
 GUIDED, SPARSE = TASK_IDS[:2]

@@ -15,7 +15,7 @@ import numpy as np
 
 from maniskill_tomato.errors import InvalidInputError, RenderingUnavailableError
 from maniskill_tomato.files import write_atomically
-from maniskill_tomato.plants.spec import SEED_SPLITS
+from maniskill_tomato.plants.seed_splits import SEED_SPLITS
 from maniskill_tomato.rendering.vulkan_probe import NO_RENDERING_HINT, rendering_available
 from maniskill_tomato.robot.d435 import color_intrinsics
 from maniskill_tomato.segmentation.datasets.annotations import (

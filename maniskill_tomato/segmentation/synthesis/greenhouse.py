@@ -261,10 +261,10 @@ def _sky(strength: float) -> sapien.render.RenderCubemap:
 
 
 def _merged(parts: Sequence[MeshPart]) -> list[MeshPart]:
-    """One part for each material."""
+    """One part for each material and number of sides."""
     merged = []
-    for material in sorted({part.material for part in parts}):
-        same = [part for part in parts if part.material == material]
+    for material, two_sided in sorted({(part.material, part.two_sided) for part in parts}):
+        same = [part for part in parts if (part.material, part.two_sided) == (material, two_sided)]
         merged.append(
             MeshPart(
                 vertices=np.concatenate([part.vertices for part in same]),
@@ -272,6 +272,7 @@ def _merged(parts: Sequence[MeshPart]) -> list[MeshPart]:
                 uvs=np.concatenate([part.uvs for part in same]),
                 faces=joined_faces(same),
                 material=material,
+                two_sided=two_sided,
             )
         )
     return merged

@@ -1,0 +1,189 @@
+"""Episodes that the oracle was asked about; on plants from mesh files, drawn until it solves as many as are wanted."""
+
+import logging
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
+from functools import partial
+from pathlib import Path
+from typing import Any, Final
+
+from maniskill_tomato.errors import InvalidInputError
+from maniskill_tomato.experiments.result_store import ResultStore
+from maniskill_tomato.plants.episode_list import Episode, write_episodes
+from maniskill_tomato.plants.mesh_set import ALL, MeshSource
+from maniskill_tomato.plants.seed_splits import SEED_SPLITS
+from maniskill_tomato.policies.oracle import OracleSearch
+from maniskill_tomato.tasks.making import make_world
+from maniskill_tomato.tasks.row.episode_sampling import episode_of
+from maniskill_tomato.worker_pool import run_jobs
+
+logger = logging.getLogger(__name__)
+
+ENV_ID: Final = "TomatoViewpoint-v1"
+
+GIVE_UP_AFTER: Final = 12
+"""Draws in a row on one plant that are no hidden start or that the oracle does not solve."""
+
+FIRST_SEED: Final = 7_000_000
+"""Of the first draw on the first plant."""
+
+SEEDS_A_PLANT: Final = 10_000
+"""The draws on each plant begin this far from those on the plant before."""
+
+STORED: Final = "certified"
+"""Where a benchmark's folder keeps the draws."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class PlantDraws:
+    """What was drawn on one plant."""
+
+    episodes: tuple[Episode, ...]
+    """Those that the oracle solves, in the order in which they were drawn."""
+    unsolved: int
+    """Hidden starts that it does not solve."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class CertifiedList:
+    """A list of episodes on plants from mesh files."""
+
+    path: Path
+    """The list's file."""
+    plant: dict[str, Any]
+    """The option `plant` with which the list is replayed."""
+    facts: dict[str, Any]
+    """How it came about, for the reader."""
+
+
+def certify(
+    episodes: Sequence[Episode], contact_free: bool = False, plant: Mapping[str, object] | None = None
+) -> list[Episode]:
+    """The episodes with the fewest moves that the oracle finds within the task's limit.
+
+    Args:
+        episodes: What it is asked about.
+        contact_free: Whether no move may touch the plant.
+        plant: The option `plant` of the task; None for our own plants.
+    """
+    world = make_world(ENV_ID, episodes=list(episodes), plant=plant)
+    task: Any = world.task
+    search = OracleSearch(world.ground_truth, world.device, contact_free=contact_free)
+    certified = []
+    for number, episode in enumerate(episodes):
+        world.reset(options={"episode": number})
+        belief = world.belief
+        solution = search.solve(belief.camera_position[0], belief.target_position[0], 0, int(task.max_moves))
+        start = round(float(world.state.visible_fraction[0]), 4) if plant else episode.start_visibility
+        moves = None if solution is None else solution.moves
+        certified.append(replace(episode, oracle_moves=moves, certified=True, start_visibility=start))
+    return certified
+
+
+def draw_on_plant(plant: Mapping[str, object], count: int, contact_free: bool, seed: int) -> PlantDraws:
+    """Draws hidden starts on one plant until the oracle solves so many, or gives the plant up.
+
+    More are the same ones and others after them.
+
+    Args:
+        plant: The option `plant` of the task.
+        count: How many are wanted.
+        contact_free: Whether the oracle avoids the plant.
+        seed: The plant's.
+    """
+    world = make_world(ENV_ID, plant={**plant, "seed": seed})
+    game: Any = world.game
+    episodes: list[Episode] = []
+    unsolved = failed = 0
+    low = next(low for low, high in SEED_SPLITS.values() if low <= seed < high)
+    number = FIRST_SEED + SEEDS_A_PLANT * (seed - low)
+    while len(episodes) < count and failed < GIVE_UP_AFTER:
+        soft = game.soft_starts
+        number += 1
+        failed += 1
+        try:
+            world.reset(number)
+        except InvalidInputError:
+            continue  # The arm reaches none of its ripe fruits where the plant stands now.
+        if game.soft_starts > soft:
+            continue
+        (episode,) = certify([episode_of(world)], contact_free, plant)
+        if episode.oracle_moves is None:
+            unsolved += 1
+            continue
+        episodes.append(episode)
+        failed = 0
+    return PlantDraws(episodes=tuple(episodes), unsolved=unsolved)
+
+
+def certified_list(
+    place: str, count: int, store: ResultStore, folder: Path, *, contact_free: bool, processes: int
+) -> CertifiedList:
+    """Episodes on the plants of a folder that the oracle solves, spread evenly, in turn of the plants.
+
+    Args:
+        place: FOLDER or FOLDER:SPLIT.
+        count: How many episodes.
+        store: Keeps the draws, so that what was stopped goes on.
+        folder: Where the list's file goes.
+        contact_free: Whether the oracle avoids the plants.
+        processes: How many at a time.
+
+    Raises:
+        InvalidInputError: There are no plants, or the oracle solves fewer episodes on them.
+    """
+    source, split = parse_place(place)
+    plants = source.plants
+    seeds = plants.seeds(split)
+    plant: dict[str, Any] = {"mesh": source.path, "seed": ALL}
+    wanted = -(-count // len(seeds))
+    stored = {seed: _read(result, wanted) for seed, result in store.read(STORED, "plants").items()}
+    found = {seed: draws for seed, draws in stored.items() if draws is not None}
+    missing = [seed for seed in seeds if seed not in found]
+    work = partial(draw_on_plant, plant, wanted, contact_free)
+    for seed, draws in run_jobs(work, missing, processes):
+        found[seed] = draws
+        result = {
+            "wanted": wanted,
+            "unsolved": draws.unsolved,
+            "episodes": [asdict(e) for e in draws.episodes],
+        }
+        store.add(STORED, "plants", {seed: result})
+        logger.info("%s: %d of %d episodes", plants.files[seed].name, len(draws.episodes), wanted)
+    drawn = [found[seed] for seed in seeds]
+    turns = [d.episodes[k] for k in range(wanted) for d in drawn if k < len(d.episodes)][:count]
+    if len(turns) < count:
+        raise InvalidInputError(
+            f"the oracle solves only {len(turns)} episodes on the {len(seeds)} plants of {place}, --episodes asks for "
+            f"{count}; on {sum(not d.episodes for d in drawn)} plants it solves none of {GIVE_UP_AFTER} draws: are "
+            "their ripe fruits in the arm's reach, and hidden from somewhere?"
+        )
+    path = folder / f"episodes_{count}.json"
+    write_episodes(path, turns)
+    facts = {
+        "plants": f"{sum(bool(d.episodes) for d in drawn)} of {len(seeds)} ({split})",
+        "hidden starts that the oracle does not solve": sum(d.unsolved for d in drawn),
+    }
+    return CertifiedList(path=path, plant=plant, facts=facts)
+
+
+def parse_place(place: str) -> tuple[MeshSource, str]:
+    """The plants of FOLDER or FOLDER:SPLIT and the split, which is `held_out` unless it is said.
+
+    Raises:
+        InvalidInputError: There is no such folder or split.
+    """
+    folder, colon, split = place.rpartition(":")
+    if not colon or Path(place).exists():
+        folder, split = place, "held_out"
+    elif split not in (*SEED_SPLITS, ALL):
+        raise InvalidInputError.choice("the split of --plants FOLDER:SPLIT", split, (*SEED_SPLITS, ALL))
+    return MeshSource.parse(str(Path(folder).resolve())), split
+
+
+def _read(result: Mapping[str, Any], wanted: int) -> PlantDraws | None:
+    """Draws as they were stored; None if more are wanted now."""
+    episodes = tuple(Episode(**row) for row in result["episodes"])
+    if result["wanted"] < wanted and len(episodes) == result["wanted"]:
+        return None
+    return PlantDraws(episodes=episodes[:wanted], unsolved=result["unsolved"])

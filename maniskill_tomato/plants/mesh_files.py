@@ -1,0 +1,170 @@
+"""The named objects of a mesh file: GLB, glTF, OBJ and PLY by trimesh, and `.npz` with an array an object."""
+
+import re
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from maniskill_tomato.errors import InvalidInputError
+from maniskill_tomato.plants.meshing import Float64, Int64
+
+MESH_SUFFIXES: Final = (".glb", ".gltf", ".obj", ".ply", ".npz")
+"""Endings of the files that can be a plant."""
+
+PLY_LABELS: Final = ("object", "instance", "label", "class")
+"""Whole numbers of a PLY's faces or vertices that tell its objects apart, the first one that there is."""
+
+_OPAQUE: Final = 128
+"""An alpha below this of 255 is a hole."""
+
+
+@dataclass(frozen=True, eq=False)
+class MeshObject:
+    """One named object of a file, in the file's own frame and unit."""
+
+    name: str
+    material: str
+    """Name of its material, or empty."""
+    vertices: Float64
+    """Shape (V, 3)."""
+    faces: Int64
+    """Vertex indices. Shape (F, 3)."""
+    has_holes: bool = False
+    """Whether the alpha channel of its texture makes parts of it invisible."""
+
+
+def read_objects(path: Path) -> list[MeshObject]:
+    """The objects of a file that have triangles, in the order of their names.
+
+    Raises:
+        InvalidInputError: There is no such file, it cannot be read, or an object's numbers are not finite.
+    """
+    if not path.is_file():
+        raise InvalidInputError(f"there is no mesh file {path}")
+    suffix = path.suffix.lower()
+    if suffix not in MESH_SUFFIXES:
+        raise InvalidInputError.choice(f"the ending of the mesh file {path.name}", path.suffix, MESH_SUFFIXES)
+    objects = list(_read_npz(path) if suffix == ".npz" else _read_scene(path, suffix))
+    for found in objects:
+        if not np.isfinite(found.vertices).all():
+            raise InvalidInputError(f"{path}: object {found.name!r} has corners that are not finite numbers")
+    if not objects:
+        raise InvalidInputError(f"{path} holds no triangles")
+    # Not in the file's order, which its reader does not keep: the number of a fruit must always be the same.
+    return sorted(objects, key=lambda found: (found.name, found.material))
+
+
+def _read_npz(path: Path) -> Iterator[MeshObject]:
+    try:
+        with np.load(path, allow_pickle=False) as arrays:
+            named = {name: arrays[name] for name in arrays.files}
+    except (OSError, ValueError, EOFError) as error:
+        raise InvalidInputError(f"{path} cannot be read as .npz: {error}") from error
+    for name, corners in named.items():
+        if corners.ndim != 3 or corners.shape[1:] != (3, 3) or corners.dtype.kind not in "fiu":
+            raise InvalidInputError(
+                f"{path}: object {name!r} must be an array of triangles of shape (F, 3, 3), got "
+                f"{corners.dtype} of shape {corners.shape}"
+            )
+        if len(corners):
+            yield MeshObject(name, "", *_joined_corners(corners.astype(np.float64)))
+
+
+def _joined_corners(corners: Float64) -> tuple[Float64, Int64]:
+    """Vertices and faces of triangles of shape (F, 3, 3), with equal corners as one vertex."""
+    from trimesh.grouping import unique_rows
+
+    points = corners.reshape(-1, 3)
+    if not np.isfinite(points).all():
+        return points, np.arange(len(points)).reshape(-1, 3)
+    first, inverse = unique_rows(points, digits=7)
+    return points[first], inverse.reshape(-1, 3).astype(np.int64)
+
+
+def _read_scene(path: Path, suffix: str) -> Iterator[MeshObject]:
+    import trimesh
+
+    options: dict[str, Any] = {"split_objects": True} if suffix == ".obj" else {}
+    try:
+        scene = trimesh.load_scene(path, process=False, **options)
+    except Exception as error:  # Its readers raise whatever a broken file makes them raise.
+        raise InvalidInputError(f"{path} cannot be read as {suffix[1:].upper()}: {error}") from error
+    parents = scene.graph.transforms.parents
+    for node in scene.graph.nodes_geometry:
+        T_scene_node, geometry = scene.graph[node]
+        mesh = scene.geometry[geometry]
+        if not isinstance(mesh, trimesh.Trimesh) or not len(mesh.faces):
+            continue
+        material = getattr(mesh.visual, "material", None)
+        label = str(getattr(material, "name", None) or "")
+        name = _object_name(str(node), str(parents.get(node, "")), label)
+        T = np.asarray(T_scene_node)
+        faces = np.asarray(mesh.faces, dtype=np.int64)
+        if np.linalg.det(T[:3, :3]) < 0.0:
+            faces = faces[:, ::-1]  # A mirrored node turns its triangles inside out.
+        vertices = np.asarray(mesh.vertices, dtype=np.float64) @ T[:3, :3].T + T[:3, 3]
+        labels = _face_labels(path, mesh) if suffix == ".ply" else None
+        for number, own in [(None, faces)] if labels is None else _by_label(labels, faces):
+            named = path.stem if suffix == ".ply" else name
+            if number is not None:
+                named = number
+            used, inverse = np.unique(own, return_inverse=True)
+            # Exporters cut meshes along the seams of textures and normals: the same place is one vertex again.
+            yield MeshObject(
+                named,
+                label,
+                *_joined_corners(vertices[used][inverse.reshape(-1, 3)]),
+                has_holes=_has_holes(material),
+            )
+
+
+def _object_name(node: str, parent: str, material: str) -> str:
+    """The name that a user gave: trimesh adds a code where a node has several materials, and an OBJ's material."""
+    if parent and re.fullmatch(re.escape(parent) + r"_[0-9a-f]{6}", node):
+        return parent
+    return node.removesuffix(f"_{material}") if material else node
+
+
+def _face_labels(path: Path, mesh: Any) -> tuple[str, NDArray[Any]] | None:
+    """The property that tells a PLY's objects apart and its value for each face; None without one."""
+    raw = mesh.metadata.get("_ply_raw", {})
+    for element in ("face", "vertex"):
+        data = raw.get(element, {}).get("data")
+        names = getattr(getattr(data, "dtype", None), "names", None) or (
+            data if isinstance(data, dict) else ()
+        )
+        for name in (n for n in PLY_LABELS if n in names):
+            values = np.asarray(data[name]).reshape(-1)
+            expected = len(mesh.faces) if element == "face" else len(mesh.vertices)
+            if len(values) != expected:
+                raise InvalidInputError(
+                    f"{path}: the {element}s have {len(values)} values of {name!r} for {expected} triangles or "
+                    "vertices; triangulate the mesh before it is written"
+                )
+            return name, values if element == "face" else values[mesh.faces[:, 0]]
+    return None
+
+
+def _by_label(labels: tuple[str, NDArray[Any]], faces: Int64) -> Iterator[tuple[str | None, Int64]]:
+    name, values = labels
+    for value in np.unique(values):
+        yield f"{name}_{value:g}", faces[values == value]
+
+
+def _has_holes(material: Any) -> bool:
+    """Whether a material's alpha channel cuts pieces out."""
+    if getattr(material, "alphaMode", None) == "OPAQUE":
+        return False
+    image = getattr(material, "baseColorTexture", None) or getattr(material, "image", None)
+    mode = getattr(image, "mode", "")
+    if image is None or not (mode in ("RGBA", "LA") or "transparency" in getattr(image, "info", {})):
+        return False
+    # glTF's default is opaque, whatever the picture holds.
+    if hasattr(material, "alphaMode") and material.alphaMode is None:
+        return False
+    alpha = np.asarray(image.convert("RGBA"))[..., 3]
+    return bool((alpha < _OPAQUE).any())
