@@ -1,12 +1,19 @@
 """The only way to an arm: `Safety` checks every command, and every reported state is checked before it is used."""
 
 import logging
+from collections.abc import Callable
 from typing import Final
 
 import numpy as np
 
 from maniskill_tomato.deploy.clock import Clock
-from maniskill_tomato.deploy.deploy_errors import DeviceTimeoutError, FaultError, RefusedError
+from maniskill_tomato.deploy.deploy_errors import (
+    DeviceTimeoutError,
+    FaultError,
+    HeartbeatLostError,
+    RefusedError,
+    StoppedError,
+)
 from maniskill_tomato.deploy.interface import LIMIT_SLACK, Arm, ArmState, Float64, JointMove
 from maniskill_tomato.deploy.safety import Safety
 from maniskill_tomato.robot.iiwa14 import JOINT_LOWER, JOINT_NAMES, JOINT_UPPER, VELOCITY_LIMITS
@@ -24,22 +31,37 @@ MOVE_TIME_EXTRA: Final = 5.0
 
 
 class GuardedArm:
-    """An arm that refuses what is not safe. Nothing else in `deploy` calls `Arm.command`."""
+    """An arm that refuses what is not safe. Nothing else in `deploy` calls `Arm.command`.
 
-    def __init__(self, arm: Arm, safety: Safety, clock: Clock) -> None:
+    A stop stays: after `stop`, or once the run's stops say so, no move is sent until `begin_run`.
+    """
+
+    def __init__(self, arm: Arm, safety: Safety, clock: Clock, forbidden: str | None = None) -> None:
         """Wraps an arm.
 
         Args:
             arm: Connected by the caller.
             safety: The envelope.
             clock: The one that the arm's time stamps come from.
+            forbidden: Why no move may be sent at all; None if moves may be sent.
         """
+        self._forbidden = forbidden
+        self._stopped: str | None = None
+        self._why_stop: Callable[[], str | None] = _nobody
         self._arm = arm
         self.safety = safety
         self._clock = clock
         self._last: ArmState | None = None
         self._under_way: JointMove | None = None
         self._deadline = 0.0
+
+    def begin_run(self, why_stop: Callable[[], str | None]) -> None:
+        """Forgets the stop of an earlier run.
+
+        Args:
+            why_stop: Why the new one has to stop, None while it need not; asked before every move is sent and after.
+        """
+        self._stopped, self._why_stop = None, why_stop
 
     @property
     def simulated(self) -> bool:
@@ -102,16 +124,24 @@ class GuardedArm:
 
         Raises:
             RefusedError: It is not safe, with the reason; nothing was sent.
+            StoppedError: The run was stopped; nothing was sent.
+            HeartbeatLostError: The same, because the loop stood still.
             FaultError: The driver says it sent something else than was checked.
         """
+        if self._forbidden is not None:
+            raise RefusedError(self._forbidden)
         state = self.read()
         refusal = self.safety.check(move, state, self._clock.now(), frame_stamp, points_w)
         if refusal is not None:
             raise RefusedError(str(refusal))
         if self._under_way is not None:
             raise RefusedError("busy: the last move has not ended")
+        self._check_stopped()
         sent = self._arm.command(move)
         self._under_way = sent
+        if self._asked_to_stop() is not None:
+            # Asked while it was sent.
+            self.stop()
         turn = np.abs(sent.joint_positions - state.joint_positions)
         expected = float((turn / (VELOCITY_LIMITS * move.speed_fraction)).max())
         self._deadline = self._clock.now() + MOVE_TIME_FACTOR * expected + MOVE_TIME_EXTRA
@@ -144,8 +174,26 @@ class GuardedArm:
                 )
         return True
 
+    def _asked_to_stop(self) -> str | None:
+        if self._stopped is None:
+            self._stopped = self._why_stop()
+        return self._stopped
+
+    def _check_stopped(self) -> None:
+        why = self._asked_to_stop()
+        if why == HeartbeatLostError.reason:
+            raise HeartbeatLostError("the loop stood still for too long; no move is sent any more")
+        if why is not None:
+            raise StoppedError(why)
+
     def stop(self) -> bool:
-        """Does what can be done to end the move under way; whether the arm stands by it. Never raises."""
+        """Does what can be done to end the move under way, and lets no other one out before `begin_run`.
+
+        Returns:
+            Whether the arm stands by it. Never raises.
+        """
+        if self._stopped is None:
+            self._stopped = "stopped"
         stopped = self._arm.stop()
         if stopped:
             self._under_way = None
@@ -154,3 +202,8 @@ class GuardedArm:
                 "the move under way goes on to its end: only the smartPAD or the emergency stop halts it"
             )
         return stopped
+
+
+def _nobody() -> None:
+    """Nobody asks for a stop."""
+    return None

@@ -28,6 +28,7 @@ from maniskill_tomato.deploy.deploy_errors import (
     HeartbeatLostError,
     PerceptionError,
     RefusedError,
+    StoppedError,
 )
 from maniskill_tomato.deploy.goal import Goal, Look, OneFruit
 from maniskill_tomato.deploy.interface import Float64, Frame, JointMove
@@ -156,6 +157,7 @@ class Loop:
         self._policy, self._stops = policy, stops
         self._goal = goal or OneFruit(workcell.perception, profile.loop, workcell.target_position())
         self._settle, self._mode = profile.loop.settle, mode
+        self._arm.begin_run(stops.asked)
         self._recorders, self._confirm = recorders, confirm
         self._robot_belief = RobotBelief(profile.T_flange_camera, self._goal.max_moves)
         self._chooser = MoveChooser(self._arm.safety, profile.T_flange_camera)
@@ -181,6 +183,8 @@ class Loop:
                 self._one_look()
         except _End as end:
             reason, detail, is_fault = end.reason, end.detail, end.is_fault
+        except StoppedError as error:
+            reason, detail, is_fault = error.reason, str(error), False
         except PolicyError as error:
             reason, detail, is_fault = "policy", str(error), True
         except DeployError as error:

@@ -21,7 +21,7 @@ from maniskill_tomato.deploy.loop import TASK, Loop, default_policy
 from maniskill_tomato.deploy.profile import Profile
 from maniskill_tomato.deploy.recording import McapRecorder
 from maniskill_tomato.deploy.run_records import Mode, Proposal, Recorder, RunResult, Step
-from maniskill_tomato.deploy.workcell import Workcell, make_workcell
+from maniskill_tomato.deploy.workcell import NOT_CALIBRATED, Workcell, make_workcell
 from maniskill_tomato.errors import TomatoError
 from maniskill_tomato.files import write_atomically
 from maniskill_tomato.policies.opening import open_policy
@@ -112,10 +112,7 @@ def prepare(config: RunConfig, clock: Clock | None = None) -> Prepared:
     mode: Mode = config.mode or ("unattended" if workcell.simulated else "dry_run")
     if not workcell.simulated and not profile.calibrated:
         if mode != "dry_run":
-            raise ProfileError(
-                "the camera's place on the flange is not calibrated: run `maniskill-tomato deploy calibrate` and name "
-                "its file in calibration.file; without it only a dry run is allowed"
-            )
+            raise ProfileError(NOT_CALIBRATED)
         _logger.warning("not calibrated: the camera's place on the flange is that of the drawings")
     facts: dict[str, Any] = {
         "profile": profile.name,

@@ -2,8 +2,6 @@
 
 Errors name the key."""
 
-import json
-import tomllib
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -21,6 +19,7 @@ from maniskill_tomato.deploy.safety import SafetyConfig
 from maniskill_tomato.deploy.toml_tables import parse_table
 from maniskill_tomato.errors import InvalidInputError, check_ranges
 from maniskill_tomato.robot.d435 import T_flange_camera_color_optical
+from maniskill_tomato.text_files import parse_toml, read_json
 
 TABLES: Final = (
     "description",
@@ -155,8 +154,8 @@ def parse_profile(text: str, path: Path, T_flange_camera: Any = None) -> Profile
         ProfileError: Something in it is wrong.
     """
     try:
-        data = tomllib.loads(text)
-    except tomllib.TOMLDecodeError as error:
+        data = parse_toml(text)
+    except InvalidInputError as error:
         raise ProfileError(f"{path} is no TOML: {error}") from error
     for key in data:
         if key not in TABLES:
@@ -218,7 +217,7 @@ def _calibration(table: Mapping[str, Any], path: Path) -> tuple[Float64, bool]:
         file = path.parent / str(table["file"])
         where = f"T_flange_camera in {file}"
         try:
-            values = json.loads(file.read_text(encoding="utf-8"))["T_flange_camera"]
+            values = read_json(file)["T_flange_camera"]
         except (OSError, ValueError, KeyError, TypeError) as error:
             raise ProfileError(
                 f"{path.name}: calibration.file {file} cannot be used ({error}); `maniskill-tomato deploy calibrate` "
@@ -228,7 +227,7 @@ def _calibration(table: Mapping[str, Any], path: Path) -> tuple[Float64, bool]:
         return T_flange_camera_color_optical, False
     try:
         T = np.array(values, dtype=np.float64)
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         T = np.zeros(0)
     if T.shape != (4, 4) or not np.isfinite(T).all() or not np.allclose(T[3], [0, 0, 0, 1]):
         raise ProfileError(f"{where} must be a 4 x 4 transform, got {values!r}")

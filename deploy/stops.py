@@ -11,6 +11,8 @@ from pathlib import Path
 from types import FrameType, TracebackType
 from typing import Any, Self
 
+from maniskill_tomato.deploy.deploy_errors import StoppedError
+
 KEYS = ("q", "s", " ")
 """Followed by Enter, each of these stops a run in a terminal."""
 
@@ -69,6 +71,10 @@ class Stops:
     def beat(self) -> str | None:
         """Says that the loop is alive; why it has to stop, or None."""
         self._last_beat = time.monotonic()
+        return self.asked()
+
+    def asked(self) -> str | None:
+        """Why to stop, or None, without saying that the loop is alive."""
         if self._reason is None and self._stop_file is not None and self._stop_file.exists():
             self.request(f"stop file {self._stop_file}")
         if self._reason is None and self._keyboard and select.select([sys.stdin], [], [], 0)[0]:
@@ -79,7 +85,11 @@ class Stops:
 
     @contextmanager
     def waiting_for_a_person(self) -> Iterator[None]:
-        """While inside, nobody expects a beat: people take their time."""
+        """While inside, nobody expects a beat: people take their time. A signal ends the waiting.
+
+        Raises:
+            StoppedError: A signal asked to stop.
+        """
         self._waiting = True
         try:
             yield
@@ -94,6 +104,9 @@ class Stops:
 
     def _on_signal(self, number: int, frame: FrameType | None) -> None:
         self.request(signal.Signals(number).name)
+        if self._waiting:
+            # Python takes a read of the terminal up again after a signal, unless its handler raises.
+            raise StoppedError(signal.Signals(number).name)
 
     def _watch_heartbeat(self) -> None:
         while not self._ended.wait(min(1.0, self._heartbeat_s / 4)):

@@ -31,6 +31,13 @@ class Workcell:
     guarded_arm: GuardedArm
     perception: Perception
 
+    def __post_init__(self) -> None:
+        if self.camera.simulated and not self.arm.simulated:
+            raise ProfileError(
+                "a simulated camera, or a recording of one, cannot guide a real arm; use the mock driver for both, or "
+                "take camera.recording out of the profile"
+            )
+
     @property
     def simulated(self) -> bool:
         """Whether nothing real moves."""
@@ -84,16 +91,27 @@ class Workcell:
         )
 
 
-def make_workcell(profile: Profile, seed: int = 0, clock: Clock | None = None) -> Workcell:
+NOT_CALIBRATED = (
+    "the camera's place on the flange is not calibrated: run `maniskill-tomato deploy calibrate` and name its file in "
+    "calibration.file; without it only a dry run is allowed"
+)
+"""Why a real arm with a camera does not move."""
+
+
+def make_workcell(
+    profile: Profile, seed: int = 0, clock: Clock | None = None, *, calibrates: bool = False
+) -> Workcell:
     """Makes the devices of a profile without touching any.
 
     Args:
         profile: Which.
         seed: Of simulated devices: the twin's episode.
         clock: Another clock than the machine's, or for the twin than a simulated one.
+        calibrates: Whether the run is there to calibrate the camera. Without a calibration every other one is refused
+            each move of a real arm.
 
     Raises:
-        ProfileError: A driver or an option is wrong.
+        ProfileError: A driver or an option is wrong, or a simulated camera would guide a real arm.
     """
     if clock is None:
         drivers = {profile.arm_driver, profile.camera_driver}
@@ -103,13 +121,13 @@ def make_workcell(profile: Profile, seed: int = 0, clock: Clock | None = None) -
     context = DriverContext(clock=checked, seed=seed)
     arm = make_arm(profile.arm_driver, profile.arm_options, context)
     camera = make_camera(profile.camera_driver, profile.camera_options, context)
-    if camera.simulated and not arm.simulated:
-        raise ProfileError("a simulated camera cannot guide a real arm; use the mock driver for both")
+    is_allowed = arm.simulated or profile.calibrated or calibrates
+    safety = Safety(profile.safety, profile.T_flange_camera)
     return Workcell(
         profile=profile,
         clock=checked,
         arm=arm,
         camera=camera,
-        guarded_arm=GuardedArm(arm, Safety(profile.safety, profile.T_flange_camera), checked),
+        guarded_arm=GuardedArm(arm, safety, checked, None if is_allowed else NOT_CALIBRATED),
         perception=open_perception(profile.perception.sight, profile.perception.segmenter),
     )

@@ -12,10 +12,20 @@ MAPPED_FOLDERS = ("assets", "deploy", "tasks")
 """Folders at the root of the repository that install as subpackages of maniskill_tomato."""
 
 FOUNDATION = frozenset(
-    {"assets", "errors", "files", "report_design", "tables", "version", "warp_runtime", "worker_pool"}
+    {
+        "assets",
+        "errors",
+        "files",
+        "report_design",
+        "tables",
+        "text_files",
+        "version",
+        "warp_runtime",
+        "worker_pool",
+    }
 )
 """What every room may import: asset files, errors, files on the disk, the look of reports, tables of TOML and JSON, the
-version, the start of Warp, the pool of processes."""
+reader of such files, the version, the start of Warp, the pool of processes."""
 
 WORLD = FOUNDATION | {"robot", "plants", "raycast"}
 SENSES = WORLD | {"segmentation", "sensing"}

@@ -3,6 +3,7 @@
 import logging
 import math
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -130,6 +131,8 @@ def capture_views(
     kinematics = InverseKinematics()
     views: list[RecordedView] = []
 
+    arm.begin_run(stops.asked)
+
     def check_stops() -> None:
         reason = stops.beat()
         if reason is not None:
@@ -174,7 +177,8 @@ def capture_views(
             break
         at_start = going_back
         what = "back to the start" if going_back else f"view {len(views) + 1} of {plan.views}"
-        with stops.waiting_for_a_person():
+        confirmed = False
+        with suppress(StoppedError), stops.waiting_for_a_person():
             confirmed = confirm(f"{what}: {_in_words(move, state)}")
         check_stops()
         if not confirmed:

@@ -20,6 +20,7 @@ from maniskill_tomato.files import write_atomically
 from maniskill_tomato.robot.d435 import CameraIntrinsics
 from maniskill_tomato.robot.iiwa14 import JOINT_UPPER, NUM_JOINTS
 from maniskill_tomato.robot.kinematics import forward_kinematics
+from maniskill_tomato.text_files import read_json
 
 INDEX_NAME: Final = "views.json"
 
@@ -85,12 +86,12 @@ def read_views(folder: Path) -> tuple[list[RecordedView], CameraIntrinsics, str]
     try:
         if path.stat().st_size > LARGEST_INDEX_BYTES:
             raise CalibrationError(f"{path} is larger than {LARGEST_INDEX_BYTES} bytes")
-        index = json.loads(path.read_text())
+        index = read_json(path)
     except FileNotFoundError as error:
         raise CalibrationError(
             f"no {INDEX_NAME} in {folder}; it holds intrinsics and, for each picture, image and joint_positions"
         ) from error
-    except (OSError, ValueError, RecursionError) as error:
+    except (OSError, ValueError) as error:
         raise CalibrationError(f"{path} cannot be read: {error}") from error
     if not isinstance(index, dict) or not isinstance(index.get("views"), list):
         raise CalibrationError(f"{path} must hold a table with a list `views`")

@@ -35,7 +35,6 @@ class RealSenseCamera(Camera):
     """A D400 camera, live or played from a file."""
 
     name = "realsense"
-    simulated = False
 
     def __init__(self, config: RealSenseConfig, clock: Clock) -> None:
         """Touches nothing.
@@ -46,6 +45,8 @@ class RealSenseCamera(Camera):
         """
         self._config = config
         self._clock = clock
+        # What a file shows is not where the arm is.
+        self.simulated = config.recording is not None
         self._source: FrameSource | None = None
         self._intrinsics: CameraIntrinsics | None = None
         self._depth_intrinsics: CameraIntrinsics | None = None

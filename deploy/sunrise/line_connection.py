@@ -77,7 +77,7 @@ class LineConnection:
             ProtocolError: A line is too long or holds other bytes than printable ASCII.
         """
         self._require_open()
-        deadline = time.monotonic() + timeout_s
+        deadline, has_looked = time.monotonic() + timeout_s, False
         while True:
             while (end := self._pending.find(b"\n")) >= 0:
                 line, self._pending = self._pending[:end], self._pending[end + 1 :]
@@ -88,10 +88,12 @@ class LineConnection:
                     ProtocolError, f"it sent more than {MAX_LINE_BYTES} bytes without an end of line"
                 )
             remaining = deadline - time.monotonic()
-            if remaining < 0.0 and timeout_s > 0.0:
+            # Empty lines do not prolong the wait.
+            if has_looked and remaining <= 0.0:
                 return None
             if not self._fill(max(remaining, 0.0)):
                 return None
+            has_looked = True
 
     def _fill(self, timeout_s: float) -> bool:
         """Takes what has come in; whether there was any."""

@@ -139,7 +139,8 @@ class SunriseArm(Arm):
             raise RefusedError(f"joint positions must be finite and within the limits, got {target}")
         if not 0.0 < move.speed_fraction <= 1.0:
             raise RefusedError(f"speed_fraction must be above 0 and at most 1, got {move.speed_fraction}")
-        self._stop_asked = False
+        if self._stop_asked:
+            raise RefusedError("the arm was told to stop; connect anew before it moves again")
         start = self._measure().positions
         target = np.round(target, 9)
         count = max(1, math.ceil(float(np.max(np.abs(target - start))) / self._config.largest_segment - 1e-9))

@@ -312,7 +312,7 @@ class DeployCalibrate:
                 f"{folder} holds views already; calculate from them with --views, or choose another --out"
             )
         profile = load_profile(name)
-        workcell = make_workcell(profile)
+        workcell = make_workcell(profile, calibrates=True)
         plan = CapturePlan(views=self.count)
         stops = workcell.listen(self.out, keyboard=not self.confirm)
         with ExitStack() as stack:

@@ -99,17 +99,18 @@ class Detect:
             raise InvalidInputError(f"--score-threshold must be between 0 and 1, got {self.score_threshold}")
 
         from maniskill_tomato.segmentation.datasets.picture_files import write_picture
-        from maniskill_tomato.segmentation.detection_list import detect, image_files
+        from maniskill_tomato.segmentation.detection_list import detect, drawing_files, image_files
         from maniskill_tomato.segmentation.drawing import draw_instances
         from maniskill_tomato.segmentation.instances import Image, Instances
         from maniskill_tomato.segmentation.segmenter import open_for_files
 
         image_files(self.images)
+        drawings = {} if self.pictures is None else drawing_files(self.images, self.pictures)
         segmenter = open_for_files(self.segmenter, self.score_threshold, thorough=not self.quick)
 
         def draw(name: str, image: Image, found: Instances) -> None:
-            if self.pictures is not None:
-                write_picture(self.pictures / f"{Path(name).stem}.jpg", draw_instances(image, found, 0.3))
+            if name in drawings:
+                write_picture(drawings[name], draw_instances(image, found, 0.3))
 
         summary = detect(self.images, segmenter, self.out, draw)
         for reason in summary.skipped[:10]:

@@ -1,7 +1,6 @@
 """Plants from mesh files as a set: a file is one plant, a folder holds many, each in one split."""
 
 import hashlib
-import tomllib
 from collections.abc import Mapping
 from dataclasses import dataclass, fields
 from functools import cached_property, lru_cache
@@ -15,6 +14,7 @@ from maniskill_tomato.plants.mesh_rules import MeshRules
 from maniskill_tomato.plants.organs import Plant
 from maniskill_tomato.plants.seed_splits import SEED_SPLITS
 from maniskill_tomato.tables import read_table
+from maniskill_tomato.text_files import read_toml
 
 RULES_FILE: Final = "mesh.toml"
 """The rules of all files of its folder."""
@@ -191,8 +191,4 @@ def _split_by_name(name: str) -> str:
 def _rules(path: Path, given: Mapping[str, Any]) -> MeshRules:
     if not path.is_file():
         return MeshRules(**given)
-    try:
-        table = tomllib.loads(path.read_text(encoding="utf-8"))
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise InvalidInputError(f"{path} is no TOML file: {error}") from error
-    return read_table(MeshRules, {**table, **given}, path)
+    return read_table(MeshRules, {**read_toml(path), **given}, path)

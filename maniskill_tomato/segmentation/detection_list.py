@@ -46,6 +46,31 @@ def image_files(place: Path) -> list[Path]:
     return files
 
 
+def drawing_files(place: Path, folder: Path) -> dict[str, Path]:
+    """Where the drawing of each image goes, by the image's name: no two share one, and none is an image itself.
+
+    Args:
+        place: An image or a folder.
+        folder: Of the drawings.
+
+    Raises:
+        InvalidInputError: There is no image, or a drawing would take its place.
+    """
+    files = image_files(place)
+    stems = [path.stem for path in files]
+    drawings = {
+        path.name: folder / (f"{path.stem}.jpg" if stems.count(path.stem) == 1 else f"{path.name}.jpg")
+        for path in files
+    }
+    images = {path.resolve() for path in files}
+    for name, drawing in drawings.items():
+        if drawing.resolve() in images:
+            raise InvalidInputError(
+                f"--pictures: the drawing of {name} would take the place of the image {drawing}; choose another folder"
+            )
+    return drawings
+
+
 def detect(
     place: Path,
     segmenter: Segmenter,
@@ -64,11 +89,13 @@ def detect(
         seen: Called with each name, image and what was found in it.
 
     Raises:
-        InvalidInputError: There is no image, none can be read, or `out` is a folder.
+        InvalidInputError: There is no image, none can be read, or `out` is a folder or named as an image.
         CheckpointError: The file cannot be written.
     """
     if out.is_dir():
         raise InvalidInputError(f"--out must be a file such as {out / 'detections.json'}; {out} is a folder")
+    if out.suffix.lower() in IMAGE_SUFFIXES:
+        raise InvalidInputError(f"--out is the list and must be a file such as detections.json; got {out}")
     entries: list[dict[str, Any]] = []
     skipped: list[str] = []
     files = image_files(place)

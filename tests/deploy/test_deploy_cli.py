@@ -2,15 +2,17 @@
 
 import json
 import os
+import pty
 import signal
 import subprocess
 import sys
+import threading
 import time
 from pathlib import Path
 
 import pytest
 
-from maniskill_tomato.cli import main, parse
+from maniskill_tomato.cli import deploy_commands, main, parse
 from maniskill_tomato.deploy.stops import Stops
 
 BLOCKED = """
@@ -100,6 +102,39 @@ def test_ctrl_c_while_views_of_a_calibration_are_taken_ends_it_with_its_status(
         main(["deploy", "calibrate", "--profile", "mock", "--unattended", "--out", str(tmp_path)])
     assert end.value.code == 128 + signal.SIGINT
     assert "stopped (SIGINT) after 0 views; the arm holds its position" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_signal_at_the_prompt_ends_the_run_before_anything_moves(
+    number: signal.Signals, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    master, slave = pty.openpty()
+    monkeypatch.setattr(sys, "stdin", os.fdopen(slave))
+    asked, goes = threading.Event(), deploy_commands._goes
+
+    def ask() -> bool:
+        asked.set()
+        return goes()
+
+    def press() -> None:
+        assert asked.wait(300)
+        time.sleep(0.2)
+        os.kill(os.getpid(), number)
+
+    monkeypatch.setattr(deploy_commands, "_goes", ask)
+    threading.Thread(target=press, daemon=True).start()
+    profile = tmp_path / "small.toml"
+    profile.write_text(
+        '[arm]\ndriver = "mock"\n[camera]\ndriver = "mock"\n[twin]\nwidth = 160\nheight = 120\n'
+        '[perception]\nsegmenter = "ground_truth"\n[target]\nsource = "twin"\n'
+    )
+    with pytest.raises(SystemExit) as end:
+        main(["deploy", "run", "--profile", str(profile), "--confirm", "--out", str(tmp_path / "out")])
+    os.close(master)
+    assert end.value.code == 128 + number
+    content = json.loads((tmp_path / "out" / "result.json").read_text())
+    assert (content["reason"], content["detail"]) == ("stopped", number.name)
+    assert len({str(step["camera"]) for step in content["steps"]}) <= 1
 
 
 def test_a_fault_has_its_own_exit_status(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -16,7 +16,7 @@ from torch import Tensor
 
 from maniskill_tomato.assets import asset_path
 from maniskill_tomato.deploy.clock import SimulatedClock
-from maniskill_tomato.deploy.deploy_errors import ProfileError, RefusedError
+from maniskill_tomato.deploy.deploy_errors import DeployError, ProfileError, RefusedError
 from maniskill_tomato.deploy.guarded_arm import GuardedArm
 from maniskill_tomato.deploy.interface import Frame, JointMove
 from maniskill_tomato.deploy.loop import TASK, Loop, default_policy
@@ -423,6 +423,52 @@ def test_a_signal_in_the_middle_of_a_move_stops_the_arm(number: int) -> None:
     assert (result.reason, result.detail, result.is_fault) == ("stopped", signal.Signals(number).name, False)
     assert result.end_state == "the arm was stopped and holds its position"
     assert signal.getsignal(number) is before
+
+
+class StoppedWhileDeciding(Towards):
+    """Something asks for a stop while the policy thinks."""
+
+    def __init__(self, how: str, stop_file: Path) -> None:
+        super().__init__()
+        self.how, self.stop_file = how, stop_file
+
+    def act(self, belief: Belief) -> Tensor:
+        if self.how == "file":
+            self.stop_file.touch()
+        elif self.how == "heartbeat":
+            time.sleep(0.5)
+        else:
+            os.kill(os.getpid(), signal.Signals[self.how])
+        return super().act(belief)
+
+
+@pytest.mark.parametrize("how", ["SIGTERM", "SIGINT", "file", "heartbeat"])
+def test_a_stop_while_the_policy_decides_lets_no_move_out(how: str, tmp_path: Path) -> None:
+    stop_file = tmp_path / "STOP"
+    workcell = make_workcell(profile(), EPISODE)
+    arm: Any = workcell.arm
+    sent: list[JointMove] = []
+    command = arm.command
+
+    def spied(move: JointMove) -> JointMove:
+        sent.append(move)
+        moved: JointMove = command(move)
+        return moved
+
+    arm.command = spied
+    stops = Stops(stop_file=stop_file, heartbeat_s=0.2 if how == "heartbeat" else 60.0)
+    with workcell.arm, workcell.camera, stops:
+        stops.beat()
+        result = Loop(workcell, StoppedWhileDeciding(how, stop_file), stops, "unattended").run()
+    assert sent == []
+    assert result.reason == ("heartbeat" if how == "heartbeat" else "stopped")
+    assert result.is_fault is (how == "heartbeat")
+    # The guard stays stopped until another run begins.
+    with workcell.arm, pytest.raises(DeployError, match="STOP|SIG|stood still"):
+        state = workcell.guarded_arm.read()
+        stay = JointMove(joint_positions=state.joint_positions, speed_fraction=0.1)
+        workcell.guarded_arm.command(stay)
+    assert sent == []
 
 
 def test_a_stop_file_ends_the_run_before_anything_moves(tmp_path: Path) -> None:

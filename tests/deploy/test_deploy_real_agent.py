@@ -10,13 +10,14 @@ import torch
 
 import maniskill_tomato  # noqa: F401
 from maniskill_tomato.deploy.deploy_errors import NotConnectedError, ProfileError, RefusedError
-from maniskill_tomato.deploy.interface import Frame
+from maniskill_tomato.deploy.interface import ArmState, Frame
 from maniskill_tomato.deploy.profile import parse_profile
 from maniskill_tomato.deploy.real_agent import IiwaRealAgent, depth_in_mm, fit_color, fit_depth
 from maniskill_tomato.deploy.sim2real import TomatoSim2RealEnv
 from maniskill_tomato.deploy.workcell import make_workcell
 from maniskill_tomato.robot import d435
 from maniskill_tomato.robot.d435 import CameraIntrinsics
+from maniskill_tomato.robot.iiwa14 import READY_QPOS
 
 TWIN = """
 [arm]
@@ -33,6 +34,39 @@ sight = "rays"
 [target]
 source = "twin"
 """
+
+
+REAL = """
+[arm]
+driver = "sunrise"
+host = "127.0.0.1"
+[camera]
+driver = "realsense"
+{camera}
+[perception]
+segmenter = "light"
+[target]
+source = "seen"
+"""
+
+
+def test_a_real_arm_without_a_calibration_is_not_moved_by_a_policy_nor_by_maniskill() -> None:
+    workcell = make_workcell(parse_profile(REAL.format(camera=""), Path("real.toml")))
+    state = ArmState(joint_positions=READY_QPOS, joint_velocities=np.zeros(7), stamp=workcell.clock.now())
+    arm: Any = workcell.arm
+    arm.read = lambda max_age_s=0.5: state
+    real = IiwaRealAgent(workcell)
+    sent: list[Any] = []
+    arm.command = sent.append
+    with pytest.raises(RefusedError, match="not calibrated"):
+        real.set_target_qpos(READY_QPOS + 0.05)
+    assert sent == []
+
+
+def test_a_recorded_camera_guides_no_real_arm() -> None:
+    recorded = REAL.format(camera='recording = "old.db3"')
+    with pytest.raises(ProfileError, match=r"recording of one, cannot guide a real arm"):
+        make_workcell(parse_profile(recorded, Path("real.toml")))
 
 
 def agent(seed: int = 0, extra: str = "") -> IiwaRealAgent:

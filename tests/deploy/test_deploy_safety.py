@@ -13,7 +13,7 @@ from scipy.optimize import brentq
 
 from maniskill_tomato.deploy.clock import SimulatedClock
 from maniskill_tomato.deploy.collision import Box, CollisionChecker
-from maniskill_tomato.deploy.deploy_errors import DeviceTimeoutError, FaultError, RefusedError
+from maniskill_tomato.deploy.deploy_errors import DeviceTimeoutError, FaultError, RefusedError, StoppedError
 from maniskill_tomato.deploy.guarded_arm import GuardedArm
 from maniskill_tomato.deploy.interface import Arm, ArmState, JointMove
 from maniskill_tomato.deploy.plant_points import sphere_distances
@@ -666,6 +666,44 @@ def test_a_command_does_not_follow_on_one_that_has_not_ended() -> None:
     guard.command(move(turned(j1=0.1)))
     with pytest.raises(RefusedError, match="busy"):
         guard.command(move(turned(j1=0.2)))
+
+
+def test_a_stop_stays_until_another_run_begins() -> None:
+    clock = SimulatedClock(100.0)
+    arm = SpyArm(clock)
+    guard = GuardedArm(arm, Safety(), clock)
+    guard.command(move(turned(j1=0.1)))
+    assert guard.wait(0.1) and guard.stop()
+    with pytest.raises(StoppedError, match="stopped"):
+        guard.command(move(turned(j1=0.2)))
+    reasons = iter([None, None, "key"])
+    guard.begin_run(lambda: next(reasons))
+    guard.command(move(turned(j1=0.2)))
+    assert guard.wait(0.1)
+    for _ in range(2):
+        with pytest.raises(StoppedError, match="key"):
+            guard.command(move(turned(j1=0.3)))
+    assert len(arm.sent) == 2
+
+
+def test_a_stop_asked_for_while_a_move_is_sent_is_passed_on() -> None:
+    clock = SimulatedClock(100.0)
+    arm = SpyArm(clock)
+    stopped: list[bool] = []
+    arm.stop = lambda: stopped.append(True) or True  # type: ignore[method-assign, func-returns-value]
+    guard = GuardedArm(arm, Safety(), clock)
+    guard.begin_run(lambda: "SIGTERM" if arm.sent else None)
+    guard.command(move(turned(j1=0.1)))
+    assert stopped == [True]
+
+
+def test_a_forbidden_arm_is_not_moved_by_any_command() -> None:
+    clock = SimulatedClock(100.0)
+    arm = SpyArm(clock)
+    guard = GuardedArm(arm, Safety(), clock, forbidden="not calibrated")
+    with pytest.raises(RefusedError, match="not calibrated"):
+        guard.command(move(turned(j1=0.1)))
+    assert arm.sent == []
 
 
 def test_states_that_cannot_be_true_are_faults() -> None:

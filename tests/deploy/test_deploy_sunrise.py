@@ -1,6 +1,7 @@
 """The iiwa's driver over a real socket: against the loopback controller, its races and its faults, and by hand."""
 
 import ast
+import contextlib
 import socket
 import subprocess
 import sys
@@ -266,6 +267,31 @@ def test_a_line_that_never_ends_is_a_timeout() -> None:
     with LoopbackController(qpos=REST, faults=faults) as controller, driver(controller, **HASTY) as arm:
         with pytest.raises(DeviceTimeoutError):
             arm.read()
+
+
+def test_a_server_that_sends_only_empty_lines_holds_nobody() -> None:
+    ended = threading.Event()
+
+    def flood(server: socket.socket) -> None:
+        peer, _ = server.accept()
+        with peer, contextlib.suppress(OSError):
+            while not ended.is_set():
+                peer.sendall(b"\n" * 4096)
+
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        threading.Thread(target=flood, args=(server,), daemon=True).start()
+        connection = LineConnection("127.0.0.1", server.getsockname()[1], 5.0)
+        answers: list[str | None] = []
+
+        def ask() -> None:
+            answers.extend(connection.receive(wait) for wait in (0.0, 0.05))
+
+        asking = threading.Thread(target=ask, daemon=True)
+        asking.start()
+        asking.join(20.0)
+        ended.set()
+        assert answers == [None, None]
+        connection.close("the test is over")
 
 
 def test_joint_angles_that_are_no_numbers_never_become_a_state() -> None:

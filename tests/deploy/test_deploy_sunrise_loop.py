@@ -79,6 +79,8 @@ def run(
             capture=CaptureConfig(max_age=5.0),
         )
         arm, camera = make_arm("sunrise", options, context), make_camera("mock", TWIN, context)
+        # The controller is a loopback: nothing real moves, and the camera looks at where its arm is.
+        arm.simulated = True
         workcell = Workcell(
             profile=profile,
             clock=clock,

@@ -126,3 +126,38 @@ def test_the_light_segmenter_looks_thoroughly_at_files_unless_there_is_a_hurry()
     by_file = open_for_files(str(asset_path(SHIPPED_WEIGHTS)), 0.2, thorough=True)
     assert isinstance(by_file, LightSegmenter) and by_file.mirrored
     assert not isinstance(open_for_files("colour", 0.2, thorough=True), LightSegmenter)
+
+
+def test_no_drawing_takes_the_place_of_an_image_or_of_another_drawing(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    photos = tmp_path / "photos"
+    photos.mkdir()
+    write_image(photos / "a.png", (20, 30, 60, 70))
+    write_image(photos / "a.jpg", (20, 30, 60, 70))
+    before = {path.name: path.read_bytes() for path in photos.iterdir()}
+    out = tmp_path / "list.json"
+    run(photos, out, "--pictures", str(tmp_path / "drawn"))
+    assert {path.name for path in (tmp_path / "drawn").iterdir()} == {"a.png.jpg", "a.jpg.jpg"}
+    (photos / "a.png").unlink()
+    error = fails(capsys, str(photos), "--segmenter", "colour", "--pictures", str(photos), "--out", str(out))
+    assert "a.jpg would take the place" in error
+    error = fails(capsys, str(photos), "--segmenter", "colour", "--out", str(photos / "a.jpg"))
+    assert "must be a file such as detections.json" in error
+    assert (photos / "a.jpg").read_bytes() == before["a.jpg"]
+
+
+def test_pictures_that_are_cut_off_or_too_large_are_said_to_be(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    photos = tmp_path / "photos"
+    photos.mkdir()
+    write_image(photos / "good.jpg", (20, 30, 60, 70))
+    whole = (photos / "good.jpg").read_bytes()
+    (photos / "cut.jpg").write_bytes(whole[: len(whole) // 2])
+    head = b"\x89PNG\r\n\x1a\n\x00\x00\x00\rIHDR" + (40_000).to_bytes(4, "big") * 2
+    (photos / "large.png").write_bytes(head + bytes(50))
+    assert len(run(photos, tmp_path / "list.json")) == 1
+    printed = capsys.readouterr().out
+    assert "cut.jpg is a JPEG that ends too early" in printed
+    assert "large.png has 1600000000 pixels; 200000000 are allowed" in printed

@@ -1,7 +1,5 @@
 """Run descriptions in files: TOML written by hand, or the `config.json` that a run leaves."""
 
-import json
-import tomllib
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -10,6 +8,7 @@ from typing import Any
 from maniskill_tomato.errors import InvalidInputError
 from maniskill_tomato.learning.rl.presets import PresetName, TrainConfig, default_preset, get_preset
 from maniskill_tomato.tables import read_table
+from maniskill_tomato.text_files import read_json, read_toml
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -93,12 +92,12 @@ def _read(path: Path) -> Mapping[str, Any]:
         raise InvalidInputError(f"no configuration file at {path}")
     try:
         if path.suffix == ".toml":
-            return tomllib.loads(path.read_text())
+            return read_toml(path)
         if path.suffix == ".json":
-            values = json.loads(path.read_text())
+            values = read_json(path)
             if not isinstance(values, dict):
                 raise InvalidInputError(f"{path} must hold a table, got {type(values).__name__}")
             return values
-    except (tomllib.TOMLDecodeError, json.JSONDecodeError, UnicodeDecodeError, OSError) as error:
-        raise InvalidInputError(f"{path} cannot be read: {error}") from error
+    except FileNotFoundError:
+        raise InvalidInputError(f"no configuration file at {path}") from None
     raise InvalidInputError(f"a configuration file must end in .toml or .json; got {path}")

@@ -24,8 +24,9 @@ from maniskill_tomato.segmentation.datasets.annotations import (
     Instance,
     counted_clip,
 )
-from maniskill_tomato.segmentation.datasets.picture_files import read_picture
+from maniskill_tomato.segmentation.datasets.picture_files import LARGEST_PICTURE, read_picture
 from maniskill_tomato.segmentation.masks import Box, EncodedMask
+from maniskill_tomato.text_files import read_json
 
 VISIBLE_FILE = "annotations.json"
 
@@ -194,11 +195,9 @@ def _looks_like_coco(path: Path) -> bool:
 
 def _load(path: Path) -> dict[str, Any]:
     try:
-        content = json.loads(path.read_text(encoding="utf-8"))
+        content = read_json(path)
     except FileNotFoundError:
         raise InvalidInputError(f"there is no COCO file {path}") from None
-    except (OSError, ValueError, RecursionError) as error:
-        raise InvalidInputError(f"{path} cannot be read as JSON ({error})") from error
     keys = ("images", "annotations", "categories")
     if not isinstance(content, dict) or not all(isinstance(content.get(k), list) for k in keys):
         raise InvalidInputError(f"{path} is not a COCO file: it needs the lists {', '.join(keys)}")
@@ -233,6 +232,9 @@ def _read_image(entry: Mapping[str, Any], folder: Path, skipped: Counter[str]) -
         except InvalidInputError:
             skipped["images that cannot be read"] += 1
             return None
+    if width * height > LARGEST_PICTURE:
+        skipped[f"images of more than {LARGEST_PICTURE} pixels"] += 1
+        return None
     depth = entry.get("depth_file_name")
     return AnnotatedImage(
         path=path,

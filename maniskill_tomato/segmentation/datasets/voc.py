@@ -17,7 +17,7 @@ from maniskill_tomato.segmentation.datasets.annotations import (
     counted_clip,
     leaves_image,
 )
-from maniskill_tomato.segmentation.datasets.picture_files import read_picture
+from maniskill_tomato.segmentation.datasets.picture_files import LARGEST_PICTURE, read_picture
 
 IMAGE_SUFFIXES = (".jpg", ".jpeg", ".png", ".bmp")
 IMAGE_FOLDERS = ("JPEGImages", "images", ".")
@@ -132,15 +132,18 @@ def _read_image(folder: Path, path: Path, skipped: Counter[str]) -> AnnotatedIma
         root = ElementTree.parse(path).getroot()
     except FileNotFoundError:
         raise InvalidInputError("images listed without an XML file") from None
-    except (ElementTree.ParseError, OSError, UnicodeDecodeError):
+    except (ElementTree.ParseError, OSError, ValueError, LookupError):
+        # An encoding that Python does not know, or that the parser does not take, is the last two.
         raise InvalidInputError("images with broken XML") from None
     picture = _find_picture(folder, root.findtext("filename") or "", path.stem)
     if picture is None:
         raise InvalidInputError("images without their file")
     try:
         width, height = (int(float(root.findtext(f"size/{key}") or 0)) for key in ("width", "height"))
-    except ValueError:
+    except (ValueError, OverflowError):
         width = height = 0
+    if width * height > LARGEST_PICTURE:
+        raise InvalidInputError(f"images of more than {LARGEST_PICTURE} pixels")
     if width < 1 or height < 1:
         try:
             height, width = read_picture(picture).shape[:2]
