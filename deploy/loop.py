@@ -10,6 +10,7 @@ may take it in.
 """
 
 import logging
+import math
 import time
 from collections import defaultdict, deque
 from collections.abc import Callable, Iterator, Sequence
@@ -60,6 +61,9 @@ WAIT_SLICE: Final = 0.1
 
 STOP_TIME: Final = 2.0
 """An arm that was told to stop stands after so long, in [s]."""
+
+AT_REST: Final = 0.01
+"""An arm whose joints all turn more slowly stands, in [rad/s]."""
 
 STANDS: Final = 0.005
 """Joints that have turned by less than this have not moved, in [rad]."""
@@ -531,16 +535,26 @@ class Loop:
 
     def _come_to_rest(self) -> str:
         """Leaves the arm without a command; says what it does then."""
-        try:
-            if self._arm.wait(0.0):
+        with suppress(DeployError):
+            if self._arm.wait(0.0) and self._speed() < AT_REST:
                 return "the arm stands and holds its position"
-        except DeployError:
-            pass
         if self._arm.stop():
             with suppress(DeployError):
                 self._arm.wait(STOP_TIME)
-            return "the arm was stopped and holds its position"
+            speed = self._speed()
+            if speed < AT_REST:
+                return "the arm was stopped and holds its position"
+            if math.isinf(speed):
+                return "the arm was told to stop; whether it stands nobody knows, for it does not answer"
+            return f"the arm was told to stop and still moves at {speed:.3f} rad/s; use the emergency stop"
         return "a move may still be under way and goes on to its end; only the smartPAD or the emergency stop halts it"
+
+    def _speed(self) -> float:
+        """Of the fastest joint as it is read, in [rad/s]; infinite where the arm does not answer."""
+        try:
+            return float(np.abs(self._arm.read().joint_velocities).max())
+        except DeployError:
+            return math.inf
 
     def _record(self, step: Step) -> None:
         for recorder in self._recorders:

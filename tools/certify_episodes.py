@@ -14,15 +14,16 @@ import logging
 import sys
 import time
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import tyro
 
 from maniskill_tomato.assets import ASSETS_DIR
 from maniskill_tomato.errors import InvalidInputError, TomatoError
-from maniskill_tomato.experiments.certified_episodes import certify
+from maniskill_tomato.learning.rl.envs import make_env
 from maniskill_tomato.plants.episode_list import (
     EPISODE_LISTS,
     Episode,
@@ -30,6 +31,7 @@ from maniskill_tomato.plants.episode_list import (
     read_episodes,
     write_episodes,
 )
+from maniskill_tomato.policies.oracle import OracleSearch
 from maniskill_tomato.tasks.row.episode_sampling import draw_episodes, extend_episodes
 from maniskill_tomato.worker_pool import run_jobs
 
@@ -57,6 +59,24 @@ class Args:
     """Ask for a way that does not touch the plant."""
     again: bool = False
     """Also ask about episodes that are certified already."""
+
+
+def certify(episodes: list[Episode], contact_free: bool) -> list[Episode]:
+    """The episodes with the fewest moves that the oracle finds within the task's limit."""
+    env: Any = make_env("TomatoViewpoint-v1", episodes=episodes)
+    world = env.unwrapped
+    search = OracleSearch(world.ground_truth, world.device, contact_free=contact_free)
+    certified = []
+    for number, episode in enumerate(episodes):
+        env.reset(options={"episode": number})
+        belief = world.belief
+        solution = search.solve(
+            belief.camera_position[0], belief.target_position[0], 0, int(world.task.max_moves)
+        )
+        moves = None if solution is None else solution.moves
+        certified.append(replace(episode, oracle_moves=moves, certified=True))
+    env.close()
+    return certified
 
 
 def certify_all(episodes: list[Episode], args: Args) -> Iterator[list[Episode]]:

@@ -1,8 +1,8 @@
-"""The twin's plant and start: an episode of the simulated task's lists, number for number."""
+"""The twin's plant and start: an episode of one of the simulated task's lists, number for number."""
 
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import Final, Literal
+from typing import Final
 
 import numpy as np
 import torch
@@ -13,14 +13,13 @@ from maniskill_tomato.deploy.deploy_errors import ProfileError
 from maniskill_tomato.deploy.interface import Float64
 from maniskill_tomato.deploy.move_choice import Postures
 from maniskill_tomato.plants.episode_list import Episode, load_episodes
+from maniskill_tomato.plants.mesh_set import ALL
 from maniskill_tomato.plants.organs import Plant
-from maniskill_tomato.plants.spec import ROW_PLANT
+from maniskill_tomato.plants.spec import ROW_PLANT, PlantSpec
 from maniskill_tomato.robot.d435 import T_flange_camera_color_optical
 from maniskill_tomato.robot.iiwa14 import JOINT_LOWER, JOINT_UPPER, READY_QPOS
 from maniskill_tomato.robot.inverse_kinematics import Reach
 from maniskill_tomato.robot.look_at_move import LookAtMover
-
-EpisodeListName = Literal["held_out", "validation"]
 
 START_MARGIN: Final = 0.05
 """How far the start's joints stay from their limits where they can, in [rad]."""
@@ -42,29 +41,36 @@ class TwinEpisode:
 
 
 @lru_cache(maxsize=4)
-def load_episode(name: EpisodeListName, index: int) -> TwinEpisode:
+def load_episode(name: str, index: int, plants: str | None = None) -> TwinEpisode:
     """The episode that `TomatoViewpoint-v1` with `episodes=name` begins at `reset(seed=index)`.
 
     Args:
-        name: One of the fixed lists.
+        name: One of the fixed lists, or a `.json` file of one.
         index: Which, modulo the list's length.
+        plants: Mesh file or folder whose plants the list names; None for our own.
 
     Raises:
         ProfileError: The index is negative.
+        InvalidInputError: There is no such list, or no such plant.
     """
     if index < 0:
         raise ProfileError(f"the seed must be 0 or more, got {index}")
     episodes = load_episodes(name)
-    return make_episode(episodes[index % len(episodes)])
+    spec = ROW_PLANT if plants is None else PlantSpec.parse({"mesh": plants, "seed": ALL}, ROW_PLANT)
+    return make_episode(episodes[index % len(episodes)], spec)
 
 
-def make_episode(episode: Episode) -> TwinEpisode:
+def make_episode(episode: Episode, spec: PlantSpec = ROW_PLANT) -> TwinEpisode:
     """Grows the plant and works out the start.
+
+    Args:
+        episode: Which plant, target and start.
+        spec: The kind of plant that the episode's seed is of.
 
     Raises:
         ProfileError: The arm cannot look at the target from the episode's start.
     """
-    plant = ROW_PLANT.grow(episode.plant_seed)
+    plant = spec.grow(episode.plant_seed)
     T_world_plant = _plant_pose(episode.plant_pose)
     centre = torch.as_tensor(np.asarray(plant.fruits[episode.target].centre, dtype=np.float32))
     # Single precision and in this order, as in the simulated task, so that both start from the same bits.

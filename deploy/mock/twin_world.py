@@ -14,9 +14,10 @@ from maniskill_tomato.deploy.clock import Clock
 from maniskill_tomato.deploy.drivers import DriverContext
 from maniskill_tomato.deploy.interface import Float64, FrameTruth
 from maniskill_tomato.deploy.mock.dynamics import ArmDynamics
-from maniskill_tomato.deploy.mock.episode import EpisodeListName, TwinEpisode, load_episode
+from maniskill_tomato.deploy.mock.episode import TwinEpisode, load_episode
 from maniskill_tomato.deploy.toml_tables import parse_table
-from maniskill_tomato.errors import check_ranges
+from maniskill_tomato.errors import InvalidInputError, check_ranges
+from maniskill_tomato.plants.episode_list import EPISODE_LISTS, episode_path
 from maniskill_tomato.plants.organs import SemanticClass
 from maniskill_tomato.raycast.images import FIRST_ORGAN_LABEL, Picture
 from maniskill_tomato.raycast.scene import RayScene
@@ -59,8 +60,10 @@ Renderer = Literal["rays", "sapien", "auto"]
 class TwinOptions:
     """The `[twin]` table of a profile; the run's seed is the number of the episode."""
 
-    episodes: EpisodeListName = "held_out"
-    """Which list the plants come from."""
+    episodes: str = "held_out"
+    """Which list the plants come from: held_out, validation, or a `.json` file such as `benchmark --plants` writes."""
+    plants: str | None = None
+    """Mesh file or folder whose plants such a file names; None for our own."""
     width: int = 640
     """Of the colour picture, in [px]."""
     height: int = 480
@@ -75,6 +78,12 @@ class TwinOptions:
     """What goes wrong."""
 
     def __post_init__(self) -> None:
+        episode_path(self.episodes)
+        if self.plants is not None and self.episodes in EPISODE_LISTS:
+            raise InvalidInputError(
+                f"plants needs a list of its own: set episodes to a .json file, which `benchmark --plants` writes, "
+                f"instead of {self.episodes!r}"
+            )
         check_ranges(self, depth_noise=(0.0, math.inf), width=(16, 1920), height=(16, 1080))
 
 
@@ -196,6 +205,8 @@ def twin_world(options: TwinOptions, context: DriverContext) -> TwinWorld:
 
     def make() -> TwinWorld:
         intrinsics = color_intrinsics(options.width, options.height)
-        return TwinWorld(load_episode(options.episodes, context.seed), intrinsics, context.clock)
+        return TwinWorld(
+            load_episode(options.episodes, context.seed, options.plants), intrinsics, context.clock
+        )
 
     return context.shared("twin", make)

@@ -33,6 +33,8 @@ class Dataset:
     """Of a rendered image, in [px]."""
     vary_crop: bool = True
     """Cherry and beef tomatoes and other leaf densities too, instead of the tasks' own plants alone."""
+    plants: Path | None = None
+    """Mesh file or folder whose plants of the split stand in front, each alone, instead of our own rows."""
     jobs: int | None = None
     """Processes; by default one per processor core."""
 
@@ -54,6 +56,7 @@ class Dataset:
             width=self.width,
             height=self.height,
             vary_crop=self.vary_crop,
+            plants=None if self.plants is None else str(self.plants),
         )
         photos = read_annotated(self.real, self.real_split) if self.real is not None else None
         if photos is not None and photos.skipped:

@@ -1,18 +1,20 @@
-"""Episodes that the oracle was asked about; on plants from mesh files, drawn until it solves as many as are wanted."""
+"""Episodes on plants from mesh files: hidden starts are drawn until the lattice oracle solves as many as wanted."""
 
 import logging
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any, Final
+
+import torch
 
 from maniskill_tomato.errors import InvalidInputError
 from maniskill_tomato.experiments.result_store import ResultStore
 from maniskill_tomato.plants.episode_list import Episode, write_episodes
 from maniskill_tomato.plants.mesh_set import ALL, MeshSource
 from maniskill_tomato.plants.seed_splits import SEED_SPLITS
-from maniskill_tomato.policies.oracle import OracleSearch
+from maniskill_tomato.policies.lattice_oracle import LatticeOracle
 from maniskill_tomato.tasks.making import make_world
 from maniskill_tomato.tasks.row.episode_sampling import episode_of
 from maniskill_tomato.worker_pool import run_jobs
@@ -22,7 +24,7 @@ logger = logging.getLogger(__name__)
 ENV_ID: Final = "TomatoViewpoint-v1"
 
 GIVE_UP_AFTER: Final = 12
-"""Draws in a row on one plant that are no hidden start or that the oracle does not solve."""
+"""Draws in a row on one plant that are no hidden start or that the lattice oracle does not solve."""
 
 FIRST_SEED: Final = 7_000_000
 """Of the first draw on the first plant."""
@@ -39,7 +41,7 @@ class PlantDraws:
     """What was drawn on one plant."""
 
     episodes: tuple[Episode, ...]
-    """Those that the oracle solves, in the order in which they were drawn."""
+    """Those that the lattice oracle solves, in the order in which they were drawn."""
     unsolved: int
     """Hidden starts that it does not solve."""
 
@@ -56,39 +58,36 @@ class CertifiedList:
     """How it came about, for the reader."""
 
 
-def certify(
-    episodes: Sequence[Episode], contact_free: bool = False, plant: Mapping[str, object] | None = None
-) -> list[Episode]:
-    """The episodes with the fewest moves that the oracle finds within the task's limit.
+def certify(episode: Episode, plant: Mapping[str, object]) -> Episode:
+    """The episode with V_f of its first view and the moves of the lattice oracle, None if it runs out of them.
 
     Args:
-        episodes: What it is asked about.
-        contact_free: Whether no move may touch the plant.
-        plant: The option `plant` of the task; None for our own plants.
+        episode: As it was drawn.
+        plant: The option `plant` of the task.
     """
-    world = make_world(ENV_ID, episodes=list(episodes), plant=plant)
+    world = make_world(ENV_ID, episodes=[episode], plant=plant)
+    world.reset(options={"episode": 0})
+    start = round(float(world.state.visible_fraction[0]), 4)
+    oracle = LatticeOracle(world.ground_truth)
+    oracle.begin(world.belief, torch.tensor([0], device=world.device))
     task: Any = world.task
-    search = OracleSearch(world.ground_truth, world.device, contact_free=contact_free)
-    certified = []
-    for number, episode in enumerate(episodes):
-        world.reset(options={"episode": number})
-        belief = world.belief
-        solution = search.solve(belief.camera_position[0], belief.target_position[0], 0, int(task.max_moves))
-        start = round(float(world.state.visible_fraction[0]), 4) if plant else episode.start_visibility
-        moves = None if solution is None else solution.moves
-        certified.append(replace(episode, oracle_moves=moves, certified=True, start_visibility=start))
-    return certified
+    solved = None
+    for move in range(1, int(task.max_moves) + 1):
+        world.step(oracle.act(world.belief))
+        if bool(world.game.info()["success"][0]):
+            solved = move
+            break
+    return replace(episode, oracle_moves=solved, certified=True, start_visibility=start)
 
 
-def draw_on_plant(plant: Mapping[str, object], count: int, contact_free: bool, seed: int) -> PlantDraws:
-    """Draws hidden starts on one plant until the oracle solves so many, or gives the plant up.
+def draw_on_plant(plant: Mapping[str, object], count: int, seed: int) -> PlantDraws:
+    """Draws hidden starts on one plant until the lattice oracle solves so many, or gives the plant up.
 
     More are the same ones and others after them.
 
     Args:
         plant: The option `plant` of the task.
         count: How many are wanted.
-        contact_free: Whether the oracle avoids the plant.
         seed: The plant's.
     """
     world = make_world(ENV_ID, plant={**plant, "seed": seed})
@@ -107,7 +106,7 @@ def draw_on_plant(plant: Mapping[str, object], count: int, contact_free: bool, s
             continue  # The arm reaches none of its ripe fruits where the plant stands now.
         if game.soft_starts > soft:
             continue
-        (episode,) = certify([episode_of(world)], contact_free, plant)
+        episode = certify(episode_of(world), plant)
         if episode.oracle_moves is None:
             unsolved += 1
             continue
@@ -116,17 +115,14 @@ def draw_on_plant(plant: Mapping[str, object], count: int, contact_free: bool, s
     return PlantDraws(episodes=tuple(episodes), unsolved=unsolved)
 
 
-def certified_list(
-    place: str, count: int, store: ResultStore, folder: Path, *, contact_free: bool, processes: int
-) -> CertifiedList:
-    """Episodes on the plants of a folder that the oracle solves, spread evenly, in turn of the plants.
+def certified_list(place: str, count: int, store: ResultStore, folder: Path, processes: int) -> CertifiedList:
+    """Episodes on the plants of a folder that the lattice oracle solves, spread evenly, in turn of the plants.
 
     Args:
         place: FOLDER or FOLDER:SPLIT.
         count: How many episodes.
         store: Keeps the draws, so that what was stopped goes on.
         folder: Where the list's file goes.
-        contact_free: Whether the oracle avoids the plants.
         processes: How many at a time.
 
     Raises:
@@ -140,7 +136,7 @@ def certified_list(
     stored = {seed: _read(result, wanted) for seed, result in store.read(STORED, "plants").items()}
     found = {seed: draws for seed, draws in stored.items() if draws is not None}
     missing = [seed for seed in seeds if seed not in found]
-    work = partial(draw_on_plant, plant, wanted, contact_free)
+    work = partial(draw_on_plant, plant, wanted)
     for seed, draws in run_jobs(work, missing, processes):
         found[seed] = draws
         result = {
@@ -153,16 +149,18 @@ def certified_list(
     drawn = [found[seed] for seed in seeds]
     turns = [d.episodes[k] for k in range(wanted) for d in drawn if k < len(d.episodes)][:count]
     if len(turns) < count:
+        barren = sum(not draws.episodes for draws in drawn)
         raise InvalidInputError(
-            f"the oracle solves only {len(turns)} episodes on the {len(seeds)} plants of {place}, --episodes asks for "
-            f"{count}; on {sum(not d.episodes for d in drawn)} plants it solves none of {GIVE_UP_AFTER} draws: are "
-            "their ripe fruits in the arm's reach, and hidden from somewhere?"
+            f"the lattice oracle solves only {len(turns)} episodes on the {len(seeds)} plants of {place}, --episodes "
+            f"asks for {count}; on {barren} plants it solves none of {GIVE_UP_AFTER} draws: are their ripe fruits in "
+            "the arm's reach, and hidden from somewhere?"
         )
     path = folder / f"episodes_{count}.json"
     write_episodes(path, turns)
     facts = {
         "plants": f"{sum(bool(d.episodes) for d in drawn)} of {len(seeds)} ({split})",
-        "hidden starts that the oracle does not solve": sum(d.unsolved for d in drawn),
+        "oracle": LatticeOracle.name,
+        "hidden starts that it does not solve": sum(d.unsolved for d in drawn),
     }
     return CertifiedList(path=path, plant=plant, facts=facts)
 

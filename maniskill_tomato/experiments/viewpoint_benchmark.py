@@ -138,14 +138,7 @@ def _on_plants(
     config: BenchmarkConfig, place: str, store: ResultStore, processes: int
 ) -> tuple[Condition, dict[str, Any]]:
     """The condition of plants from mesh files, with facts about its episodes."""
-    listed = certified_list(
-        place,
-        config.seed + config.episodes,
-        store,
-        config.out,
-        contact_free=config.contact_free_oracle,
-        processes=processes,
-    )
+    listed = certified_list(place, config.seed + config.episodes, store, config.out, processes)
     condition = Condition(
         name="plants",
         env_options={"episodes": str(listed.path), "plant": listed.plant},

@@ -2,6 +2,7 @@
 
 import itertools
 import os
+import re
 import signal
 import time
 from dataclasses import replace
@@ -423,6 +424,17 @@ def test_a_signal_in_the_middle_of_a_move_stops_the_arm(number: int) -> None:
     assert (result.reason, result.detail, result.is_fault) == ("stopped", signal.Signals(number).name, False)
     assert result.end_state == "the arm was stopped and holds its position"
     assert signal.getsignal(number) is before
+
+
+def test_an_arm_that_is_told_to_stop_and_moves_on_is_not_said_to_stand() -> None:
+    slow = profile(more="[safety]\nspeed_fraction = 0.03\n")
+    workcell = make_workcell(slow, EPISODE, KillingClock(signal.SIGTERM))
+    arm: Any = workcell.arm
+    arm.stop = lambda: True
+    with workcell.arm, workcell.camera, Stops() as stops:
+        result = Loop(workcell, Towards(), stops, "unattended").run()
+    assert result.reason == "stopped"
+    assert re.match(r"the arm was told to stop and still moves at 0\.\d+ rad/s", result.end_state)
 
 
 class StoppedWhileDeciding(Towards):

@@ -1,6 +1,7 @@
 """The digital twin against the simulated task, and what it shows of itself."""
 
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import cv2
@@ -8,6 +9,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 import torch
+import trimesh
 
 from maniskill_tomato.deploy.clock import SimulatedClock
 from maniskill_tomato.deploy.deploy_errors import NotConnectedError, PerceptionError, ProfileError
@@ -16,6 +18,7 @@ from maniskill_tomato.deploy.interface import JointMove
 from maniskill_tomato.deploy.mock.dynamics import ArmDynamics
 from maniskill_tomato.deploy.mock.episode import load_episode
 from maniskill_tomato.deploy.robot_perception import TRUE_MASKS, ImagePerception, RobotBelief, TruthPerception
+from maniskill_tomato.plants.episode_list import Episode, write_episodes
 from maniskill_tomato.raycast.images import FIRST_ORGAN_LABEL, ROBOT_LABEL
 from maniskill_tomato.raycast.view_rays import DEPTH_MODE, RayLabel
 from maniskill_tomato.robot.d435 import (
@@ -141,6 +144,38 @@ def test_a_picture_agrees_with_the_truth_that_comes_with_it() -> None:
     area = int((centre @ centre - (rays @ centre) ** 2 < (float(fruit.radius) * 0.95) ** 2).sum())
     assert visible / area == pytest.approx(truth.visible_fraction, abs=0.08)
     assert set(np.unique(truth.labels)) <= {0, ROBOT_LABEL, *range(2, 2 + len(episode.plant.organs))}
+
+
+def test_plants_of_mesh_files_stand_before_the_twin(tmp_path: Path) -> None:
+    meshes = {
+        "fruit_0": trimesh.creation.icosphere(subdivisions=1, radius=0.03).apply_translation(
+            (-0.1, 0.0, 0.8)
+        ),
+        "stem": trimesh.creation.box((0.02, 0.02, 1.2)).apply_translation((0.0, 0.0, 0.6)),
+    }
+    folder = tmp_path / "set" / "held_out"
+    folder.mkdir(parents=True)
+    arrays: dict[str, Any] = {name: mesh.triangles for name, mesh in meshes.items()}
+    np.savez(folder / "a.npz", **arrays)
+    episode = Episode(
+        plant_seed=2_000_000,
+        leaf_density=1.0,
+        plant_pose=(0.9, 0.05, 0.1),
+        target=0,
+        camera_position=(0.4, -0.1, 0.8),
+        start_visibility=0.0,
+    )
+    write_episodes(tmp_path / "list.json", [episode])
+    twin = {"episodes": str(tmp_path / "list.json"), "plants": str(tmp_path / "set")}
+    _, camera = devices(0, **twin)
+    truth = camera.read().truth
+    expected = [0.9 - 0.1 * np.cos(0.1), 0.05 - 0.1 * np.sin(0.1), 0.8]
+    np.testing.assert_allclose(truth.target_position, expected, atol=1e-6)
+    assert truth.visible_fraction == 1.0  # Nothing hangs before it.
+    with pytest.raises(ProfileError, match="plants needs a list of its own"):
+        devices(0, plants=str(tmp_path / "set"))
+    with pytest.raises(ProfileError, match="episodes must be one of 'validation', 'held_out'"):
+        devices(0, episodes="test")
 
 
 class GivenMasks:

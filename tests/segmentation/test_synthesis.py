@@ -21,6 +21,7 @@ from maniskill_tomato.robot.d435 import (
     min_depth,
 )
 from maniskill_tomato.robot.depth_noise import DepthNoise, measure_depth
+from maniskill_tomato.segmentation.datasets.annotations import BEHIND
 from maniskill_tomato.segmentation.synthesis.dataset_rendering import DatasetConfig, _numbers, make_dataset
 from maniskill_tomato.segmentation.synthesis.silhouette import draw_silhouette
 
@@ -125,6 +126,43 @@ def test_another_data_set_is_not_overwritten(tmp_path: Path, capsys: pytest.Capt
         main(["dataset", "--count", "1", "--out", str(tmp_path / "full")])
     assert caught.value.code == 2
     assert "not empty" in capsys.readouterr().err
+
+
+def write_mesh_plant(path: Path) -> Path:
+    path.parent.mkdir(parents=True)
+    meshes = {
+        "fruit_0": trimesh.creation.icosphere(subdivisions=2, radius=0.03).apply_translation(
+            (-0.1, 0.0, 0.8)
+        ),
+        "stem": trimesh.creation.box((0.02, 0.02, 1.2)).apply_translation((0.0, 0.0, 0.6)),
+    }
+    arrays: dict[str, Any] = {name: mesh.triangles for name, mesh in meshes.items()}
+    np.savez(path, **arrays)
+    return path
+
+
+def test_a_data_set_on_mesh_files_is_another_one_and_needs_plants_of_its_split(tmp_path: Path) -> None:
+    write_mesh_plant(tmp_path / "set" / "train" / "a.npz")
+    plants = str(tmp_path / "set")
+    with pytest.raises(InvalidInputError, match="no plants of the split 'held_out'"):
+        DatasetConfig(plants=plants, split="held_out")
+    (tmp_path / "data").mkdir()
+    (tmp_path / "data" / "dataset.json").write_text(json.dumps(DatasetConfig(plants=plants).identity()))
+    with pytest.raises(InvalidInputError, match="another plants"):
+        make_dataset(DatasetConfig(count=1), tmp_path / "data")
+
+
+@pytest.mark.render
+@pytest.mark.slow
+def test_plants_of_mesh_files_stand_in_the_pictures(tmp_path: Path) -> None:
+    path = write_mesh_plant(tmp_path / "a.npz" / "a.npz")
+    config = DatasetConfig(count=3, plants=str(path), width=320, height=240)
+    images = make_dataset(config, tmp_path / "data").images
+    named = [
+        one for image in images for one in image.instances if one.name and not one.name.startswith(BEHIND)
+    ]
+    assert {one.category for one in named} <= {"tomato_ripe", "stem", "robot"}
+    assert any(one.category == "tomato_ripe" and one.visible_fraction for one in named)
 
 
 def test_the_command_takes_its_options(tmp_path: Path) -> None:

@@ -15,6 +15,8 @@ import numpy as np
 
 from maniskill_tomato.errors import InvalidInputError, RenderingUnavailableError
 from maniskill_tomato.files import write_atomically
+from maniskill_tomato.plants.mesh_set import MeshSet, MeshSource
+from maniskill_tomato.plants.organs import Plant
 from maniskill_tomato.plants.seed_splits import SEED_SPLITS
 from maniskill_tomato.rendering.vulkan_probe import NO_RENDERING_HINT, rendering_available
 from maniskill_tomato.robot.d435 import color_intrinsics
@@ -60,6 +62,8 @@ class DatasetConfig:
     """Cherry and beef tomatoes and other leaf densities too, instead of the tasks' own plants alone."""
     quality: int = 92
     """Of the JPEG files, 1 to 100."""
+    plants: str | None = None
+    """Mesh file or folder whose plants of the split stand in front, each alone; None grows rows of our own."""
 
     def __post_init__(self) -> None:
         if self.count < 1:
@@ -74,6 +78,8 @@ class DatasetConfig:
             )
         if not 1 <= self.quality <= 100:
             raise InvalidInputError(f"quality must be 1 to 100, got {self.quality}")
+        if self.plants is not None:
+            self.mesh_plants(self.plants).seeds(self.split)
 
     @property
     def scenes(self) -> int:
@@ -82,7 +88,14 @@ class DatasetConfig:
 
     def identity(self) -> dict[str, Any]:
         """What may not change when a data set is continued; its count may."""
-        return {k: v for k, v in asdict(self).items() if k != "count"} | {"format": FORMAT}
+        plants = None if self.plants is None else self.mesh_plants(self.plants).fingerprint
+        same = {k: v for k, v in asdict(self).items() if k != "count"}
+        return same | {"format": FORMAT, "plants": plants}
+
+    @staticmethod
+    def mesh_plants(plants: str) -> MeshSet:
+        """The set of mesh files."""
+        return MeshSource.parse(plants).plants
 
 
 def make_dataset(
@@ -200,7 +213,14 @@ def render_scene(config: DatasetConfig, out: Path, scene: int) -> int:
     low, high = SEED_SPLITS[config.split]
     rng = np.random.default_rng([config.seed, low, scene])
     appearance = draw_appearance(rng, vary_crop=config.vary_crop)
-    coarse, fine = grow(appearance, low + int(rng.integers(high - low)), (low, high))
+    coarse: Plant
+    fine: Plant
+    if config.plants is None:
+        coarse, fine = grow(appearance, low + int(rng.integers(high - low)), (low, high))
+    else:
+        meshes = config.mesh_plants(config.plants)
+        seeds = meshes.seeds(config.split)
+        coarse = fine = meshes.grow(seeds[int(rng.integers(len(seeds)))])
     intrinsics = color_intrinsics(config.width, config.height)
     views = draw_views(coarse, VIEWS_PER_SCENE, intrinsics, rng)
     built = GreenhouseScene(fine, appearance, intrinsics, rng, first_seed=low)
