@@ -33,7 +33,7 @@ LISTED_ERROR: Final = 0.01
 LOST_AFTER: Final = 6
 """A fruit is given up after so many views in a row that do not show it."""
 
-STALE_AFTER: Final = 5
+STALE_AFTER: Final = 6
 """It is given up, too, after so many views in a row that do not show more of it than those before."""
 
 LITTLE: Final = 0.15
