@@ -142,7 +142,7 @@ class FruitDetector:
 def _pieces(fruits: Sequence[DetectedFruit]) -> list[list[int]]:
     """Detections that are pieces of one fruit, by their indices: two or more each.
 
-    Two fruits are solid; spheres of which one's centre lies well inside the other are one.
+    Fruits are solid: where the fitted spheres of two detections overlap more than two fruits could, it is one fruit.
     """
     groups: list[list[int]] = []
     for k, fruit in enumerate(fruits):

@@ -270,18 +270,21 @@ def test_a_line_that_never_ends_is_a_timeout() -> None:
 
 
 def test_a_server_that_sends_only_empty_lines_holds_nobody() -> None:
-    ended = threading.Event()
+    ended, flooded = threading.Event(), threading.Event()
 
     def flood(server: socket.socket) -> None:
         peer, _ = server.accept()
         with peer, contextlib.suppress(OSError):
             while not ended.is_set():
-                peer.sendall(b"\n" * 4096)
+                peer.sendall(b"\n" * 65536)
+                flooded.set()
 
     with socket.create_server(("127.0.0.1", 0)) as server:
         threading.Thread(target=flood, args=(server,), daemon=True).start()
         connection = LineConnection("127.0.0.1", server.getsockname()[1], 5.0)
         answers: list[str | None] = []
+        # More comes in than is read from now on.
+        assert flooded.wait(20.0)
 
         def ask() -> None:
             answers.extend(connection.receive(wait) for wait in (0.0, 0.05))
