@@ -1,4 +1,4 @@
-"""Text files that people or other programs wrote, as values: JSON and TOML within limits that real files stay far below."""
+"""Text files that others wrote, as values: JSON and TOML within limits that real files stay far below."""
 
 import json
 import tomllib
