@@ -12,7 +12,8 @@ from typing import Annotated
 
 import tyro
 
-from maniskill_tomato.deploy.sunrise.loopback import Fault, LoopbackController
+from maniskill_tomato.deploy.loopback_faults import Fault
+from maniskill_tomato.deploy.sunrise.loopback import LoopbackController
 from maniskill_tomato.errors import TomatoError
 
 

@@ -18,6 +18,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Literal, get_args
 
+from maniskill_tomato.deploy.loopback_faults import Fault, FaultSchedule
 from maniskill_tomato.deploy.sunrise.loopback_motion import (
     SimulatedArm,
     flange_pose,
@@ -34,55 +35,6 @@ FaultKind = Literal[
 closes the connection after `seconds`; `garbage` sends bytes that mean nothing; `partial` a line without an end;
 `endless` a line that never ends; `nan` joint angles that are no numbers; `jump` joint angles `radians` away; `contact`
 pushes on joint 2 while it moves; `swallow` loses this one command."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class Fault:
-    """One thing that goes wrong."""
-
-    kind: FaultKind
-    """What happens."""
-    command: str = ""
-    """Beginning of the command at which it happens; empty: any."""
-    count: int = 1
-    """At which occurrence of that command."""
-    seconds: float = 0.5
-    """How late, or how long after."""
-    radians: float = 0.5
-    """How far a joint jumps."""
-
-    @classmethod
-    def parse(cls, text: str) -> "Fault":
-        """A fault written as KIND, KIND@COMMAND or KIND@COMMAND#COUNT.
-
-        Raises:
-            InvalidInputError: The kind is unknown or the count is no number.
-        """
-        kind, _, rest = text.partition("@")
-        command, _, count = rest.partition("#")
-        if kind not in get_args(FaultKind):
-            raise InvalidInputError.choice("fault", kind, get_args(FaultKind))
-        if count and not (count.isdecimal() and int(count) > 0):
-            raise InvalidInputError(f"the count of a fault must be a whole number above 0, got {count!r}")
-        return cls(kind=kind, command=command, count=int(count or 1))  # type: ignore[arg-type]
-
-
-class FaultSchedule:
-    """Which fault begins with which command."""
-
-    def __init__(self, faults: Sequence[Fault]) -> None:
-        """Counts from the first command on."""
-        self._faults = tuple(faults)
-        self._seen = [0] * len(self._faults)
-
-    def due(self, command: str) -> Fault | None:
-        """The fault that begins with this command, if any; empty lines do not count."""
-        for index, fault in enumerate(self._faults):
-            if command and command.startswith(fault.command):
-                self._seen[index] += 1
-                if self._seen[index] == fault.count:
-                    return fault
-        return None
 
 
 logger = logging.getLogger(__name__)
@@ -121,7 +73,7 @@ class LoopbackController:
         self._target = [0.0] * 7
         self._relative_speed = 0.0
         self._tool = [0.0] * 6
-        self._schedule = FaultSchedule(self.faults)
+        self._schedule = FaultSchedule(self.faults, get_args(FaultKind))
         self._connection: socket.socket | None = None
         self._send_lock = threading.Lock()
         self._over = threading.Event()

@@ -23,10 +23,10 @@ from maniskill_tomato.deploy.deploy_errors import (
     RefusedError,
 )
 from maniskill_tomato.deploy.drivers import DriverContext
+from maniskill_tomato.deploy.iiwa_readings import Reading, pose_difference, why_impossible
 from maniskill_tomato.deploy.interface import Arm, ArmState, Float64, JointMove
 from maniskill_tomato.deploy.sunrise.client import SunriseClient
 from maniskill_tomato.deploy.sunrise.line_connection import LineConnection
-from maniskill_tomato.deploy.sunrise.readings import Reading, pose_difference, why_impossible
 from maniskill_tomato.deploy.sunrise.sunrise_config import SunriseConfig
 from maniskill_tomato.deploy.toml_tables import parse_table
 from maniskill_tomato.robot import iiwa14

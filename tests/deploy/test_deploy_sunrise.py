@@ -29,10 +29,11 @@ from maniskill_tomato.deploy.deploy_errors import (
 )
 from maniskill_tomato.deploy.drivers import DriverContext, make_arm, make_camera
 from maniskill_tomato.deploy.interface import Arm, JointMove
+from maniskill_tomato.deploy.loopback_faults import Fault
 from maniskill_tomato.deploy.profile import load_profile
 from maniskill_tomato.deploy.sunrise.client import SunriseClient
 from maniskill_tomato.deploy.sunrise.line_connection import MAX_LINE_BYTES, LineConnection
-from maniskill_tomato.deploy.sunrise.loopback import Fault, LoopbackController
+from maniskill_tomato.deploy.sunrise.loopback import LoopbackController
 from maniskill_tomato.errors import InvalidInputError
 
 START = np.array([0.0, 0.35, 0.0, -1.2, 0.0, 1.5, 0.0])
@@ -254,7 +255,7 @@ def test_a_connection_dropped_in_a_move_says_what_halts_the_arm() -> None:
 
 
 @pytest.mark.parametrize("kind", ["garbage", "endless"])
-def test_bytes_that_mean_nothing_end_the_connection(kind: Any) -> None:
+def test_bytes_that_mean_nothing_end_the_connection(kind: str) -> None:
     faults = [Fault(kind=kind, command="getJointsPositions", count=2)]
     with LoopbackController(qpos=REST, faults=faults) as controller, driver(controller) as arm:
         with pytest.raises(ProtocolError, match="restart the toolbox server"):

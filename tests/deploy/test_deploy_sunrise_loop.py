@@ -12,6 +12,7 @@ from maniskill_tomato.deploy.drivers import DriverContext, make_arm, make_camera
 from maniskill_tomato.deploy.guarded_arm import GuardedArm
 from maniskill_tomato.deploy.interface import Float64
 from maniskill_tomato.deploy.loop import TASK, Loop
+from maniskill_tomato.deploy.loopback_faults import Fault
 from maniskill_tomato.deploy.mock.episode import load_episode
 from maniskill_tomato.deploy.mock.twin_world import twin_options, twin_world
 from maniskill_tomato.deploy.profile import Profile, TargetConfig
@@ -19,7 +20,7 @@ from maniskill_tomato.deploy.robot_perception import TruthPerception
 from maniskill_tomato.deploy.run_records import LoopConfig, RunResult
 from maniskill_tomato.deploy.safety import Safety, SafetyConfig
 from maniskill_tomato.deploy.stops import Stops
-from maniskill_tomato.deploy.sunrise.loopback import Fault, LoopbackController
+from maniskill_tomato.deploy.sunrise.loopback import LoopbackController
 from maniskill_tomato.deploy.workcell import Workcell
 from maniskill_tomato.policies.opening import open_policy
 from maniskill_tomato.robot.d435 import T_flange_camera_color_optical
@@ -145,7 +146,7 @@ def test_a_fault_of_the_controller_ends_the_run_with_its_reason(fault: Fault, re
         ("nan", "protocol"),
     ],
 )
-def test_after_a_connection_lost_in_a_move_nobody_claims_that_the_arm_stands(kind: Any, reason: str) -> None:
+def test_after_a_connection_lost_in_a_move_nobody_claims_that_the_arm_stands(kind: str, reason: str) -> None:
     """The seventh reading of the joints falls into the first move."""
     fault = Fault(kind=kind, command="getJointsPositions", count=7, seconds=4.0)
     timeout = 2.0 if reason == "timeout" else 30.0

@@ -1,6 +1,7 @@
-"""Checks of what the controller reports: joint angles that can be true, a flange where our kinematics put it."""
+"""What drivers of an iiwa check: joint angles that can be true, a flange where our kinematics put it."""
 
 import math
+from dataclasses import dataclass
 from typing import Final, NamedTuple
 
 import numpy as np
@@ -10,7 +11,7 @@ from scipy.spatial.transform import Rotation
 from maniskill_tomato.deploy.deploy_errors import FaultError
 from maniskill_tomato.deploy.interface import LIMIT_SLACK, Float64
 from maniskill_tomato.deploy.rigid import difference, transform
-from maniskill_tomato.deploy.sunrise.sunrise_config import SunriseConfig
+from maniskill_tomato.errors import check_ranges
 from maniskill_tomato.robot import iiwa14
 from maniskill_tomato.robot.kinematics import forward_kinematics
 
@@ -19,6 +20,37 @@ SPEED_SLACK: Final = 1.2
 
 READING_SLACK: Final = 0.005
 """How far two readings may differ beyond that, in [rad]."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class IiwaConfig:
+    """Options that the drivers of an iiwa share: what is mounted, and how exactly readings must agree."""
+
+    flange_xyz: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    """Where Sunrise's flange lies in the plain flange face (126 mm from the wrist), in [m]. A media flange moves it;
+    KUKA's own ROS 2 model has (0, 0, 0.026)."""
+    flange_rpy: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    """Fixed-axis roll, pitch, yaw of Sunrise's flange in the plain flange face, in [rad]."""
+    tool_xyzabc: tuple[float, float, float, float, float, float] | None = None
+    """The tool in Sunrise's flange frame: x, y, z, in [m], A, B, C, in [rad] about z, y, x. Only the pose check uses
+    it; the load must be set in Sunrise."""
+    pose_tolerance_m: float = 0.002
+    """How far Sunrise's flange and ours may lie apart when connecting, in [m]."""
+    pose_tolerance_rad: float = 0.01
+    """The same for the orientation, in [rad]."""
+    arrival_tolerance: float = 0.002
+    """How far a joint may be from its target after a move, in [rad]; Sunrise itself allows 0.1 degrees."""
+    rest_tolerance: float = 0.01
+    """How far a joint may be from where it stood without a move, in [rad]."""
+
+    def __post_init__(self) -> None:
+        check_ranges(
+            self,
+            pose_tolerance_m=(1e-5, 0.05),
+            pose_tolerance_rad=(1e-5, 0.1),
+            arrival_tolerance=(1e-5, 0.1),
+            rest_tolerance=(1e-5, 0.1),
+        )
 
 
 class Reading(NamedTuple):
@@ -60,7 +92,7 @@ def why_impossible(reading: Reading, last: Reading | None, moving: bool, rest_to
     return f"that joint {joint + 1} turned by {math.degrees(change[joint]):.2f} degrees {how}"
 
 
-def pose_difference(told: Float64, joint_positions: Float64, config: SunriseConfig) -> tuple[float, float]:
+def pose_difference(told: Float64, joint_positions: Float64, config: IiwaConfig) -> tuple[float, float]:
     """How far the controller's tool, or flange, is from ours.
 
     Args:
