@@ -25,6 +25,7 @@ ENTRY_POINT_GROUP: Final = "maniskill_tomato.drivers"
 
 BUILT_IN: Final[dict[Kind, dict[str, str]]] = {
     "arm": {
+        "libiiwa": "maniskill_tomato.deploy.libiiwa.libiiwa_arm:make_arm",
         "mock": "maniskill_tomato.deploy.mock.mock_arm:make_arm",
         "sunrise": "maniskill_tomato.deploy.sunrise.sunrise_arm:make_arm",
     },

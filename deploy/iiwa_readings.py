@@ -9,9 +9,9 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from maniskill_tomato.deploy.deploy_errors import FaultError
-from maniskill_tomato.deploy.interface import LIMIT_SLACK, Float64
+from maniskill_tomato.deploy.interface import LIMIT_SLACK, ArmState, Float64
 from maniskill_tomato.deploy.rigid import difference, transform
-from maniskill_tomato.errors import check_ranges
+from maniskill_tomato.errors import InvalidInputError, check_ranges
 from maniskill_tomato.robot import iiwa14
 from maniskill_tomato.robot.kinematics import forward_kinematics
 
@@ -34,6 +34,9 @@ class IiwaConfig:
     tool_xyzabc: tuple[float, float, float, float, float, float] | None = None
     """The tool in Sunrise's flange frame: x, y, z, in [m], A, B, C, in [rad] about z, y, x. Only the pose check uses
     it; the load must be set in Sunrise."""
+    torque_margin: tuple[float, ...] = (30.0, 30.0, 15.0, 15.0, 10.0, 4.0, 4.0)
+    """How far each joint's torque may leave what it is before the move until the arm stops, in [N m]; about a tenth of
+    what the joints can do. Shape (7,)."""
     pose_tolerance_m: float = 0.002
     """How far Sunrise's flange and ours may lie apart when connecting, in [m]."""
     pose_tolerance_rad: float = 0.01
@@ -44,6 +47,12 @@ class IiwaConfig:
     """How far a joint may be from where it stood without a move, in [rad]."""
 
     def __post_init__(self) -> None:
+        if len(self.torque_margin) != iiwa14.NUM_JOINTS or not all(
+            0.0 < t <= 400.0 for t in self.torque_margin
+        ):
+            raise InvalidInputError(
+                f"torque_margin must be {iiwa14.NUM_JOINTS} torques above 0 and up to 400 N m, got {self.torque_margin}"
+            )
         check_ranges(
             self,
             pose_tolerance_m=(1e-5, 0.05),
@@ -90,6 +99,40 @@ def why_impossible(reading: Reading, last: Reading | None, moving: bool, rest_to
     joint = int(np.argmax(change - allowed))
     how = "faster than it can" if moving else "without a move"
     return f"that joint {joint + 1} turned by {math.degrees(change[joint]):.2f} degrees {how}"
+
+
+class ReadingLog:
+    """The last two readings of one arm, which tell its velocity."""
+
+    def __init__(self, rest_tolerance: float) -> None:
+        """Begins empty.
+
+        Args:
+            rest_tolerance: How far a joint may turn without a move, in [rad].
+        """
+        self._rest_tolerance = rest_tolerance
+        self._last: Reading | None = None
+        self._previous: Reading | None = None
+
+    def add(self, reading: Reading, moving: bool) -> str | None:
+        """Takes a reading; what speaks against it, by which it is not taken.
+
+        Args:
+            reading: Its numbers are finite.
+            moving: Whether a move was under way since the last one.
+        """
+        what = why_impossible(reading, self._last, moving, self._rest_tolerance)
+        if what is None:
+            self._previous, self._last = self._last, reading
+        return what
+
+    def state(self) -> ArmState | None:
+        """Positions and velocities; None where the readings are too near or too far apart to tell these."""
+        last, before = self._last, self._previous
+        if last is None or before is None or not 0.005 < last.asked - before.asked < 1.0:
+            return None
+        velocities = (last.positions - before.positions) / (last.asked - before.asked)
+        return ArmState(joint_positions=last.positions, joint_velocities=velocities, stamp=last.stamp)
 
 
 def pose_difference(told: Float64, joint_positions: Float64, config: IiwaConfig) -> tuple[float, float]:

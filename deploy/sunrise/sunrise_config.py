@@ -5,7 +5,6 @@ from dataclasses import dataclass
 from maniskill_tomato.deploy.iiwa_readings import IiwaConfig
 from maniskill_tomato.deploy.sunrise.client import TorqueKind
 from maniskill_tomato.errors import InvalidInputError, check_ranges
-from maniskill_tomato.robot.iiwa14 import NUM_JOINTS
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -16,9 +15,6 @@ class SunriseConfig(IiwaConfig):
     """Address of the controller; this is the cabinet's default on the socket X66."""
     port: int = 30001
     """TCP port of the toolbox server."""
-    torque_margin: tuple[float, ...] = (30.0, 30.0, 15.0, 15.0, 10.0, 4.0, 4.0)
-    """How far each joint's torque may leave what it is before the move until the arm stops, in [N m]; about a tenth of
-    what the joints can do. Shape (7,)."""
     torque_kind: TorqueKind = "external"
     """Which torque the windows lie around. Which one Sunrise compares with them is for the first test in T1 to
     show: with the wrong one moves are stopped where nothing touches the arm."""
@@ -37,10 +33,6 @@ class SunriseConfig(IiwaConfig):
         super().__post_init__()
         if not self.host or any(c.isspace() for c in self.host):
             raise InvalidInputError(f"host must be an address, got {self.host!r}")
-        if len(self.torque_margin) != NUM_JOINTS or not all(0.0 < t <= 400.0 for t in self.torque_margin):
-            raise InvalidInputError(
-                f"torque_margin must be {NUM_JOINTS} torques above 0 and up to 400 N m, got {self.torque_margin}"
-            )
         check_ranges(
             self,
             port=(1, 65535),

@@ -1,0 +1,1 @@
+"""The KUKA iiwa through the LibIiwa application on its controller."""
