@@ -27,6 +27,7 @@ from maniskill_tomato.files import write_atomically
 from maniskill_tomato.policies.opening import open_policy
 from maniskill_tomato.policies.protocol import Policy
 from maniskill_tomato.report_design import INK, rgb
+from maniskill_tomato.warp_runtime import load_kernels
 
 TILE: Final = (320, 240)
 """Largest size of one look, in [px]."""
@@ -160,6 +161,9 @@ def run_goal(
             info = {**facts, "profile_text": profile.text, "T_flange_camera": mount}
             every.append(stack.enter_context(McapRecorder(config.out / RECORDING, info)))
         stack.enter_context(stops)
+        # What is slow the first time is done before the loop's first beat, from which on the heartbeat is watched.
+        load_kernels()
+        workcell.perception.warm_up(camera.intrinsics)
         loop = Loop(workcell, prepared.policy, stops, prepared.mode, every, confirm, goal)
         return loop.run(), facts
 

@@ -13,6 +13,7 @@ from maniskill_tomato.deploy.interface import Float64, Frame, FrameTruth
 from maniskill_tomato.errors import TomatoError
 from maniskill_tomato.raycast.images import ROBOT_LABEL
 from maniskill_tomato.raycast.view_rays import ViewRays
+from maniskill_tomato.robot.d435 import CameraIntrinsics
 from maniskill_tomato.robot.kinematics import forward_kinematics, link_transforms
 from maniskill_tomato.robot.rotations import FORWARD_RPY, matrix_to_rpy
 from maniskill_tomato.segmentation.instances import Instances
@@ -85,6 +86,10 @@ class Perception(Protocol):
         """
         ...
 
+    def warm_up(self, intrinsics: CameraIntrinsics) -> None:
+        """Does what is slow the first time, before pictures of these intrinsics come; changes nothing else."""
+        ...
+
     def look(self, frame: Frame, T_world_camera: Float64) -> Sighting:
         """What a picture tells.
 
@@ -128,6 +133,19 @@ class ImagePerception:
         self._perception = CameraPerception(1, self._detector)
         self._chooses = False
         return self._perception
+
+    def warm_up(self, intrinsics: CameraIntrinsics) -> None:
+        """Has the segmenter look at a black picture."""
+        if self._knows_truth:
+            return
+        size = (intrinsics.height, intrinsics.width)
+        black = PosedFrame(
+            depth_m=np.zeros(size, np.float32),
+            intrinsics=intrinsics,
+            T_world_camera=np.eye(4),
+            rgb=np.zeros((*size, 3), np.uint8),
+        )
+        self._detector.measure(black)
 
     def look(self, frame: Frame, T_world_camera: Float64) -> Sighting:
         """The sighting by masks and depth; see `Perception`."""
@@ -216,6 +234,9 @@ class TruthPerception:
 
     def begin(self, target_position: Float64 | None) -> None:
         self._target = target_position
+
+    def warm_up(self, intrinsics: CameraIntrinsics) -> None:
+        """Nothing: the picture comes with its truth."""
 
     def look(self, frame: Frame, T_world_camera: Float64) -> Sighting:
         truth = frame.truth

@@ -1,5 +1,6 @@
 """Ways to stop a run: Ctrl-C, SIGTERM, a key, a file, and a missing heartbeat of the loop."""
 
+import math
 import select
 import signal
 import sys
@@ -15,6 +16,9 @@ from maniskill_tomato.deploy.deploy_errors import StoppedError
 
 KEYS = ("q", "s", " ")
 """Followed by Enter, each of these stops a run in a terminal."""
+
+SHORTEST_WATCH, LONGEST_WATCH = 0.01, 1.0
+"""The heartbeat is looked at when it would be lost, within these bounds, in [s]."""
 
 
 class Stops:
@@ -33,7 +37,7 @@ class Stops:
         Args:
             stop_file: The run stops when this file appears.
             keyboard: Listen to `KEYS` on a terminal.
-            heartbeat_s: Longest time between two `beat`s, in [s] of real time.
+            heartbeat_s: Longest time between two `beat`s, in [s] of real time; it counts from the first one.
             on_lost_heartbeat: Called once from another thread when that passes.
         """
         self._stop_file = stop_file
@@ -41,13 +45,12 @@ class Stops:
         self._heartbeat_s = heartbeat_s
         self._on_lost = on_lost_heartbeat
         self._reason: str | None = None
-        self._last_beat = time.monotonic()
+        self._last_beat = math.inf
         self._waiting = False
         self._ended = threading.Event()
         self._handlers: dict[signal.Signals, Any] = {}
 
     def __enter__(self) -> Self:
-        self._last_beat = time.monotonic()
         if threading.current_thread() is threading.main_thread():
             for number in (signal.SIGINT, signal.SIGTERM):
                 self._handlers[number] = signal.signal(number, self._on_signal)
@@ -109,8 +112,11 @@ class Stops:
             raise StoppedError(signal.Signals(number).name)
 
     def _watch_heartbeat(self) -> None:
-        while not self._ended.wait(min(1.0, self._heartbeat_s / 4)):
-            if not self._waiting and time.monotonic() - self._last_beat > self._heartbeat_s:
+        wait = self._heartbeat_s
+        while not self._ended.wait(min(max(wait, SHORTEST_WATCH), LONGEST_WATCH)):
+            # Read once: another thread beats.
+            wait = self._last_beat + self._heartbeat_s - time.monotonic()
+            if wait < 0.0 and not self._waiting:
                 self.request("heartbeat")
                 if self._on_lost is not None:
                     self._on_lost()

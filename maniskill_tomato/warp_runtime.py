@@ -36,6 +36,16 @@ def start_warp() -> None:
         os.close(kept)
 
 
+def load_kernels() -> None:
+    """Compiles and loads all Warp kernels of this package that are imported, for the CPU.
+
+    Warp otherwise does so when each is first called: seconds for every module where its cache is empty, such as after
+    an update.
+    """
+    start_warp()
+    wp.load_module(__name__.partition(".")[0], device="cpu", recursive=True)
+
+
 LARGEST_KEPT_BATCH: Final = 4096
 """Tensors of larger batches are not kept between calls."""
 

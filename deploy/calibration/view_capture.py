@@ -28,6 +28,7 @@ from maniskill_tomato.deploy.stops import Stops
 from maniskill_tomato.errors import InvalidInputError, check_ranges
 from maniskill_tomato.robot.d435 import T_flange_camera_color_optical
 from maniskill_tomato.robot.inverse_kinematics import InverseKinematics, Reach
+from maniskill_tomato.warp_runtime import load_kernels
 
 logger = logging.getLogger(__name__)
 
@@ -129,6 +130,8 @@ def capture_views(
     """
     plan, stops = plan or CapturePlan(), stops or Stops()
     kinematics = InverseKinematics()
+    # Compiled before the first beat, from which on the heartbeat is watched.
+    load_kernels()
     views: list[RecordedView] = []
 
     arm.begin_run(stops.asked)

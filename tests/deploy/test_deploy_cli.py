@@ -87,6 +87,28 @@ def test_sigterm_ends_a_run_in_a_defined_state(tmp_path: Path) -> None:
     assert "holds its position" in content["end_state"]
 
 
+@pytest.mark.slow  # Compiles every kernel.
+def test_the_first_run_compiles_its_kernels_before_the_heartbeat_is_watched(tmp_path: Path) -> None:
+    profile = tmp_path / "hasty.toml"
+    profile.write_text(
+        '[arm]\ndriver = "mock"\n[camera]\ndriver = "mock"\n[twin]\nwidth = 160\nheight = 120\n'
+        '[perception]\nsegmenter = "ground_truth"\n[target]\nsource = "twin"\n'
+        "[loop]\nmax_moves = 3\n[stop]\nheartbeat = 3.0\n"
+    )
+    out, cache = tmp_path / "out", tmp_path / "empty"
+    command = [sys.executable, "-m", "maniskill_tomato.cli", "deploy", "run", "--profile", str(profile)]
+    done = subprocess.run(
+        [*command, "--seed", "9", "--out", str(out)],
+        env={**os.environ, "WARP_CACHE_PATH": str(cache)},
+        capture_output=True,
+        text=True,
+        timeout=500,
+    )
+    assert done.returncode == 0, done.stderr
+    assert any(cache.rglob("*.o")), "kernels were compiled into the empty folder"
+    assert json.loads((out / "result.json").read_text())["reason"] in ("success", "budget")
+
+
 def test_ctrl_c_while_views_of_a_calibration_are_taken_ends_it_with_its_status(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -506,6 +506,19 @@ def test_a_loop_that_stands_still_loses_its_heartbeat_and_stops_the_arm() -> Non
     assert len(stopped) == 1
 
 
+def test_the_heartbeat_is_watched_from_the_first_beat_on_and_lost_when_it_should() -> None:
+    lost_at: list[float] = []
+    with Stops(heartbeat_s=0.2, on_lost_heartbeat=lambda: lost_at.append(time.monotonic())) as stops:
+        time.sleep(0.5)
+        assert stops.asked() is None
+        began = time.monotonic()
+        assert stops.beat() is None
+        while not lost_at and time.monotonic() < began + 30.0:
+            time.sleep(0.01)
+        assert stops.asked() == "heartbeat"
+    assert 0.2 <= lost_at[0] - began < 5.0
+
+
 def test_people_may_take_longer_than_the_heartbeat_to_confirm_and_can_stop_instead(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:

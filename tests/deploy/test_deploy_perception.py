@@ -142,3 +142,17 @@ def test_the_same_frames_give_the_same_observation_in_the_simulator_and_on_the_r
             solved = mover.move(qpos, position, targets.double(), torch.tensor([MOVES[step]] * n))
             qpos = solved.qpos.float()
     assert seen >= n * len(MOVES) / 2, "the target must be seen in most of the views"
+
+
+def test_warming_up_has_the_segmenter_look_once_at_a_picture_of_the_cameras_size_and_maps_nothing() -> None:
+    seen: list[Any] = []
+
+    def segmenter(image: Any, depth_m: Any = None) -> Instances:
+        seen.append((image.shape, image.dtype, image.max(), depth_m.shape))
+        return Instances.from_masks(np.zeros((0, *depth_m.shape), np.bool_), categories=())
+
+    perception = ImagePerception("counting", segmenter)
+    perception.warm_up(color_intrinsics(320, 240))
+    assert seen == [((240, 320, 3), np.dtype(np.uint8), 0, (240, 320))]
+    assert list(perception.map.tracks) == []
+    ImagePerception(TRUE_MASKS, None).warm_up(color_intrinsics(320, 240))
