@@ -56,8 +56,11 @@ TASK: Final = "TomatoViewpoint-v1"
 BOUND_SLACK: Final = 1e-4
 """An action's entries may exceed 1 by this much: rounding."""
 
-WAIT_SLICE: Final = 0.1
-"""While the arm moves, stops are looked for this often, in [s]."""
+WAIT_SLICE: Final = 0.02
+"""While an arm moves that can be stopped, stops are looked for this often, in [s]."""
+
+LONG_SLICE: Final = 0.1
+"""The same for one that cannot."""
 
 STOP_TIME: Final = 2.0
 """An arm that was told to stop stands after so long, in [s]."""
@@ -475,7 +478,7 @@ class Loop:
         """Waits until the arm stands and has settled, looking for stops all the while."""
         with self._times.timed("move"):
             try:
-                while not self._arm.wait(WAIT_SLICE):
+                while not self._arm.wait(WAIT_SLICE if self._arm.can_stop else LONG_SLICE):
                     self._check_stops()
                 self._clock.sleep(self._settle)
             except (_End, DeployError) as error:

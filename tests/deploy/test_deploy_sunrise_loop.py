@@ -6,54 +6,21 @@ from typing import Any
 import numpy as np
 import pytest
 
-from maniskill_tomato.deploy.capture import CaptureConfig
-from maniskill_tomato.deploy.clock import MonotonicClock
-from maniskill_tomato.deploy.drivers import DriverContext, make_arm, make_camera
-from maniskill_tomato.deploy.guarded_arm import GuardedArm
-from maniskill_tomato.deploy.interface import Float64
 from maniskill_tomato.deploy.loop import TASK, Loop
 from maniskill_tomato.deploy.loopback_faults import Fault
 from maniskill_tomato.deploy.mock.episode import load_episode
-from maniskill_tomato.deploy.mock.twin_world import twin_options, twin_world
-from maniskill_tomato.deploy.profile import Profile, TargetConfig
-from maniskill_tomato.deploy.robot_perception import TruthPerception
-from maniskill_tomato.deploy.run_records import LoopConfig, RunResult
-from maniskill_tomato.deploy.safety import Safety, SafetyConfig
+from maniskill_tomato.deploy.mock.rehearsal import rehearsal
+from maniskill_tomato.deploy.run_records import RunResult
 from maniskill_tomato.deploy.stops import Stops
 from maniskill_tomato.deploy.sunrise.loopback import LoopbackController
-from maniskill_tomato.deploy.workcell import Workcell
 from maniskill_tomato.policies.opening import open_policy
-from maniskill_tomato.robot.d435 import T_flange_camera_color_optical
 
-TWIN = {"width": 160, "height": 120, "depth_noise": 0.0}
 SEED = 1
-
-
-class CarriedBy:
-    """In the twin's world, the arm of the controller instead of MuJoCo's."""
-
-    moving = False
-
-    def __init__(self, controller: LoopbackController) -> None:
-        self._controller = controller
-
-    @property
-    def joint_positions(self) -> Float64:
-        return np.array(self._controller.arm.qpos)
-
-    @property
-    def joint_velocities(self) -> Float64:
-        return np.zeros(7)
-
-    def advance(self, time: float) -> None:
-        pass
 
 
 def run(
     faults: Sequence[Fault] = (), moves: int = 2, speedup: float = 5.0, reply_timeout_s: float = 30.0
 ) -> tuple[RunResult, LoopbackController]:
-    clock = MonotonicClock()
-    context = DriverContext(clock=clock, seed=SEED)
     start = load_episode("held_out", SEED).start_joints
     with LoopbackController(
         qpos=start.tolist(), speedup=speedup, media_flange_m=0.026, faults=faults
@@ -61,36 +28,8 @@ def run(
         host, port = controller.address
         options: dict[str, Any] = {"host": host, "port": port, "flange_xyz": [0.0, 0.0, 0.026]}
         options["reply_timeout_s"] = reply_timeout_s
-        world: Any = twin_world(twin_options(TWIN), context)
-        world.arm = CarriedBy(controller)
-        x, y, z = world.episode.target_position.tolist()
-        profile = Profile(
-            name="rehearsal",
-            text="",
-            description="",
-            arm_driver="sunrise",
-            arm_options=options,
-            camera_driver="mock",
-            camera_options=TWIN,
-            T_flange_camera=T_flange_camera_color_optical,
-            calibrated=False,
-            target=TargetConfig(source="given", position=(x, y, z)),
-            safety=SafetyConfig(max_state_age=10.0, max_frame_age=60.0),
-            loop=LoopConfig(max_moves=moves),
-            capture=CaptureConfig(max_age=5.0),
-        )
-        arm, camera = make_arm("sunrise", options, context), make_camera("mock", TWIN, context)
-        # The controller is a loopback: nothing real moves, and the camera looks at where its arm is.
-        arm.simulated = True
-        workcell = Workcell(
-            profile=profile,
-            clock=clock,
-            arm=arm,
-            camera=camera,
-            guarded_arm=GuardedArm(arm, Safety(profile.safety), clock),
-            perception=TruthPerception(),
-        )
-        with arm, camera, Stops() as stops:
+        workcell = rehearsal("sunrise", options, lambda: np.array(controller.arm.qpos), SEED, moves)
+        with workcell.arm, workcell.camera, Stops() as stops:
             result = Loop(workcell, open_policy("nbv", env_id=TASK), stops, "unattended").run()
     return result, controller
 
