@@ -98,10 +98,12 @@ def sources() -> tuple[str, ...]:
 
 
 @pytest.mark.skipif(not (ROOT / "pyproject.toml").is_file(), reason="the tests run outside a checkout")
-@pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
+@pytest.mark.parametrize(
+    "page",
+    [page for page in PAGES if page.name != "CHANGELOG.md"],  # It also names what is gone.
+    ids=lambda page: str(page.relative_to(ROOT)),
+)
 def test_names_of_modules_in_the_text_exist(page: Path) -> None:
-    if page.name == "CHANGELOG.md":
-        pytest.skip("it also names what is gone")
     text = page.read_text(encoding="utf-8")
     rooms = "|".join(ROOMS)
     pattern = rf"(?:maniskill_tomato\.|(?<![-\w./]))((?:{rooms})(?:\.[A-Za-z_]\w*)+)\b"

@@ -8,6 +8,7 @@ import mujoco
 import numpy as np
 import pytest
 import torch
+import trimesh
 from torch import Tensor
 
 from maniskill_tomato.deploy.clock import SimulatedClock
@@ -81,7 +82,6 @@ def depths_in_links(postures: Iterable[Float64], points: Float64) -> Float64:
     """How deep each point gets into the hull of a link from the forearm on in any of the postures, in [m]."""
     deepest = np.full(len(points), -np.inf)
     hulls = {name: link_meshes()[name][0] for name in LINK_NAMES[5:]}
-    trimesh = pytest.importorskip("trimesh")
     solids = {name: trimesh.convex.convex_hull(vertices) for name, vertices in hulls.items()}
     for joints in postures:
         links = link_transforms(torch.as_tensor(joints)[None])[0].numpy()

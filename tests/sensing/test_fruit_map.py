@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import torch
 from numpy.typing import NDArray
 from scipy.stats import chi2
 
@@ -23,8 +24,6 @@ from maniskill_tomato.sensing.fruit_map import (
 from maniskill_tomato.sensing.measurement import DetectedFruit, Measurement
 from maniskill_tomato.sensing.posed_frame import PosedFrame
 from maniskill_tomato.sensing.visible_fraction.sphere import FLATNESS
-
-torch = pytest.importorskip("torch")
 
 Place = NDArray[np.float64]
 

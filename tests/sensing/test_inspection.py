@@ -2,21 +2,19 @@
 
 import numpy as np
 import pytest
+import torch
 from numpy.typing import NDArray
 
 from maniskill_tomato.robot.d435 import color_intrinsics
+from maniskill_tomato.robot.look_at import look_at_pose
 from maniskill_tomato.segmentation.instances import Instances
 from maniskill_tomato.sensing.fruit_detector import FruitDetector
 from maniskill_tomato.sensing.fruit_map import FruitMap, MapConfig, Track
 from maniskill_tomato.sensing.inspection import LOST_AFTER, Aim, Inspection
-
-torch = pytest.importorskip("torch")
-
-from maniskill_tomato.robot.look_at import look_at_pose  # noqa: E402
-from maniskill_tomato.sensing.measurement import Measurement  # noqa: E402
-from maniskill_tomato.sensing.posed_frame import PosedFrame  # noqa: E402
-from maniskill_tomato.sensing.view_lattice import ViewLattice  # noqa: E402
-from maniskill_tomato.sensing.visible_fraction.sphere import FLATNESS  # noqa: E402
+from maniskill_tomato.sensing.measurement import Measurement
+from maniskill_tomato.sensing.posed_frame import PosedFrame
+from maniskill_tomato.sensing.view_lattice import ViewLattice
+from maniskill_tomato.sensing.visible_fraction.sphere import FLATNESS
 
 Place = NDArray[np.float64]
 
