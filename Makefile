@@ -55,6 +55,10 @@ lint: $(STAMP) ## Check the style (ruff)
 	@$(BIN)/ruff check .
 	@$(BIN)/ruff format --check .
 
+.PHONY: licences
+licences: $(STAMP) ## Check the licences of all installed packages
+	@$(BIN)/pip-licenses >/dev/null
+
 .PHONY: format
 format: $(STAMP) ## Repair the style (ruff)
 	@$(BIN)/ruff check --fix .
@@ -66,7 +70,7 @@ type: $(STAMP) ## Check the types (mypy, pyright)
 	@$(BIN)/pyright
 
 .PHONY: check
-check: lint type test ## Everything that must pass before a commit
+check: lint licences type test ## Everything that must pass before a commit
 
 .PHONY: build
 build: $(STAMP) ## Build the wheel and try it in a clean environment
