@@ -43,7 +43,12 @@ class _CarryingArm:
 
 
 def rehearsal(
-    driver: str, options: Mapping[str, Any], joints: Callable[[], Float64], seed: int, max_moves: int
+    driver: str,
+    options: Mapping[str, Any],
+    joints: Callable[[], Float64],
+    seed: int,
+    max_moves: int,
+    speed_fraction: float = 0.1,
 ) -> Workcell:
     """A workcell of a driver whose controller is a loopback, and of the twin's camera. Nothing real moves.
 
@@ -53,6 +58,7 @@ def rehearsal(
         joints: Where the loopback's arm is, in [rad]; shape (7,).
         seed: The twin's held-out episode, in whose start posture the loopback's arm should stand.
         max_moves: Of a run.
+        speed_fraction: Share of the joints' largest speeds.
     """
     clock = MonotonicClock()
     context = DriverContext(clock=clock, seed=seed)
@@ -70,7 +76,7 @@ def rehearsal(
         T_flange_camera=T_flange_camera_color_optical,
         calibrated=False,
         target=TargetConfig(source="given", position=(x, y, z)),
-        safety=SafetyConfig(max_state_age=10.0, max_frame_age=60.0),
+        safety=SafetyConfig(speed_fraction=speed_fraction, max_state_age=10.0, max_frame_age=60.0),
         loop=LoopConfig(max_moves=max_moves),
         capture=CaptureConfig(max_age=5.0),
     )

@@ -53,7 +53,7 @@ def run(
     in_move: Callable[[], None] | None = None,
     hang: Callable[[LoopbackRobot], None] | None = None,
     moves: int = 2,
-    speedup: float = 3.0,
+    speed_fraction: float = 0.1,
     reply_timeout_s: float = 10.0,
 ) -> tuple[RunResult, LoopbackRobot]:
     port = free_port()
@@ -62,13 +62,17 @@ def run(
     with LoopbackRobot(
         port=port,
         qpos=start.tolist(),
-        speedup=speedup,
         media_flange_m=0.026,
         tries_for_s=60.0,
         faults=faults,
     ) as robot:
         workcell = rehearsal(
-            "libiiwa", {**reach, "reply_timeout_s": reply_timeout_s}, lambda: robot.arm.qpos, SEED, moves
+            "libiiwa",
+            {**reach, "reply_timeout_s": reply_timeout_s},
+            lambda: robot.arm.qpos,
+            SEED,
+            moves,
+            speed_fraction,
         )
         listening = Stops(on_lost_heartbeat=workcell.guarded_arm.stop, **(stops or {}))
         if hang is not None:
@@ -109,7 +113,7 @@ def test_a_stop_in_a_move_halts_the_arm_on_its_way(how: str, tmp_path: Path) -> 
         else:
             os.kill(os.getpid(), signal.Signals[how])
 
-    result, robot = run(stops={"stop_file": stop_file}, in_move=ask, speedup=1.0)
+    result, robot = run(stops={"stop_file": stop_file}, in_move=ask)
     assert result.reason == "stopped" and not result.is_fault, result.detail
     assert result.end_state == "the arm was stopped and holds its position"
     sent = [request for request in robot.received if round(request[0]) == 102]
@@ -126,7 +130,7 @@ def test_a_lost_heartbeat_in_a_move_halts_the_arm_while_the_loop_still_hangs() -
         time.sleep(2.5)
         halted.append(not robot.arm.moves and robot.stopped_at is not None)
 
-    result, robot = run(stops={"heartbeat_s": 2.0}, hang=hang, speedup=0.25)
+    result, robot = run(stops={"heartbeat_s": 2.0}, hang=hang, speed_fraction=0.03)
     assert halted == [True]
     assert (result.reason, result.is_fault) == ("heartbeat", True), result.detail
     sent = [request for request in robot.received if round(request[0]) == 102]
@@ -146,7 +150,7 @@ def test_a_lost_heartbeat_in_a_move_halts_the_arm_while_the_loop_still_hangs() -
 )
 def test_a_fault_of_the_robot_ends_the_run_with_its_reason(fault: Fault, reason: str, word: str) -> None:
     timeout = 1.0 if reason == "timeout" else 10.0
-    result, robot = run([fault], moves=3, speedup=1.0, reply_timeout_s=timeout)
+    result, robot = run([fault], moves=3, reply_timeout_s=timeout)
     assert result.is_fault and result.reason == reason and word in result.detail, result.detail
     claims = "the arm was stopped and holds" in result.end_state or "the arm stands" in result.end_state
     # Nothing is claimed of an arm that does not answer.
