@@ -173,7 +173,7 @@ def kept_result(result: RunResult, write: Callable[[], None]) -> RunResult:
     try:
         write()
     except RecordingError as error:
-        _logger.error("%s", error)
+        result = replace(result, report_error=str(error))
         if not result.is_fault:
             result = replace(result, reason=error.reason, detail=str(error), is_fault=True)
     return result

@@ -108,10 +108,12 @@ class RunResult:
     """Mean wall time of each stage of a step, in [ms]."""
     end_state: str
     """What the arm does now."""
+    report_error: str = ""
+    """Why its report could not be written; empty if it was."""
 
     def to_json(self) -> dict[str, Any]:
         """Plain numbers, strings and lists."""
-        return asdict(self)
+        return {name: value for name, value in asdict(self).items() if name != "report_error"}
 
 
 class Recorder(Protocol):

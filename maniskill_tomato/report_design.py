@@ -2,11 +2,16 @@
 
 import base64
 import html
+import io
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, Final
+from typing import TYPE_CHECKING, Any, Final
 
 import maniskill_tomato
+from maniskill_tomato.files import write_atomically
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 INK, MUTED, GRID, PAPER = "#1f2a24", "#6b7770", "#e3e7e2", "#fafaf7"
 TOMATO, LEAF, STRAW, SKY, PLUM = "#c8402c", "#3f7d4e", "#d9a441", "#3b6ea5", "#8a5aa5"
@@ -129,6 +134,18 @@ _PAGE: Final = """<!DOCTYPE html>
 </body>
 </html>
 """
+
+
+def save_figure(figure: "Figure", path: Path, dpi: float | None = None) -> None:
+    """Writes a figure in the format that the file's name says, whole or not at all.
+
+    Raises:
+        NotWrittenError: The file cannot be written.
+    """
+    content = io.BytesIO()
+    options: dict[str, Any] = {} if dpi is None else {"dpi": dpi}
+    figure.savefig(content, format=path.suffix[1:], **options)
+    write_atomically(path, content.getvalue())
 
 
 def rgb(colour: str) -> tuple[int, int, int]:

@@ -6,10 +6,11 @@ import multiprocessing.connection
 import os
 import signal
 import threading
+import time
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from multiprocessing.process import BaseProcess
-from typing import Any, TypeVar
+from typing import Any, Final, TypeVar
 
 from maniskill_tomato.errors import InvalidInputError
 
@@ -18,6 +19,9 @@ Result = TypeVar("Result")
 
 ONE_THREAD = {"OMP_NUM_THREADS": "1", "OPENCV_FOR_THREADS_NUM": "1", "LP_NUM_THREADS": "1"}
 """Variables that keep numerical libraries, OpenCV and Mesa's CPU renderer from taking all cores in each process."""
+
+GRACE_SECONDS: Final = 120.0
+"""How long a process may take to save its work and end when the one that started it is gone."""
 
 
 def run_jobs(
@@ -67,14 +71,19 @@ def run_jobs(
         pool.shutdown()
 
 
-def start_process(function: Callable[..., None], *arguments: Any) -> BaseProcess:
+def start_process(
+    function: Callable[..., None], *arguments: Any, grace: float = GRACE_SECONDS
+) -> BaseProcess:
     """Calls a function in a process of its own, which gets SIGTERM when this one ends, however that ends.
 
     Args:
         function: A function of a module, since the process must find it.
         arguments: What it is called with.
+        grace: Seconds that it then has to end by itself; after them it is ended.
     """
-    process = multiprocessing.get_context("spawn").Process(target=_run_alone, args=(function, arguments))
+    process = multiprocessing.get_context("spawn").Process(
+        target=_run_alone, args=(function, arguments, grace)
+    )
     # Until the process has a session of its own, Ctrl-C in the terminal would reach it too.
     before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
     try:
@@ -84,10 +93,16 @@ def start_process(function: Callable[..., None], *arguments: Any) -> BaseProcess
     return process
 
 
-def _run_alone(function: Callable[..., None], arguments: tuple[Any, ...]) -> None:
+def _run_alone(function: Callable[..., None], arguments: tuple[Any, ...], grace: float) -> None:
     os.setsid()
     signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
-    _when_parent_ends(lambda: os.kill(os.getpid(), signal.SIGTERM))
+
+    def end() -> None:
+        os.kill(os.getpid(), signal.SIGTERM)
+        time.sleep(grace)
+        os._exit(1)
+
+    _when_parent_ends(end)
     function(*arguments)
 
 

@@ -28,7 +28,8 @@ import numpy as np
 import torch
 import tyro
 
-from maniskill_tomato.deploy.recording import CutOffError, read_messages
+from maniskill_tomato.deploy.deploy_errors import CutOffError
+from maniskill_tomato.deploy.recording import read_messages
 from maniskill_tomato.files import read_tensors, write_json
 
 MARK = "TOMATO_CHECK_KILLS"
@@ -177,16 +178,25 @@ def recording_left(unbroken: Path, killed: Path) -> str | None:
 
 def commands(images: Path) -> dict[str, Command]:
     """Every command with the smallest settings that still write several times."""
-    train = "train TomatoViewpointGuided-v1 --plant one_tomato --total-timesteps 1500 --learning-starts 100"
-    begin = [*train.split(), *"--batch-size 32 --checkpoint-every 100 --out OUT".split()]
-    dataset = "dataset --count 48 --width 64 --height 64 --jobs 2 --out OUT".split()
-    benchmark = "benchmark --policies random_viewpoint,fixed_sweep --episodes 8 --no-pictures --jobs 2 --out OUT"
-    detect = ["detect", str(images), *"--quick --out OUT/list.json --pictures OUT/drawn".split()]
-    inspect = "deploy inspect --seed 0 --max-moves 6 --out OUT".split()
+
+    def words(text: str) -> list[str]:
+        return list(text.split())
+
+    begin = words(
+        "train TomatoViewpointGuided-v1 --plant one_tomato --total-timesteps 1500 --learning-starts 100 "
+        "--batch-size 32 --checkpoint-every 100 --out OUT"
+    )
+    go_on = words("train --resume OUT")
+    dataset = words("dataset --count 48 --width 64 --height 64 --jobs 2 --out OUT")
+    benchmark = words(
+        "benchmark --policies random_viewpoint,fixed_sweep --episodes 8 --no-pictures --jobs 2 --out OUT"
+    )
+    detect = ["detect", str(images), *words("--quick --out OUT/list.json --pictures OUT/drawn")]
+    inspect = words("deploy inspect --seed 0 --max-moves 6 --out OUT")
     return {
-        "train": Command(begin=begin, go_on=["train", "--resume", "OUT"], content=train_content),
+        "train": Command(begin=begin, go_on=go_on, content=train_content),
         "dataset": Command(begin=dataset, go_on=dataset, content=file_content),
-        "benchmark": Command(begin=benchmark.split(), go_on=benchmark.split(), content=benchmark_content),
+        "benchmark": Command(begin=benchmark, go_on=benchmark, content=benchmark_content),
         "detect": Command(begin=detect, go_on=detect, content=file_content),
         "inspect": Command(begin=inspect, go_on=inspect, content=inspect_content, left=recording_left),
     }

@@ -1,7 +1,6 @@
 """The plants of N environments: grown, shown, placed, and asked for their fruits."""
 
 from collections.abc import Mapping
-from functools import lru_cache
 
 import numpy as np
 import torch
@@ -9,17 +8,14 @@ from torch import Tensor
 from torch.nn.functional import pad
 
 from maniskill_tomato.plants.organs import Plant
+from maniskill_tomato.plants.plant_store import PLANT_STORE, plant_bytes
 from maniskill_tomato.plants.spec import PlantSpec
 from maniskill_tomato.tasks.world_state import WorldState
 
-GROWN_PLANTS = 128
-"""How many plants are kept, of 1 MB or less each (a row: 3 MB), for environments that show them again."""
 
-
-@lru_cache(maxsize=GROWN_PLANTS)
 def grow(spec: PlantSpec, seed: int) -> Plant:
-    """The plant of a spec and seed; the last few are kept, as environments often share them."""
-    return spec.grow(seed)
+    """The plant of a spec and seed; the last ones are kept, as environments often share them."""
+    return PLANT_STORE.get((spec, seed), lambda: spec.grow(seed), plant_bytes)
 
 
 class PlantBatch:

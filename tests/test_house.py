@@ -13,9 +13,11 @@ MAPPED_FOLDERS = ("assets", "deploy", "tasks")
 
 FOUNDATION = frozenset(
     {
+        "array_files",
         "assets",
         "errors",
         "files",
+        "network_weights",
         "report_design",
         "tables",
         "text_files",
@@ -24,8 +26,9 @@ FOUNDATION = frozenset(
         "worker_pool",
     }
 )
-"""What every room may import: asset files, errors, files on the disk, the look of reports, tables of TOML and JSON, the
-reader of such files, the version, the start of Warp, the pool of processes."""
+"""What every room may import: files of arrays, asset files, errors, files on the disk, weights put into a network, the
+look of reports, tables of TOML and JSON, the reader of such files, the version, the start of Warp, the pool of
+processes."""
 
 WORLD = FOUNDATION | {"robot", "plants", "raycast"}
 SENSES = WORLD | {"segmentation", "sensing"}

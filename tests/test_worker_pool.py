@@ -97,3 +97,23 @@ def test_workers_end_when_the_process_that_started_them_is_killed(tmp_path: Path
         finally:
             parent.send_signal(signal.SIGKILL)
     assert until(lambda: not any(is_running(pid) for pid in workers))
+
+
+@pytest.mark.skipif(not Path("/proc/self/stat").exists(), reason="reads the states of processes from /proc")
+@pytest.mark.parametrize("deaf", [False, True])
+def test_a_process_ends_when_the_one_that_started_it_is_killed(tmp_path: Path, deaf: bool) -> None:
+    """Also one that does not hear SIGTERM."""
+    script = (
+        "import signal, sys, time\n"
+        "from maniskill_tomato.worker_pool import start_process\n"
+        f"function, argument = {'signal.sigwait, [signal.SIGUSR1]' if deaf else 'time.sleep, 3600.0'}\n"
+        "if function is signal.sigwait: signal.pthread_sigmask(signal.SIG_BLOCK, [signal.SIGTERM])\n"
+        "print(start_process(function, argument, grace=0.5).pid, flush=True)\n"
+        "time.sleep(3600)\n"
+    )
+    with subprocess.Popen([sys.executable, "-c", script], stdout=subprocess.PIPE, text=True) as parent:
+        assert parent.stdout is not None
+        child = int(parent.stdout.readline())
+        assert until(lambda: is_running(child))
+        parent.send_signal(signal.SIGKILL)
+    assert until(lambda: not is_running(child))

@@ -1,7 +1,6 @@
 """A folder of views: pictures of the board, `views.json` with the joint angles and the camera's intrinsics."""
 
 import json
-import math
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -20,6 +19,7 @@ from maniskill_tomato.files import write_atomically
 from maniskill_tomato.robot.d435 import CameraIntrinsics
 from maniskill_tomato.robot.iiwa14 import JOINT_UPPER, NUM_JOINTS
 from maniskill_tomato.robot.kinematics import forward_kinematics
+from maniskill_tomato.segmentation.datasets.picture_files import read_picture
 from maniskill_tomato.text_files import read_json
 
 INDEX_NAME: Final = "views.json"
@@ -97,8 +97,6 @@ def read_views(folder: Path) -> tuple[list[RecordedView], CameraIntrinsics, str]
         raise CalibrationError(f"{path} must hold a table with a list `views`")
     try:
         intrinsics = CameraIntrinsics(**index["intrinsics"])
-        if not all(math.isfinite(v) for v in (intrinsics.cx, intrinsics.cy)):
-            raise InvalidInputError("cx and cy must be finite")
     except (KeyError, TypeError, InvalidInputError) as error:
         raise CalibrationError(
             f"{path}: intrinsics must have width, height, fx, fy, cx, cy ({error})"
@@ -123,13 +121,13 @@ def _read_view(folder: Path, entry: Any, k: int, intrinsics: CameraIntrinsics) -
     name = entry["image"]
     if Path(name).name != name:
         raise CalibrationError(f"{where}.image must be a file of this folder, got {name!r}")
-    picture = cv2.imread(str(folder / name), cv2.IMREAD_COLOR)
-    if picture is None:
-        raise CalibrationError(f"{where}.image: {folder / name} is no readable picture")
+    try:
+        picture = read_picture(folder / name)
+    except InvalidInputError as error:
+        raise CalibrationError(f"{where}.image: {error}") from error
     if picture.shape[:2] != (intrinsics.height, intrinsics.width):
         raise CalibrationError(
             f"{where}.image is {picture.shape[1]} x {picture.shape[0]} px, the intrinsics are of "
             f"{intrinsics.width} x {intrinsics.height}"
         )
-    color = np.asarray(cv2.cvtColor(picture, cv2.COLOR_BGR2RGB), dtype=np.uint8)
-    return RecordedView(name=name, color=color, joint_positions=joints)
+    return RecordedView(name=name, color=picture, joint_positions=joints)

@@ -90,8 +90,9 @@ class DeployRun(_Moving):
             f"{result.reason}: {result.detail}; {result.moves} moves, V_f {result.visible_fraction:.2f}, "
             f"{result.seconds:.1f} s; {result.end_state}"
         )
-        print(f"result  {self.out / 'result.json'}")
-        print(f"report  {self.out / 'report.png'}")
+        if not result.report_error:
+            print(f"result  {self.out / 'result.json'}")
+            print(f"report  {self.out / 'report.png'}")
         _end(result)
 
 
@@ -129,8 +130,9 @@ class DeployInspect(_Moving):
                 f"truth   {t['true_fully_seen']} of {t['true_ripe_in_reach']} ripe fruits in reach fully seen, "
                 f"precision {t['true_precision']}, place {t['true_position_error_median_m']} m off in the median"
             )
-        print(f"list    {self.out / 'inspection.json'}")
-        print(f"report  {self.out / 'report.html'}")
+        if not result.report_error:
+            print(f"list    {self.out / 'inspection.json'}")
+            print(f"report  {self.out / 'report.html'}")
         _end(result)
 
 
@@ -364,6 +366,8 @@ def _end(result: "RunResult") -> None:
     """Ends with the exit status of a fault or a signal, if one ended the run."""
     if result.is_fault:
         print(f"error: {result.detail}", file=sys.stderr)
+        if result.report_error not in ("", result.detail):
+            print(f"error: {result.report_error}", file=sys.stderr)
         raise SystemExit(FAULT_STATUS)
     if result.reason == "stopped":
         _end_by_signal(result.detail)

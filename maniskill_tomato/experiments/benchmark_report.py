@@ -15,7 +15,7 @@ from maniskill_tomato.experiments.episode_record import EpisodeRecord
 from maniskill_tomato.experiments.metrics import THRESHOLDS, compare_policies, summarise_policy
 from maniskill_tomato.experiments.policy_runs import Condition
 from maniskill_tomato.files import write_atomically, write_json
-from maniskill_tomato.report_design import INK, PLOT_STYLE, TEN, markdown_table, number, percent
+from maniskill_tomato.report_design import INK, PLOT_STYLE, TEN, markdown_table, number, percent, save_figure
 
 HEAD = (
     "policy",
@@ -180,7 +180,7 @@ def plot_progress(runs: Mapping[str, Sequence[EpisodeRecord]], horizon: int, pat
         for axes in (left, right):
             axes.xaxis.set_major_locator(MaxNLocator(integer=True))
         figure.legend(loc="outside lower center", ncols=5)
-        figure.savefig(path)
+        save_figure(figure, path)
 
 
 def plot_thresholds(rows: Sequence[Mapping[str, Any]], threshold: float, path: Path) -> None:
@@ -209,7 +209,7 @@ def plot_thresholds(rows: Sequence[Mapping[str, Any]], threshold: float, path: P
         )
         axes.set(title="Episodes that reach a V_f", xlabel="V_f", ylim=(-0.02, 1.02))
         figure.legend(loc="outside lower center", ncols=4)
-        figure.savefig(path)
+        save_figure(figure, path)
 
 
 def plot_sweeps(rows: Sequence[Mapping[str, Any]], path: Path) -> None:
@@ -241,7 +241,7 @@ def plot_sweeps(rows: Sequence[Mapping[str, Any]], path: Path) -> None:
         for axes in list(figure.axes)[len(axes_names) :]:
             axes.set_visible(False)
         figure.legend(loc="outside lower center", ncols=4)
-        figure.savefig(path)
+        save_figure(figure, path)
 
 
 def _cells(row: Mapping[str, Any], privileged: bool) -> tuple[str, ...]:

@@ -1,5 +1,6 @@
 """An evaluation from policy to report: episodes, metrics, plots, pictures, film, page."""
 
+import io
 import logging
 import time
 from collections.abc import Sequence
@@ -8,7 +9,6 @@ from pathlib import Path
 from typing import Any, cast
 
 import gymnasium as gym
-import imageio.v2 as imageio
 import numpy as np
 
 from maniskill_tomato.errors import InvalidInputError
@@ -21,13 +21,14 @@ from maniskill_tomato.experiments.rollout import open_widest, run_episodes
 from maniskill_tomato.experiments.row_benchmark import ENV_ID as ROW_ID
 from maniskill_tomato.experiments.row_benchmark import seeable_in_row, without_camera
 from maniskill_tomato.experiments.training_runs import Run
-from maniskill_tomato.files import write_json
+from maniskill_tomato.files import write_atomically, write_json
 from maniskill_tomato.learning.rl.envs import make_env
 from maniskill_tomato.learning.rl.history import load_history
 from maniskill_tomato.policies.adapters import origin
 from maniskill_tomato.policies.opening import RANDOM, find_policy, open_policy, shipped_policy
 from maniskill_tomato.policies.protocol import Planner, Policy
 from maniskill_tomato.rendering import vulkan_probe
+from maniskill_tomato.segmentation.datasets.picture_files import write_picture
 
 logger = logging.getLogger(__name__)
 
@@ -82,10 +83,10 @@ def evaluate(config: EvaluationConfig) -> EvaluationResult:
     views: list[ReportPicture] = []
     video = left_out = None
     if config.video:
-        if vulkan_probe.rendering_available():
+        if (problem := vulkan_probe.rendering_problem()) is None:
             video, views = _film(config, found)
         else:
-            left_out = LEFT_OUT.format(hint=vulkan_probe.NO_RENDERING_HINT)
+            left_out = LEFT_OUT.format(hint=problem)
     facts = {key.replace("_", " "): str(value) for key, value in description.items() if key != "path"}
     facts["evaluation time"] = f"{metrics['wall_seconds']:.0f} s"
     content = ReportInput(
@@ -147,14 +148,16 @@ def write_trajectories(path: Path, episodes: Sequence[EpisodeRecord]) -> None:
     and `visible_fraction`; `target[i]` is its target's position [m].
     """
     lengths = np.array([len(e.visible_fraction) for e in episodes])
+    content = io.BytesIO()
     np.savez_compressed(
-        path,
+        content,
         seed=np.array([e.seed for e in episodes]),
         first_view=np.concatenate(([0], np.cumsum(lengths)[:-1])),
         target=np.stack([e.target[0] for e in episodes]),
         viewpoints=np.concatenate([e.viewpoints for e in episodes]),
         visible_fraction=np.concatenate([e.visible_fraction for e in episodes]),
     )
+    write_atomically(path, content.getvalue())
 
 
 def _required_task(config: EvaluationConfig) -> str | None:
@@ -297,6 +300,6 @@ def _film(config: EvaluationConfig, found: str | Path) -> tuple[Path, list[Repor
         ("last_pose", first.last.outside, "At the end of the episode."),
     ):
         picture = config.out / f"{name}.png"
-        imageio.imwrite(picture, image)
+        write_picture(picture, image)
         pictures.append(ReportPicture(path=picture, caption=caption))
     return path, pictures

@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+from maniskill_tomato.files import write_atomically
 from maniskill_tomato.report_design import figure, notice, page, paragraph, section, table, tile
 
 
@@ -54,8 +55,7 @@ def write_report(path: Path, content: ReportInput) -> None:
             _facts(content, path.parent),
         ],
     )
-    path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_text(text, encoding="utf-8")
+    write_atomically(path, text.encode())
 
 
 def _summary(metrics: Mapping[str, Any]) -> str:

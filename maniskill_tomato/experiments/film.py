@@ -1,6 +1,8 @@
 """Episodes in pictures: the first and last views, and a film of the scene beside what the wrist camera sees."""
 
+import contextlib
 import functools
+import os
 from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
@@ -8,6 +10,7 @@ from typing import Any
 
 import gymnasium as gym
 import imageio.v2 as imageio
+import imageio_ffmpeg
 import numpy as np
 import torch
 from matplotlib import font_manager
@@ -16,6 +19,7 @@ from PIL import Image as PillowImage
 from PIL import ImageDraw, ImageFont
 
 from maniskill_tomato import report_design as design
+from maniskill_tomato.errors import NotWrittenError
 from maniskill_tomato.experiments.rollout import run_batch
 from maniskill_tomato.policies.protocol import Policy, StatePolicy
 from maniskill_tomato.rendering import vulkan_probe
@@ -90,18 +94,48 @@ def film_episodes(
 
     Returns:
         One entry per episode.
+
+    Raises:
+        NotWrittenError: The disk does not take it.
     """
-    path.parent.mkdir(parents=True, exist_ok=True)
-    writer: Any = imageio.get_writer(
-        path, fps=FRAMES_PER_SECOND, codec="libx264", quality=7, macro_block_size=16, ffmpeg_log_level="error"
-    )
+    part = path.with_name(f".{path.stem}.{os.getpid()}.tmp{path.suffix}")
     try:
-        return [
-            photograph(env, policy, seed, _Camera(env, f"episode {number} of {len(seeds)}", writer))
-            for number, seed in enumerate(seeds, start=1)
-        ]
+        path.parent.mkdir(parents=True, exist_ok=True)
+        writer: Any = imageio.get_writer(
+            part,
+            fps=FRAMES_PER_SECOND,
+            codec="libx264",
+            quality=7,
+            macro_block_size=16,
+            ffmpeg_log_level="error",
+        )
+        with contextlib.closing(writer):
+            films = [
+                photograph(env, policy, seed, _Camera(env, f"episode {number} of {len(seeds)}", writer))
+                for number, seed in enumerate(seeds, start=1)
+            ]
+        _check_film(part)
+        part.replace(path)
+    except OSError as error:
+        raise NotWrittenError(
+            f"cannot write the film {path}: {str(error).splitlines()[0]}; free some space, choose another --out, or "
+            "leave the film out"
+        ) from error
     finally:
-        writer.close()
+        part.unlink(missing_ok=True)
+    return films
+
+
+def _check_film(path: Path) -> None:
+    """Refuses a film that FFmpeg, which says nothing of a full disk, left unfinished.
+
+    Raises:
+        OSError: It cannot be played.
+    """
+    try:
+        imageio_ffmpeg.count_frames_and_secs(str(path))
+    except RuntimeError as error:
+        raise OSError("the disk did not take all of it") from error
 
 
 def photograph(

@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 from maniskill_tomato.errors import InvalidInputError
 from maniskill_tomato.experiments.episode_record import EpisodeRecord
 from maniskill_tomato.learning.rl.history import TrainingCurves
-from maniskill_tomato.report_design import INK, LEAF, MUTED, PLOT_STYLE, PLUM, SKY, STRAW, TOMATO
+from maniskill_tomato.report_design import INK, LEAF, MUTED, PLOT_STYLE, PLUM, SKY, STRAW, TOMATO, save_figure
 from maniskill_tomato.robot.d435 import T_flange_camera_color_optical, color_intrinsics
 from maniskill_tomato.robot.kinematics import viewpoint_transform
 
@@ -104,7 +104,7 @@ def plot_training_curves(
         if len(several) > 1:
             handles, labels = figure.axes[0].get_legend_handles_labels()
             figure.legend(handles, labels, loc="outside lower center", ncols=len(labels))
-        figure.savefig(path)
+        save_figure(figure, path)
 
 
 def plot_steps(episodes: Sequence[EpisodeRecord], path: Path) -> None:
@@ -120,7 +120,7 @@ def plot_steps(episodes: Sequence[EpisodeRecord], path: Path) -> None:
         axes.set_ylabel("steps")
         axes.yaxis.set_major_locator(MaxNLocator(integer=True))
         _outcome_legend(axes)
-        figure.savefig(path)
+        save_figure(figure, path)
 
 
 def plot_visible_fraction(episodes: Sequence[EpisodeRecord], threshold: float, path: Path) -> None:
@@ -152,7 +152,7 @@ def plot_visible_fraction(episodes: Sequence[EpisodeRecord], threshold: float, p
         axes.xaxis.set_major_locator(MaxNLocator(integer=True))
         axes.set_ylabel("V_f")
         _outcome_legend(axes)
-        figure.savefig(path)
+        save_figure(figure, path)
 
 
 def plot_trajectories(episodes: Sequence[EpisodeRecord], title: str, path: Path) -> None:
@@ -212,7 +212,7 @@ def plot_trajectories(episodes: Sequence[EpisodeRecord], title: str, path: Path)
         handles, labels = figure.axes[0].get_legend_handles_labels()
         plot_title(figure, title)
         figure.legend(handles, labels, loc="outside lower center", ncols=len(labels))
-        figure.savefig(path)
+        save_figure(figure, path)
 
 
 def marked_views(episode: EpisodeRecord) -> list[int]:

@@ -16,6 +16,7 @@ from typing import Any
 from maniskill_tomato.errors import InvalidInputError
 from maniskill_tomato.experiments.episode_record import EpisodeRecord
 from maniskill_tomato.files import write_json
+from maniskill_tomato.text_files import parse_json, read_json
 
 logger = logging.getLogger(__name__)
 
@@ -63,7 +64,7 @@ class ResultStore:
         found: dict[int, dict[str, Any]] = {}
         for line in path.read_bytes().splitlines() if path.is_file() else ():
             try:
-                content = json.loads(line)
+                content = parse_json(line.decode())
                 found[int(content["number"])] = content["result"]
             except (ValueError, KeyError, TypeError):
                 logger.warning("%s has a line that cannot be read; its result is made again", path)
@@ -108,7 +109,7 @@ def fingerprint(*files: Path) -> str:
 
 def _read_settings(path: Path) -> dict[str, Any]:
     try:
-        found = json.loads(path.read_text(encoding="utf-8"))
+        found = read_json(path)
         return {"settings": dict(found["settings"]), "members": dict(found["members"])}
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise InvalidInputError(

@@ -36,6 +36,7 @@ from maniskill_tomato.report_design import (
     markdown_table,
     page,
     paragraph,
+    save_figure,
     section,
     table,
 )
@@ -218,7 +219,7 @@ def plot_curves(groups: Sequence[Group], path: Path) -> None:
                     axes.text(0.5, 0.5, "not logged", transform=axes.transAxes, ha="center", color=MUTED)
         handles = [Line2D([], [], color=SERIES[i % len(SERIES)]) for i in range(len(groups))]
         canvas.legend(handles, labels, loc="outside lower center", ncols=2)
-        canvas.savefig(path)
+        save_figure(canvas, path)
 
 
 def _draw_curve(axes: Axes, group: Group, column: str, wall_time: bool, index: int) -> bool:

@@ -3,7 +3,6 @@
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-import imageio.v2 as imageio
 import matplotlib as mpl
 import numpy as np
 from matplotlib.axes import Axes
@@ -28,7 +27,8 @@ from maniskill_tomato.learning.rl.history import load_history
 from maniskill_tomato.plants.organs import SemanticClass
 from maniskill_tomato.plants.spec import PlantPose, PlantSpec
 from maniskill_tomato.rendering import vulkan_probe
-from maniskill_tomato.report_design import INK, MUTED, PLOT_STYLE, TOMATO
+from maniskill_tomato.report_design import INK, MUTED, PLOT_STYLE, TOMATO, save_figure
+from maniskill_tomato.segmentation.datasets.picture_files import write_picture
 from maniskill_tomato.tasks.plant_batch import grow
 from maniskill_tomato.tasks.thesis.thesis_config import ViewpointTaskConfig, guided_task, sparse_task
 
@@ -79,8 +79,8 @@ def take_views(experiment: Experiment, trial: Trial, folder: Path) -> str | None
     Returns:
         A message if this machine cannot render, else None.
     """
-    if not vulkan_probe.rendering_available():
-        return LEFT_OUT.format(hint=vulkan_probe.NO_RENDERING_HINT.capitalize())
+    if (problem := vulkan_probe.rendering_problem()) is not None:
+        return LEFT_OUT.format(hint=problem)
     from maniskill_tomato.experiments.film import make_film_options, photograph
 
     folder.mkdir(parents=True, exist_ok=True)
@@ -91,7 +91,7 @@ def take_views(experiment: Experiment, trial: Trial, folder: Path) -> str | None
         finally:
             env.close()
         views = (film.first.wrist, film.last.wrist, film.last.outside)
-        imageio.imwrite(folder / f"views_{evaluation.name}.png", np.concatenate(views, axis=1)[::2, ::2])
+        write_picture(folder / f"views_{evaluation.name}.png", np.concatenate(views, axis=1)[::2, ::2])
     return None
 
 
@@ -158,7 +158,7 @@ def plot_evaluation(
         handles, labels = grid[0][1].get_legend_handles_labels()
         plot_title(figure, title)
         figure.legend(handles, labels, loc="outside lower center", ncols=min(len(labels), 3))
-        figure.savefig(path)
+        save_figure(figure, path)
 
 
 def plot_plant_positions(experiment: Experiment, path: Path) -> None:
@@ -186,7 +186,7 @@ def plot_plant_positions(experiment: Experiment, path: Path) -> None:
                 fontweight="normal",
                 color=MUTED,
             )
-        figure.savefig(path)
+        save_figure(figure, path)
 
 
 def _draw_plant(

@@ -1,7 +1,6 @@
 """Training runs as their folders tell of them."""
 
 import csv
-import json
 from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from maniskill_tomato.errors import InvalidInputError
+from maniskill_tomato.text_files import read_json
 
 REQUIRED_METRICS = ("env_id", "episodes", "seed", "success_rate", "mean_steps")
 
@@ -135,9 +135,9 @@ def read_clock(folder: Path) -> Float64 | None:
 
 def _read_json(path: Path) -> dict[str, Any]:
     try:
-        content = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError) as error:
-        raise InvalidInputError(f"{path} cannot be read as JSON: {error}") from error
+        content = read_json(path)
+    except FileNotFoundError as error:
+        raise InvalidInputError(f"there is no {path}") from error
     if not isinstance(content, dict):
         raise InvalidInputError(f"{path} must hold a JSON object, got {type(content).__name__}")
     return content

@@ -14,7 +14,7 @@ from maniskill_tomato.experiments.episode_record import EpisodeRecord
 from maniskill_tomato.experiments.film import Image, make_film_options, wrist_picture
 from maniskill_tomato.experiments.policy_runs import Condition
 from maniskill_tomato.learning.rl.envs import make_env
-from maniskill_tomato.report_design import LEAF, PLOT_STYLE, TOMATO
+from maniskill_tomato.report_design import LEAF, PLOT_STYLE, TOMATO, save_figure
 
 EPISODES = 5
 SHRINK = 2
@@ -82,5 +82,4 @@ def _draw(rows: Sequence[Sequence[tuple[str, float, Image]]], threshold: float, 
                 axes.text(
                     0.03, 0.05, f"{seen:.2f}", transform=axes.transAxes, fontsize=7, color=colour, bbox=note
                 )
-        path.parent.mkdir(parents=True, exist_ok=True)
-        figure.savefig(path, dpi=110)
+        save_figure(figure, path, dpi=110)

@@ -87,11 +87,12 @@ def run_benchmark(config: BenchmarkConfig) -> BenchmarkResult:
     }
     task = GeneralTaskConfig()
     pictures, left_out = [], None
-    if config.pictures and vulkan_probe.rendering_available():
+    problem = vulkan_probe.rendering_problem() if config.pictures else None
+    if config.pictures and problem is None:
         pictures.append(config.out / "views.jpg")
         draw_view_grid(runs[main.name], main, task.full_visibility, pictures[0])
-    elif config.pictures:
-        left_out = LEFT_OUT.format(hint=vulkan_probe.NO_RENDERING_HINT.capitalize())
+    elif problem is not None:
+        left_out = LEFT_OUT.format(hint=problem)
     figures = summarise_runs(runs, (main, *swept), task.max_moves)
     table, page = write_benchmark(
         figures,

@@ -11,6 +11,7 @@ from torch import Tensor
 
 from maniskill_tomato.errors import InvalidInputError
 from maniskill_tomato.files import read_tensors, write_json, write_tensors
+from maniskill_tomato.text_files import read_json
 from maniskill_tomato.worker_pool import run_jobs
 
 
@@ -63,6 +64,6 @@ def begin_training(out: Path, settings: dict[str, Any]) -> None:
     """
     settings = json.loads(json.dumps(settings))  # With lists for tuples, as the file tells it.
     described = out / "config.json"
-    if described.is_file() and json.loads(described.read_text()) != settings:
+    if described.is_file() and read_json(described) != settings:
         raise InvalidInputError(f"{out} holds a training with other settings; choose another folder")
     write_json(described, settings)

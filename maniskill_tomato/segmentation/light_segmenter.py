@@ -18,6 +18,7 @@ from torch.nn import functional
 
 from maniskill_tomato.assets import asset_path
 from maniskill_tomato.errors import CheckpointError, InvalidInputError, MissingPackageError
+from maniskill_tomato.network_weights import fill_network
 from maniskill_tomato.segmentation.detector_configs import FruitNetworkConfig
 from maniskill_tomato.segmentation.fruit_network import (
     SIZE_MULTIPLE,
@@ -307,8 +308,8 @@ def open_light(weights: Path | str | None = None, **options: Any) -> LightSegmen
     try:
         sizes = {field.name: data["config"][field.name] for field in fields(FruitNetworkConfig)}
         network = FruitNetwork(FruitNetworkConfig(**sizes))
-        network.load_state_dict(data["state"])
-    except (KeyError, TypeError, RuntimeError) as error:
+        fill_network(network, data["state"])
+    except (KeyError, TypeError, ValueError, RuntimeError) as error:
         raise CheckpointError(
             f"{path} does not fit this version's network ({str(error).splitlines()[0]})"
         ) from error

@@ -22,6 +22,7 @@ from torchvision.ops.feature_pyramid_network import FeaturePyramidNetwork, LastL
 from torchvision.ops.misc import FrozenBatchNorm2d
 
 from maniskill_tomato.errors import CheckpointError, InvalidInputError, MissingWeightsError
+from maniskill_tomato.network_weights import fill_network
 from maniskill_tomato.segmentation.detector_configs import FIXED_BLOCKS, ClassicAugmentation, MaskRcnnConfig
 from maniskill_tomato.segmentation.efficientnet_lite import FEATURE_WIDTHS, EfficientNetLite0
 from maniskill_tomato.segmentation.instances import Image, Instances, check_image
@@ -201,8 +202,8 @@ def open_mask_rcnn(
         augmentation = ClassicAugmentation(**data["config"]["augmentation"])
         config = MaskRcnnConfig(**{**data["config"], "augmentation": augmentation})
         network = build_mask_rcnn(config)
-        network.load_state_dict(data["state"])
-    except (TypeError, KeyError, RuntimeError) as error:
+        fill_network(network, data["state"])
+    except (TypeError, KeyError, ValueError, RuntimeError) as error:
         raise CheckpointError(
             f"{weights} does not fit this version's network ({str(error).splitlines()[0]})"
         ) from error

@@ -74,6 +74,8 @@ def load_weights(path: Path, kind: str) -> dict[str, Any]:
             f"{FORMAT}: upgrade maniskill-tomato",
             newer_format=True,
         )
+    if not isinstance(data["state"], dict) or not all(isinstance(t, Tensor) for t in data["state"].values()):
+        raise CheckpointError(f"{path} holds weights that are no tensors; train it again")
     data["state"] = {n: t.float() if t.is_floating_point() else t for n, t in data["state"].items()}
     return data
 

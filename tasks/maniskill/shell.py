@@ -122,7 +122,7 @@ class TomatoEnv(BaseEnv):  # type: ignore[misc]
                 **kwargs,
             )
         except RuntimeError as error:
-            problem = shell_options.rendering_failure(error) if rendering else None
+            problem = shell_options.device_failure(error, rendering)
             if problem is not None:
                 raise RenderingUnavailableError(problem) from error
             raise

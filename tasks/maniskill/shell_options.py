@@ -1,5 +1,6 @@
 """The checks of what ManiSkill's shell takes beside the task's options: every refusal names the allowed values."""
 
+import re
 from collections.abc import Iterable
 from typing import Literal, get_args
 
@@ -71,15 +72,23 @@ def pick_render_backend(render_backend: str, rendering: bool) -> str:
     return "gpu" if torch.cuda.is_available() else "cpu"
 
 
-def rendering_failure(error: RuntimeError) -> str | None:
-    """What to tell a user whose SAPIEN raised this because it cannot draw; None if it is about something else."""
+def device_failure(error: RuntimeError, rendering: bool) -> str | None:
+    """What to tell a user whose SAPIEN raised this for want of a device; None if it is about something else."""
+    if (missing := re.search(r'failed to find device "(.*)"', str(error))) is not None:
+        what = "an NVIDIA GPU with its driver" if missing[1].startswith("cuda") else "a device of that name"
+        return (
+            f"sim_backend or render_backend asks for {missing[1]!r}, which needs {what}; leave them out to use what "
+            "this machine has"
+        )
+    if not rendering:
+        return None
     text = str(error).lower()
     if "window" in text or "display" in text:
         return (
             f"render_mode='human' opens a window, but there is no display ({error}); use render_mode='rgb_array', "
             "or start the program under xvfb-run"
         )
-    if any(word in text for word in ("render", "vulkan", "vk::", "find device", "find a device")):
+    if any(word in text for word in ("render", "vulkan", "vk::", "find a device")):
         return f"{NO_RENDERING_HINT}; obs_mode='state' with render_mode=None needs none ({error})"
     return None
 

@@ -284,7 +284,7 @@ def broken(change: Callable[[dict[str, Any]], object]) -> Callable[[dict[str, An
         (lambda i: i["views"][1].update(joint_positions=[90.0] * 7), "in radians"),
         (lambda i: i["views"][1].update(joint_positions=[None] * 7), r"views\[1\].joint_positions"),
         (lambda i: i["views"][0].update(image="../view_000.png"), "file of this folder"),
-        (lambda i: i["views"][0].update(image="views.json"), "no readable picture"),
+        (lambda i: i["views"][0].update(image="views.json"), "cannot be read as an image"),
         (lambda i: i["intrinsics"].update(width=641), "640 x 480"),
     ],
 )

@@ -33,6 +33,7 @@ from maniskill_tomato.experiments.rollout import run_episodes
 from maniskill_tomato.files import write_json
 from maniskill_tomato.learning.rl.history import TrainingHistory, load_history
 from maniskill_tomato.policies.adapters import as_policy
+from maniskill_tomato.rendering import vulkan_probe
 
 HORIZON = 6
 
@@ -276,7 +277,9 @@ def test_without_vulkan_an_evaluation_still_reports_and_names_the_remedy(
     monkeypatch.setattr(evaluation, "make_env", lambda env_id, num_envs, **options: Task(1))
     monkeypatch.setattr(evaluation, "find_policy", lambda policy, env_id: "forward")
     monkeypatch.setattr(evaluation, "open_policy", lambda policy, **options: as_policy(Forward()))
-    monkeypatch.setattr("maniskill_tomato.rendering.vulkan_probe.rendering_available", lambda: False)
+    monkeypatch.setattr(vulkan_probe, "render_backend", lambda: "none")
+    monkeypatch.setenv("VK_DRIVER_FILES", "/nonexistent")
+    monkeypatch.setenv("VK_ICD_FILENAMES", "/nonexistent")
     config = EvaluationConfig(
         env_id="Task-v1", policy="forward", episodes=4, seed=0, out=tmp_path, show_progress=False
     )

@@ -12,9 +12,10 @@ from numpy.typing import NDArray
 from maniskill_tomato.errors import InvalidInputError
 from maniskill_tomato.plants.generator import generate_plant
 from maniskill_tomato.plants.organs import Fruit, MeshPart, Organ, Plant, Ripeness, SemanticClass
+from maniskill_tomato.plants.plant_store import PLANT_STORE
 from maniskill_tomato.raycast.scene import RayScene
 from maniskill_tomato.raycast.visibility import Visibility
-from maniskill_tomato.raycast.warp_meshes import CACHED_PLANTS, LinkTriangles
+from maniskill_tomato.raycast.warp_meshes import LinkTriangles, PlantMeshes
 from maniskill_tomato.robot.d435 import (
     CAMERA_NEAR,
     CameraIntrinsics,
@@ -476,16 +477,19 @@ def test_a_replaced_plant_is_seen_in_its_environment_only(device: str) -> None:
     assert fractions(0, 0) == [0.0, 1.0]
 
 
-def test_plants_no_longer_shown_are_let_go() -> None:
-    scene = RayScene([make_plant([(ahead(), "ripe")])], CAMERA)
+def test_plants_no_longer_shown_are_let_go(monkeypatch: pytest.MonkeyPatch) -> None:
+    first = make_plant([(ahead(), "ripe")])
+    room = 9
+    monkeypatch.setattr(PLANT_STORE, "_limit", lambda: room * PlantMeshes(first, "cpu").size)
+    scene = RayScene([first], CAMERA)
     shown = []
-    for _ in range(CACHED_PLANTS + 7):
+    for _ in range(room + 7):
         plant = make_plant([(ahead(), "ripe")])
         shown.append(weakref.ref(plant))
         scene.replace_plants({0: plant})
         del plant
     gc.collect()
-    assert [ref() is not None for ref in shown] == [False] * 7 + [True] * CACHED_PLANTS
+    assert [ref() is not None for ref in shown] == [False] * 7 + [True] * room
 
 
 def test_input_that_cannot_be_used_is_refused_with_a_reason() -> None:

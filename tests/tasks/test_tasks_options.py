@@ -235,6 +235,17 @@ def test_pictures_without_vulkan_are_refused_with_the_command_that_installs_it()
     assert "refused" in result.stdout
 
 
+@pytest.mark.skipif(torch.cuda.is_available(), reason="needs a machine without CUDA")
+@pytest.mark.parametrize(
+    ("backend", "what"), [("gpu", "'cuda', which needs an NVIDIA GPU"), ("typo", "'typo'")]
+)
+def test_a_device_that_is_missing_is_not_said_to_be_vulkan(backend: str, what: str) -> None:
+    option: dict[str, Any] = {"sim_backend" if backend == "gpu" else "render_backend": backend}
+    with pytest.raises(RenderingUnavailableError, match=what) as refused:
+        gym.make("TomatoViewpointGuided-v1", num_envs=1, obs_mode="rgb", **option)
+    assert "make vulkan" not in str(refused.value)
+
+
 @pytest.mark.render
 def test_a_window_without_a_display_is_refused_with_what_to_do(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delenv("DISPLAY", raising=False)

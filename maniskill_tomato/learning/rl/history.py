@@ -13,6 +13,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from maniskill_tomato.array_files import read_arrays
 from maniskill_tomato.errors import InvalidInputError
 from maniskill_tomato.files import write_atomically
 
@@ -168,18 +169,21 @@ def load_history(folder: Path) -> TrainingCurves:
     """Reads the `history.npz` of a run.
 
     Raises:
-        InvalidInputError: The folder holds none.
+        InvalidInputError: The folder holds none, or it is damaged.
     """
     path = folder / "history.npz"
     if not path.is_file():
         raise InvalidInputError(
             f"{folder} holds no training history (history.npz); give the folder of a training run"
         )
-    with np.load(path, allow_pickle=False) as data:
-        episodes = {
-            key.removeprefix("episode_"): data[key] for key in data.files if key.startswith("episode_")
-        }
+    data = read_arrays(path)
+    episodes = {
+        key.removeprefix("episode_"): values for key, values in data.items() if key.startswith("episode_")
+    }
+    try:
         return TrainingCurves(episodes, data["step_reward"], data["step_visible_fraction"])
+    except KeyError as error:
+        raise InvalidInputError(f"{path} is no training history: it lacks {error}") from error
 
 
 @dataclass

@@ -18,7 +18,7 @@ from maniskill_tomato.files import write_atomically
 from maniskill_tomato.plants.mesh_set import MeshSet, MeshSource
 from maniskill_tomato.plants.organs import Plant
 from maniskill_tomato.plants.seed_splits import SEED_SPLITS
-from maniskill_tomato.rendering.vulkan_probe import NO_RENDERING_HINT, rendering_available
+from maniskill_tomato.rendering.vulkan_probe import rendering_problem
 from maniskill_tomato.robot.d435 import color_intrinsics
 from maniskill_tomato.segmentation.datasets.annotations import (
     AnnotatedImage,
@@ -29,6 +29,7 @@ from maniskill_tomato.segmentation.datasets.annotations import (
 from maniskill_tomato.segmentation.datasets.coco import read_coco, write_coco
 from maniskill_tomato.segmentation.datasets.picture_files import write_picture
 from maniskill_tomato.segmentation.datasets.voc import write_voc
+from maniskill_tomato.text_files import read_json
 from maniskill_tomato.worker_pool import run_jobs
 
 logger = logging.getLogger(__name__)
@@ -127,8 +128,8 @@ def make_dataset(
     missing = [k for k in range(config.scenes) if not _finished(config, out, k)]
     if on_scene is not None and len(missing) < config.scenes:
         on_scene(sum(len(_numbers(config, k)) for k in range(config.scenes) if k not in set(missing)))
-    if missing and not rendering_available():
-        raise RenderingUnavailableError(NO_RENDERING_HINT)
+    if missing and (problem := rendering_problem()) is not None:
+        raise RenderingUnavailableError(problem)
     processes = max(1, min(jobs, len(missing)))
     for _, scene in run_jobs(_render_one, [(config, out, scene) for scene in missing], processes):
         if on_scene is not None:
@@ -156,10 +157,9 @@ def copy_photos(photos: AnnotatedImages, out: Path) -> AnnotatedImages:
 def _claim(config: DatasetConfig, out: Path) -> None:
     path = out / CONFIG_FILE
     if path.is_file():
-        try:
-            found = json.loads(path.read_text())
-        except ValueError as error:
-            raise InvalidInputError(f"{path} is damaged; choose another folder") from error
+        found = read_json(path)
+        if not isinstance(found, dict):
+            raise InvalidInputError(f"{path} describes no data set; choose another folder")
         differing = [k for k, v in config.identity().items() if found.get(k) != v]
         if differing:
             raise InvalidInputError(

@@ -14,6 +14,7 @@ from torch import Tensor, nn
 
 from maniskill_tomato.errors import CheckpointError, TrainingDivergedError
 from maniskill_tomato.files import read_tensors, write_atomically
+from maniskill_tomato.network_weights import fill_network
 from maniskill_tomato.segmentation.training.training_pictures import TrainingImages, TrainingPicture
 from maniskill_tomato.segmentation.weights import save_weights
 
@@ -229,7 +230,7 @@ class DetectorTraining(ABC, Generic[Network]):
                     f"{out / CHECKPOINT} was trained with other settings; repeat them, or choose another --out"
                 )
             for name, module in self._modules().items():
-                module.load_state_dict(state["modules"][name])
+                fill_network(module, state["modules"][name])
             self.optimizer.load_state_dict(state["optimizer"])
             self.rng.bit_generator.state = json.loads(state["rng"])
             torch.set_rng_state(state["torch_rng"])

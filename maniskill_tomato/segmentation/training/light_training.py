@@ -12,6 +12,7 @@ import torch
 from torch import Tensor
 
 from maniskill_tomato.errors import CheckpointError
+from maniskill_tomato.network_weights import fill_network
 from maniskill_tomato.segmentation.datasets.annotations import AnnotatedImage
 from maniskill_tomato.segmentation.detector_configs import AugmentationConfig, LightTrainConfig
 from maniskill_tomato.segmentation.fruit_network import FruitNetwork
@@ -131,7 +132,10 @@ def _load_into(network: FruitNetwork, path: Path) -> None:
         )
     if anew := len(own) - len(fitting):
         logger.warning("%d of %d layers do not fit those of %s and begin anew", anew, len(own), path)
-    network.load_state_dict(fitting, strict=False)
+    try:
+        fill_network(network, own | fitting)
+    except ValueError as error:
+        raise CheckpointError(f"{path} cannot be used: {error}") from error
 
 
 def _fixed_batches(
