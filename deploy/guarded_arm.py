@@ -1,4 +1,5 @@
-"""The only way to an arm: `Safety` checks every command, and every reported state is checked before it is used."""
+"""The only way to an arm: `Safety` checks every command, every reported state is checked before it is used, and what
+comes back during a move is held against its plan (`move_watch`)."""
 
 import logging
 from collections.abc import Callable
@@ -8,13 +9,16 @@ import numpy as np
 
 from maniskill_tomato.deploy.clock import Clock
 from maniskill_tomato.deploy.deploy_errors import (
+    DeployError,
     DeviceTimeoutError,
     FaultError,
     HeartbeatLostError,
     RefusedError,
+    StaleError,
     StoppedError,
 )
 from maniskill_tomato.deploy.interface import LIMIT_SLACK, Arm, ArmState, Float64, JointMove
+from maniskill_tomato.deploy.move_watch import MoveWatch
 from maniskill_tomato.deploy.safety import Safety
 from maniskill_tomato.robot.iiwa14 import JOINT_LOWER, JOINT_NAMES, JOINT_UPPER, VELOCITY_LIMITS
 
@@ -22,12 +26,6 @@ _logger = logging.getLogger(__name__)
 
 JUMP_SLACK: Final = 0.02
 """A joint may seem to turn this much beyond what its largest speed allows between two states, in [rad]."""
-
-MOVE_TIME_FACTOR: Final = 3.0
-"""A move may take this many times as long as its speed says, and `MOVE_TIME_EXTRA` more."""
-
-MOVE_TIME_EXTRA: Final = 5.0
-"""In [s]."""
 
 
 class GuardedArm:
@@ -53,7 +51,9 @@ class GuardedArm:
         self._clock = clock
         self._last: ArmState | None = None
         self._under_way: JointMove | None = None
-        self._deadline = 0.0
+        self.watch: MoveWatch | None = None
+        """Of the move under way, or of the last one."""
+        self._watches = False
 
     def begin_run(self, why_stop: Callable[[], str | None]) -> None:
         """Forgets the stop of an earlier run.
@@ -137,14 +137,20 @@ class GuardedArm:
         if self._under_way is not None:
             raise RefusedError("busy: the last move has not ended")
         self._check_stopped()
-        sent = self._arm.command(move)
+        start = state.joint_positions
+        seconds = self._arm.move_seconds(move.joint_positions - start, move.speed_fraction)
+        self.watch, self._watches = MoveWatch(start, move, seconds, self._clock.now()), True
+        self._arm.on_reading = self._see
+        try:
+            sent = self._arm.command(move)
+        except BaseException:
+            self._watches = False
+            raise
+        self.watch.sent(self._clock.now())
         self._under_way = sent
         if self._asked_to_stop() is not None:
             # Asked while it was sent.
             self.stop()
-        turn = np.abs(sent.joint_positions - state.joint_positions)
-        expected = float((turn / (VELOCITY_LIMITS * move.speed_fraction)).max())
-        self._deadline = self._clock.now() + MOVE_TIME_FACTOR * expected + MOVE_TIME_EXTRA
         if not np.abs(sent.joint_positions - move.joint_positions).max() <= 1e-3:
             self.stop()
             raise FaultError("the driver sent other joint positions than the checked ones")
@@ -154,18 +160,19 @@ class GuardedArm:
         """Waits for the end of the move under way; True if the arm stands where it was sent.
 
         Raises:
-            DeviceTimeoutError: It should have arrived long ago.
-            FaultError: It stands elsewhere.
+            FaultError: It left its path or its speed, or stands elsewhere; it was told to stop.
+            DeviceTimeoutError: It should have got farther by now; likewise.
+            StaleError: Its readings are old; likewise.
         """
         if not self._arm.wait(timeout_s):
-            if self._clock.now() > self._deadline:
-                self.stop()
-                raise DeviceTimeoutError(
-                    "the move takes far longer than its speed says; the arm may be blocked"
-                )
+            if self._watches:
+                self._look()
             return False
         if self._under_way is not None:
-            sent, self._under_way = self._under_way, None
+            sent = self._under_way
+            if self._watches:
+                self._look()
+            self._under_way, self._watches = None, False
             off = np.abs(self.read().joint_positions - sent.joint_positions)
             if off.max() > self.safety.config.arrival_tolerance:
                 k = int(off.argmax())
@@ -173,6 +180,39 @@ class GuardedArm:
                     f"the arm stands {off[k]:.3f} rad from where {JOINT_NAMES[k]} was sent; something holds it back"
                 )
         return True
+
+    def _look(self) -> None:
+        """Reads the arm in a move, and holds it against the plan."""
+        asked = self._clock.now()
+        try:
+            state = self.read()
+        except DeployError:
+            self.stop()
+            raise
+        age = asked - state.stamp
+        if age > self.safety.config.max_state_age:
+            raise StaleError(
+                f"the arm's state is {age:.3f} s old in the middle of a move, allowed are "
+                f"{self.safety.config.max_state_age} s; {self._halt()}"
+            )
+        self._see(state.joint_positions, state.stamp - state.stamp_error, state.stamp)
+
+    def _see(self, joint_positions: Float64, earliest: float, stamp: float) -> None:
+        if not self._watches or self.watch is None:
+            return
+        departure = self.watch.see(joint_positions, earliest, stamp)
+        if departure is not None:
+            kind = DeviceTimeoutError if departure.is_late else FaultError
+            raise kind(f"the arm does not move as planned: {departure.detail}; {self._halt()}")
+
+    def _halt(self) -> str:
+        """Ends the move under way as far as possible; what becomes of it."""
+        if self.stop():
+            return "it was told to stop"
+        return (
+            "nothing more of the move is sent; what is under way goes on to its end, and only the smartPAD or the "
+            "emergency stop halts it"
+        )
 
     def _asked_to_stop(self) -> str | None:
         if self._stopped is None:
@@ -194,6 +234,7 @@ class GuardedArm:
         """
         if self._stopped is None:
             self._stopped = "stopped"
+        self._watches = False  # An arm that brakes is on no plan.
         stopped = self._arm.stop()
         if stopped:
             self._under_way = None

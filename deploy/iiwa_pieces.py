@@ -3,9 +3,11 @@
 import math
 
 import numpy as np
+from numpy.typing import NDArray
 
-from maniskill_tomato.deploy.interface import Float64
 from maniskill_tomato.robot import iiwa14
+
+Float64 = NDArray[np.float64]
 
 
 def straight_pieces(start: Float64, target: Float64, largest: float) -> list[Float64]:

@@ -74,6 +74,11 @@ class Reading(NamedTuple):
     positions: Float64
     """In [rad]. Shape (7,)."""
 
+    @property
+    def earliest(self) -> float:
+        """When it was measured at the earliest, by the driver's clock, in [s]."""
+        return self.stamp - (self.answered - self.asked)
+
 
 def why_impossible(reading: Reading, last: Reading | None, moving: bool, rest_tolerance: float) -> str | None:
     """What speaks against a reading, or None.
@@ -132,7 +137,12 @@ class ReadingLog:
         if last is None or before is None or not 0.005 < last.asked - before.asked < 1.0:
             return None
         velocities = (last.positions - before.positions) / (last.asked - before.asked)
-        return ArmState(joint_positions=last.positions, joint_velocities=velocities, stamp=last.stamp)
+        return ArmState(
+            joint_positions=last.positions,
+            joint_velocities=velocities,
+            stamp=last.stamp,
+            stamp_error=last.answered - last.asked,
+        )
 
 
 def pose_difference(told: Float64, joint_positions: Float64, config: IiwaConfig) -> tuple[float, float]:

@@ -6,6 +6,7 @@ the driver's `Clock` and say when the device took the measurement, as far as the
 
 import math
 from abc import ABC, abstractmethod
+from collections.abc import Callable
 from dataclasses import dataclass
 from types import TracebackType
 from typing import Any, Final, Self
@@ -14,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from maniskill_tomato.deploy.deploy_errors import ProtocolError
+from maniskill_tomato.deploy.iiwa_pieces import move_seconds
 from maniskill_tomato.raycast.view_rays import ViewRays
 from maniskill_tomato.robot.d435 import CameraIntrinsics
 from maniskill_tomato.robot.iiwa14 import NUM_JOINTS
@@ -49,7 +51,9 @@ class ArmState:
     joint_velocities: Float64
     """In [rad/s]. Shape (7,)."""
     stamp: float
-    """When it was measured, in [s]."""
+    """When it was measured, at the latest, in [s]."""
+    stamp_error: float = 0.0
+    """How much earlier than that it may have been measured, in [s]."""
 
     def __post_init__(self) -> None:
         for name in ("joint_positions", "joint_velocities"):
@@ -184,6 +188,10 @@ class Arm(Device):
     """Whether nothing real moves: then runs need no confirmation."""
     can_stop: bool = False
     """Whether `stop` halts a move under way. The iiwa's PTP goes on until the smartPAD or the emergency stop."""
+    on_reading: Callable[[Float64, float, float], None] | None = None
+    """Drivers that send a move in pieces call this, where it is set, with every measurement before they send another
+    piece: joint positions in [rad], and the earliest and the latest time of the measurement, in [s]. It raises, and
+    calls `stop`, where the arm does not do what was asked."""
 
     @abstractmethod
     def read(self, max_age_s: float = 0.5) -> ArmState:
@@ -213,6 +221,18 @@ class Arm(Device):
             RefusedError: The controller does not take it, or another move is under way.
             NotConnectedError: As for `read`; likewise `DeviceTimeoutError` and `ProtocolError`.
         """
+
+    def move_seconds(self, turn: Float64, speed_fraction: float) -> float:
+        """How long a move takes that nothing holds up, with what the driver needs between its pieces.
+
+        Args:
+            turn: How far each joint turns, in [rad]. Shape (7,).
+            speed_fraction: Share of the joints' largest speeds.
+
+        Returns:
+            In [s].
+        """
+        return move_seconds(np.zeros(NUM_JOINTS), turn, speed_fraction)
 
     @abstractmethod
     def wait(self, timeout_s: float) -> bool:

@@ -40,6 +40,9 @@ _logger = logging.getLogger(__name__)
 POLL_S: Final = 0.02
 """Between two looks at the robot in a move, in [s]."""
 
+PIECE_S: Final = 0.2
+"""Between two pieces of a move until the arm is seen to stand and the next one has been sent, in [s]."""
+
 LIMIT_MARGIN: Final = 1e-3
 """Targets stay this far inside the joints' limits, in [rad]: a joint whose target is beyond them, if only by rounding,
 stays where it is, and the robot says that all is done."""
@@ -190,6 +193,11 @@ class LibiiwaArm(Arm):
             self._next_piece(client, state)
         return JointMove(joint_positions=target, speed_fraction=self._speed)
 
+    def move_seconds(self, turn: Float64, speed_fraction: float) -> float:
+        acceleration, rest = self._config.acceleration_fraction, np.zeros(iiwa14.NUM_JOINTS)
+        ends = straight_pieces(rest, turn, self._config.largest_segment)
+        return len(ends) * (move_seconds(rest, ends[0], speed_fraction, acceleration) + PIECE_S)
+
     def wait(self, timeout_s: float) -> bool:
         with self._telling_of_a_move():
             deadline = time.monotonic() + timeout_s
@@ -306,6 +314,8 @@ class LibiiwaArm(Arm):
         what = self._readings.add(reading, self._piece is not None)
         if what is not None:
             raise self._halted(f"the arm reports {what}: guided by hand, or broken data")
+        if self.on_reading is not None:
+            self.on_reading(reading.positions, reading.earliest, reading.stamp)
         return state
 
     def _halted(self, why: str) -> FaultError:

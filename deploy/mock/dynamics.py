@@ -26,6 +26,18 @@ BANDWIDTH: Final = 40.0
 """Of the position control, critically damped, in [rad/s]."""
 
 
+def duration(turn: Float64, speed_fraction: float) -> float:
+    """How long a move takes, without the settling, in [s].
+
+    Args:
+        turn: How far each joint turns, in [rad]. Shape (7,).
+        speed_fraction: Share of the joints' largest speeds.
+    """
+    by_speed = PEAK_SPEED * np.abs(turn) / (speed_fraction * VELOCITY_LIMITS)
+    by_acceleration = np.sqrt(PEAK_ACCELERATION * np.abs(turn) / (speed_fraction * ACCELERATION_LIMITS))
+    return float(max(by_speed.max(), by_acceleration.max()))
+
+
 class ArmDynamics:
     """Joint positions and velocities over time, with the joints' torque limits; self-collision is `safety`'s part."""
 
@@ -66,10 +78,7 @@ class ArmDynamics:
         """Begins a move from where the arm is sent now; how long it will take, in [s]."""
         self._start, self._goal = self._goal.copy(), np.array(goal, dtype=np.float64)
         self._began = self.time
-        turn = np.abs(self._goal - self._start)
-        by_speed = PEAK_SPEED * turn / (speed_fraction * VELOCITY_LIMITS)
-        by_acceleration = np.sqrt(PEAK_ACCELERATION * turn / (speed_fraction * ACCELERATION_LIMITS))
-        self._duration = slowness * float(max(by_speed.max(), by_acceleration.max(), TIME_STEP))
+        self._duration = slowness * max(duration(self._goal - self._start, speed_fraction), TIME_STEP)
         return self._duration
 
     def halt(self) -> None:

@@ -13,7 +13,8 @@ from maniskill_tomato.deploy.deploy_errors import (
     RefusedError,
 )
 from maniskill_tomato.deploy.drivers import DriverContext
-from maniskill_tomato.deploy.interface import Arm, ArmState, JointMove
+from maniskill_tomato.deploy.interface import Arm, ArmState, Float64, JointMove
+from maniskill_tomato.deploy.mock.dynamics import duration
 from maniskill_tomato.deploy.mock.twin_world import ArmFault, Faults, TwinWorld, twin_options, twin_world
 
 TICK: Final = 0.02
@@ -78,6 +79,9 @@ class MockArm(Arm):
             slowness = SLOWNESS if fault == "slow" else 1.0
             self._world.arm.start(move.joint_positions, move.speed_fraction, slowness)
         return move
+
+    def move_seconds(self, turn: Float64, speed_fraction: float) -> float:
+        return duration(turn, speed_fraction)
 
     def wait(self, timeout_s: float) -> bool:
         self._check()

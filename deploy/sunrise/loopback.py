@@ -29,12 +29,29 @@ from maniskill_tomato.errors import InvalidInputError
 from maniskill_tomato.robot import iiwa14
 
 FaultKind = Literal[
-    "silent", "slow", "nak", "drop", "garbage", "partial", "endless", "nan", "jump", "contact", "swallow"
+    "silent",
+    "slow",
+    "nak",
+    "drop",
+    "garbage",
+    "partial",
+    "endless",
+    "nan",
+    "jump",
+    "contact",
+    "swallow",
+    "hurry",
+    "stray",
+    "stall",
+    "crawl",
+    "frozen",
 ]
 """What goes wrong: `silent` never answers again; `slow` answers after `seconds`; `nak` fails in the main loop; `drop`
 closes the connection after `seconds`; `garbage` sends bytes that mean nothing; `partial` a line without an end;
 `endless` a line that never ends; `nan` joint angles that are no numbers; `jump` joint angles `radians` away; `contact`
-pushes on joint 2 while it moves; `swallow` loses this one command."""
+pushes on joint 2 while it moves; `swallow` loses this one command. From the next move on, `hurry` ignores the asked
+speed, `stray` leaves the path by `radians` at joint 7 and comes back, `stall` stands still half way, `crawl` takes 20
+times as long; `frozen` sends the joint angles of now for ever."""
 
 
 logger = logging.getLogger(__name__)
@@ -80,6 +97,7 @@ class LoopbackController:
         self._muted = False
         self._joint_fault: Fault | None = None
         self._contact = False
+        self._frozen: list[float] | None = None
         self._listener: socket.socket | None = None
         self._threads: list[threading.Thread] = []
 
@@ -184,7 +202,7 @@ class LoopbackController:
             self._target[index] = float(text)
 
     def _joint_line(self) -> str:
-        values = self.arm.qpos
+        values = list(self._frozen or self.arm.qpos)
         if self._joint_fault is not None:
             values[3] = math.nan if self._joint_fault.kind == "nan" else values[3] + self._joint_fault.radians
         return self._data(values)
@@ -312,6 +330,10 @@ class LoopbackController:
             self._contact = True
         elif fault.kind == "swallow":
             return False
+        elif fault.kind in ("hurry", "stray", "stall", "crawl"):
+            self.arm.disobeys, self.arm.strays_by = fault.kind, fault.radians
+        elif fault.kind == "frozen":
+            self._frozen = self.arm.qpos
         return True
 
     def _send(self, text: str) -> None:

@@ -71,6 +71,10 @@ class SimulatedArm:
         self._speedup = speedup
         self.external_torque = [0.0] * 7
         """What pushes on each joint, in [N m]; tests set it. Shape (7,)."""
+        self.disobeys = ""
+        """How it moves otherwise than told: `hurry`, `stray`, `stall`, `crawl`, or not at all."""
+        self.strays_by = 0.0
+        """How far joint 7 leaves the path, in [rad]."""
 
     @property
     def qpos(self) -> list[float]:
@@ -90,6 +94,7 @@ class SimulatedArm:
         change = np.array(target, dtype=np.float64) - start
         if not np.any(change):
             return
+        relative_speed = {"hurry": 1.0, "crawl": relative_speed / 20.0}.get(self.disobeys, relative_speed)
         speed = float(np.min(iiwa14.VELOCITY_LIMITS * relative_speed / np.maximum(np.abs(change), 1e-12)))
         acceleration = float(np.min(iiwa14.ACCELERATION_LIMITS / np.maximum(np.abs(change), 1e-12)))
         speed = min(speed, math.sqrt(acceleration))  # Shares of the path a second.
@@ -104,8 +109,13 @@ class SimulatedArm:
                 share = speed * (t - 0.5 * ramp)
             else:
                 share = 1.0 - 0.5 * acceleration * (duration - t) ** 2
+            if self.disobeys == "stall":
+                share, t = min(share, 0.5), 0.0
+            qpos = start + share * change
+            if self.disobeys == "stray":
+                qpos[6] += self.strays_by * math.sin(math.pi * share) ** 2
             with self._lock:
-                self._qpos = [float(v) for v in start + share * change]
+                self._qpos = qpos.tolist()
             if t >= duration:
                 return
             time.sleep(0.002)

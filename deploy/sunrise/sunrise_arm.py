@@ -23,7 +23,8 @@ from maniskill_tomato.deploy.deploy_errors import (
     RefusedError,
 )
 from maniskill_tomato.deploy.drivers import DriverContext
-from maniskill_tomato.deploy.iiwa_readings import Reading, pose_difference, why_impossible
+from maniskill_tomato.deploy.iiwa_pieces import move_seconds, straight_pieces
+from maniskill_tomato.deploy.iiwa_readings import Reading, ReadingLog, pose_difference
 from maniskill_tomato.deploy.interface import Arm, ArmState, Float64, JointMove
 from maniskill_tomato.deploy.sunrise.client import SunriseClient
 from maniskill_tomato.deploy.sunrise.line_connection import LineConnection
@@ -35,8 +36,11 @@ logger = logging.getLogger(__name__)
 
 ONLY_SMARTPAD: Final = "only the smartPAD or the emergency stop halts it"
 
-POLL_S: Final = 0.1
+POLL_S: Final = 0.05
 """Between two looks at the joints in a move, in [s]."""
+
+PIECE_S: Final = 0.35
+"""Between two pieces of a move for the exchange of commands and the server's pauses, in [s]."""
 
 
 class SunriseArm(Arm):
@@ -56,8 +60,7 @@ class SunriseArm(Arm):
         self._config = config
         self._clock = clock
         self._client: SunriseClient | None = None
-        self._last: Reading | None = None
-        self._previous: Reading | None = None
+        self._readings = ReadingLog(config.rest_tolerance)
         self._pieces: list[Float64] = []
         self._speed = 0.0
         self._piece: Float64 | None = None
@@ -84,8 +87,8 @@ class SunriseArm(Arm):
         connection = LineConnection(config.host, config.port, config.connect_timeout_s)
         time.sleep(config.connect_pause_s)
         self._client = SunriseClient(connection, config.reply_timeout_s)
-        self._last = self._previous = self._piece = None
-        self._pieces, self._stop_asked = [], False
+        self._readings = ReadingLog(config.rest_tolerance)
+        self._piece, self._pieces, self._stop_asked = None, [], False
         try:
             if config.tool_xyzabc is not None:
                 self._client.mount_tool(config.tool_xyzabc)
@@ -122,13 +125,17 @@ class SunriseArm(Arm):
             return self._read()
 
     def _read(self) -> ArmState:
-        now = self._measure()
-        if self._previous is None or not 0.005 < now.asked - self._previous.asked < 1.0:
+        self._measure()
+        state = self._readings.state()
+        while state is None:
             time.sleep(0.02)
-            now = self._measure()
-        assert self._previous is not None
-        velocities = (now.positions - self._previous.positions) / (now.asked - self._previous.asked)
-        return ArmState(joint_positions=now.positions, joint_velocities=velocities, stamp=now.stamp)
+            self._measure()
+            state = self._readings.state()
+        return state
+
+    def move_seconds(self, turn: Float64, speed_fraction: float) -> float:
+        ends = straight_pieces(np.zeros(iiwa14.NUM_JOINTS), turn, self._config.largest_segment)
+        return len(ends) * (move_seconds(np.zeros(iiwa14.NUM_JOINTS), ends[0], speed_fraction) + PIECE_S)
 
     def command(self, move: JointMove) -> JointMove:
         client = self._connected()
@@ -143,8 +150,7 @@ class SunriseArm(Arm):
             raise RefusedError("the arm was told to stop; connect anew before it moves again")
         start = self._measure().positions
         target = np.round(target, 9)
-        count = max(1, math.ceil(float(np.max(np.abs(target - start))) / self._config.largest_segment - 1e-9))
-        self._pieces = [start + (target - start) * (i / count) for i in range(1, count)] + [target]
+        self._pieces = straight_pieces(start, target, self._config.largest_segment)
         self._speed = move.speed_fraction
         with self._telling_of_a_move():
             self._next_piece(client)
@@ -197,16 +203,19 @@ class SunriseArm(Arm):
             self._piece = None
             raise
         self._pieces = rest
-        change = np.abs(target - start)
-        seconds = float(np.max(change / (iiwa14.VELOCITY_LIMITS * self._speed)))
-        ramp = self._speed * float(np.max(iiwa14.VELOCITY_LIMITS / iiwa14.ACCELERATION_LIMITS))
-        self._piece_deadline = time.monotonic() + 2.0 * (seconds + ramp) + self._config.move_margin_s
+        seconds = move_seconds(start, target, self._speed)
+        self._piece_deadline = time.monotonic() + 2.0 * seconds + self._config.move_margin_s
 
     def _finish_piece(self, client: SunriseClient, ended: str) -> None:
         assert self._piece is not None
-        off = float(np.max(np.abs(self._measure().positions - self._piece)))
-        rest = self._pieces
-        self._piece, self._pieces = None, []
+        rest, self._pieces = self._pieces, []
+        try:
+            off = float(np.max(np.abs(self._measure().positions - self._piece)))
+        except FaultError:
+            if client.is_open:
+                self._piece = None
+            raise
+        self._piece = None
         if ended == "nak":
             raise FaultError(
                 "the controller broke the move off (`nak`): a limit, a stop or an error; look at the smartPAD"
@@ -229,10 +238,11 @@ class SunriseArm(Arm):
         client = self._connected()
         positions = client.joint_positions()
         reading = Reading(client.asked_at, time.monotonic(), self._clock.now(), positions)
-        what = why_impossible(reading, self._last, self._piece is not None, self._config.rest_tolerance)
+        what = self._readings.add(reading, self._piece is not None)
         if what is not None:
             raise self._impossible(what)
-        self._previous, self._last = self._last, reading
+        if self.on_reading is not None:
+            self.on_reading(positions, reading.earliest, reading.stamp)
         return reading
 
     @contextmanager

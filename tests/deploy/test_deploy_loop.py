@@ -191,9 +191,9 @@ def test_one_bad_picture_is_taken_again(fault: str) -> None:
     ("fault", "reason", "words"),
     [
         ("silent", "timeout", "did not answer"),
-        ("slow", "timeout", "far longer"),
+        ("slow", "timeout", "does not move as planned"),
         ("nan", "fault", "not finite"),
-        ("jump", "fault", "0.400 rad from where joint_2 was sent"),
+        ("jump", "fault", "joint_2 jumped by 0.400 rad"),
         ("drop", "not_connected", "broke during the move"),
         ("stuck", "fault", "holds it back"),
     ],
