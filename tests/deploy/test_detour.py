@@ -15,7 +15,7 @@ from maniskill_tomato.deploy.clock import SimulatedClock
 from maniskill_tomato.deploy.collision import Box
 from maniskill_tomato.deploy.detour import MAX_MOVES, DetourPlanner
 from maniskill_tomato.deploy.guarded_arm import GuardedArm
-from maniskill_tomato.deploy.interface import ArmState, Float64, JointMove
+from maniskill_tomato.deploy.interface import Arm, ArmState, Float64, JointMove
 from maniskill_tomato.deploy.loop import Loop
 from maniskill_tomato.deploy.move_choice import MoveChooser, MoveRequest
 from maniskill_tomato.deploy.profile import parse_profile
@@ -151,10 +151,13 @@ def test_there_is_no_way_to_a_goal_inside_a_leaf() -> None:
     assert planner.plan(standing(READY_QPOS.copy()), goal, 0.0, 0.0, points) is None
 
 
-class Instant:
+class Instant(Arm):
     """An arm that is where it is sent at once."""
 
-    simulated, can_stop = True, True
+    name = "instant"
+    simulated = True
+    can_stop = True
+    is_connected = True
 
     def __init__(self, joints: Float64, clock: SimulatedClock) -> None:
         self.joints, self.clock = joints, clock
@@ -173,6 +176,10 @@ class Instant:
     def stop(self) -> bool:
         return True
 
+    def connect(self) -> None: ...
+
+    def disconnect(self) -> None: ...
+
 
 def test_a_chosen_way_passes_the_guard_move_by_move_and_ends_at_the_tasks_own_posture(
     monkeypatch: pytest.MonkeyPatch,
@@ -190,7 +197,7 @@ def test_a_chosen_way_passes_the_guard_move_by_move_and_ends_at_the_tasks_own_po
     chosen = chooser.choose(request, goal, standing(start), 0.0, 0.0, points)
     assert chosen.refusal is None and chosen.move is not None and chosen.then
     clock = SimulatedClock(0.0)
-    arm: Any = Instant(start, clock)
+    arm = Instant(start, clock)
     guarded = GuardedArm(arm, safety, clock)
     for move in (chosen.move, *chosen.then):
         guarded.command(move, 0.0, points)
