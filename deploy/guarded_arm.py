@@ -53,7 +53,7 @@ class GuardedArm:
         self._under_way: JointMove | None = None
         self.watch: MoveWatch | None = None
         """Of the move under way, or of the last one."""
-        self._watches = False
+        self._watches = self._was_told = False
 
     def begin_run(self, why_stop: Callable[[], str | None]) -> None:
         """Forgets the stop of an earlier run.
@@ -164,16 +164,15 @@ class GuardedArm:
             DeviceTimeoutError: It should have got farther by now; likewise.
             StaleError: Its readings are old; likewise.
         """
+        self._was_told = False
         if not self._arm.wait(timeout_s):
-            if self._watches:
+            if self._watches and not self._was_told:
                 self._look()
             return False
         if self._under_way is not None:
-            sent = self._under_way
-            if self._watches:
-                self._look()
+            sent, state = self._under_way, self._look()
             self._under_way, self._watches = None, False
-            off = np.abs(self.read().joint_positions - sent.joint_positions)
+            off = np.abs(state.joint_positions - sent.joint_positions)
             if off.max() > self.safety.config.arrival_tolerance:
                 k = int(off.argmax())
                 raise FaultError(
@@ -181,7 +180,7 @@ class GuardedArm:
                 )
         return True
 
-    def _look(self) -> None:
+    def _look(self) -> ArmState:
         """Reads the arm in a move, and holds it against the plan."""
         asked = self._clock.now()
         try:
@@ -196,8 +195,10 @@ class GuardedArm:
                 f"{self.safety.config.max_state_age} s; {self._halt()}"
             )
         self._see(state.joint_positions, state.stamp - state.stamp_error, state.stamp)
+        return state
 
     def _see(self, joint_positions: Float64, earliest: float, stamp: float) -> None:
+        self._was_told = True
         if not self._watches or self.watch is None:
             return
         departure = self.watch.see(joint_positions, earliest, stamp)

@@ -155,8 +155,6 @@ def _played_workcell(recorded: RecordedRun, playback: "_Playback") -> Workcell:
     profile = replace(
         profile,
         target=target,
-        # The arm arrives where it arrived then, whatever is commanded now.
-        safety=replace(profile.safety, arrival_tolerance=10.0),
         # A look's other attempts were not recorded.
         capture=replace(profile.capture, attempts=1),
         loop=replace(profile.loop, settle=0.0),
@@ -167,7 +165,7 @@ def _played_workcell(recorded: RecordedRun, playback: "_Playback") -> Workcell:
         clock=clock,
         arm=arm,
         camera=_PlayedCamera(playback),
-        guarded_arm=GuardedArm(arm, Safety(profile.safety, profile.T_flange_camera), clock),
+        guarded_arm=_PlayedGuard(arm, Safety(profile.safety, profile.T_flange_camera), clock),
         perception=open_perception(profile.perception.sight, profile.perception.segmenter),
     )
 
@@ -232,6 +230,14 @@ class _PlayedArm(Arm):
         return True
 
     def stop(self) -> bool:
+        return True
+
+
+class _PlayedGuard(GuardedArm):
+    """The arm arrives where it arrived then, whatever is commanded now."""
+
+    def wait(self, timeout_s: float) -> bool:
+        self._under_way, self._watches = None, False
         return True
 
 

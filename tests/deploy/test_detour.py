@@ -157,7 +157,10 @@ class Instant(Arm):
     name = "instant"
     simulated = True
     can_stop = True
-    is_connected = True
+
+    @property
+    def is_connected(self) -> bool:
+        return True
 
     def __init__(self, joints: Float64, clock: SimulatedClock) -> None:
         self.joints, self.clock = joints, clock
