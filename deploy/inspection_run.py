@@ -12,6 +12,7 @@ from maniskill_tomato.deploy.deploy_errors import ProfileError
 from maniskill_tomato.deploy.inspection_report import fruit_picture, overview, write_page
 from maniskill_tomato.deploy.interface import Float64
 from maniskill_tomato.deploy.policy_run import (
+    Prepared,
     RunConfig,
     StepFacts,
     as_json,
@@ -27,6 +28,7 @@ from maniskill_tomato.deploy.row_goal import WholeRow
 from maniskill_tomato.deploy.run_records import Proposal, RunResult
 from maniskill_tomato.deploy.workcell import Workcell
 from maniskill_tomato.errors import InvalidInputError
+from maniskill_tomato.folder_lock import only_writer
 from maniskill_tomato.sensing.inspection import InspectedFruit
 
 PICTURES: Final = "fruits"
@@ -63,7 +65,8 @@ def inspect_row(
     Raises:
         DeployError: It could not begin: a profile, a device or a folder cannot be used.
         PolicyError: The policy cannot be used.
-        RecordingError: The folder or the recording cannot be begun.
+        RecordingError: The recording cannot be begun.
+        CheckpointError: The folder cannot be made, or another process runs in it.
         InvalidInputError: `row_moves` is less than 1.
     """
     if row_moves < 1:
@@ -72,7 +75,20 @@ def inspect_row(
     prepared.facts["row_moves"] = row_moves
     goal = whole_row(prepared.workcell, row_moves)
     steps = StepFacts()
-    result, facts = run_goal(config, prepared, goal, [steps], confirm, keyboard)
+    with only_writer(config.out, "runs"):
+        result, facts = run_goal(config, prepared, goal, [steps], confirm, keyboard)
+        return _report(config, prepared, goal, steps, result, facts)
+
+
+def _report(
+    config: RunConfig,
+    prepared: Prepared,
+    goal: WholeRow,
+    steps: StepFacts,
+    result: RunResult,
+    facts: dict[str, Any],
+) -> InspectionResult:
+    """Writes the list and its pages, with the truth beside them on the twin."""
     fruits = goal.fruits()
     entries = [_entry(fruit) for fruit in fruits]
     totals: dict[str, Any] = {}

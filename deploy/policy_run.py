@@ -24,6 +24,7 @@ from maniskill_tomato.deploy.run_records import Mode, Proposal, Recorder, RunRes
 from maniskill_tomato.deploy.workcell import NOT_CALIBRATED, Workcell, make_workcell
 from maniskill_tomato.errors import TomatoError
 from maniskill_tomato.files import write_atomically
+from maniskill_tomato.folder_lock import only_writer
 from maniskill_tomato.policies.opening import open_policy
 from maniskill_tomato.policies.protocol import Policy
 from maniskill_tomato.report_design import INK, rgb
@@ -81,11 +82,14 @@ def run(
     Raises:
         DeployError: It could not begin: a profile, a device or a folder cannot be used.
         PolicyError: The policy cannot be used.
-        RecordingError: The folder or the recording cannot be begun.
+        RecordingError: The recording cannot be begun.
+        CheckpointError: The folder cannot be made, or another process runs in it.
     """
     sheet = ContactSheet()
-    result, facts = run_goal(config, prepare(config, clock), None, [sheet], confirm, keyboard)
-    return kept_result(result, lambda: write_report(config.out, result, facts, sheet))
+    prepared = prepare(config, clock)
+    with only_writer(config.out, "runs"):
+        result, facts = run_goal(config, prepared, None, [sheet], confirm, keyboard)
+        return kept_result(result, lambda: write_report(config.out, result, facts, sheet))
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

@@ -17,6 +17,7 @@ FOUNDATION = frozenset(
         "assets",
         "errors",
         "files",
+        "folder_lock",
         "network_weights",
         "report_design",
         "tables",
@@ -26,9 +27,9 @@ FOUNDATION = frozenset(
         "worker_pool",
     }
 )
-"""What every room may import: files of arrays, asset files, errors, files on the disk, weights put into a network, the
-look of reports, tables of TOML and JSON, the reader of such files, the version, the start of Warp, the pool of
-processes."""
+"""What every room may import: files of arrays, asset files, errors, files on the disk, locks of folders, weights put
+into a network, the look of reports, tables of TOML and JSON, the reader of such files, the version, the start of Warp,
+the pool of processes."""
 
 WORLD = FOUNDATION | {"robot", "plants", "raycast"}
 SENSES = WORLD | {"segmentation", "sensing"}

@@ -1,6 +1,5 @@
 """What several commands take, and what they do with it."""
 
-import json
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -12,6 +11,7 @@ import tyro
 from maniskill_tomato.errors import InvalidInputError, did_you_mean
 from maniskill_tomato.plants.seed_splits import SEED_SPLITS
 from maniskill_tomato.tasks import TASK_IDS
+from maniskill_tomato.text_files import parse_json
 
 EnvId = Annotated[
     str, tyro.conf.Positional, tyro.conf.arg(metavar="ENV_ID", help=f"The task: {', '.join(TASK_IDS)}.")
@@ -79,8 +79,8 @@ def parse_env_options(options: Mapping[str, str]) -> dict[str, Any]:
     parsed: dict[str, Any] = {}
     for name, text in options.items():
         try:
-            parsed[name] = json.loads(text)
-        except json.JSONDecodeError:
+            parsed[name] = parse_json(text)
+        except InvalidInputError:
             parsed[name] = text
     return parsed
 

@@ -103,7 +103,7 @@ def load_run(path: Path) -> Run:
         env_id=env_id,
         seed=seed,
         config=config,
-        episodes=_read_episodes(path / "episodes.csv"),
+        episodes=read_columns(path / "episodes.csv"),
         clock=read_clock(path / "tensorboard"),
         metrics=metrics,
     )
@@ -125,9 +125,12 @@ def read_clock(folder: Path) -> Float64 | None:
         events = [(event.step, event.wall_time) for event in EventFileLoader(str(path)).Load()]
         before = clock[-1][1] if clock else 0.0
         part: dict[int, float] = {}
+        spent, last = 0.0, events[0][1] if events else 0.0
         for step, time in events:
+            spent += max(time - last, 0.0)  # A date that is set back takes no time.
+            last = time
             if step > 0:
-                part.setdefault(step, before + time - events[0][1])
+                part.setdefault(step, before + spent)
         if part:
             clock = [point for point in clock if point[0] < min(part)] + sorted(part.items())
     return np.array(clock, dtype=np.float64) if clock else None
@@ -143,8 +146,12 @@ def _read_json(path: Path) -> dict[str, Any]:
     return content
 
 
-def _read_episodes(path: Path) -> dict[str, Float64]:
-    """The columns of episodes.csv; True counts 1 and False 0."""
+def read_columns(path: Path) -> dict[str, Float64]:
+    """The columns of a run's `episodes.csv`; True counts 1 and False 0.
+
+    Raises:
+        InvalidInputError: It cannot be read.
+    """
     words = {"True": 1.0, "False": 0.0}
     try:
         with path.open(newline="", encoding="utf-8") as file:
@@ -154,7 +161,7 @@ def _read_episodes(path: Path) -> dict[str, Float64]:
             name: np.array([words[v] if v in words else float(v) for v in column], dtype=np.float64)
             for name, column in zip(header, columns, strict=True)
         }
-    except (OSError, ValueError) as error:
+    except (OSError, ValueError, csv.Error) as error:
         raise InvalidInputError(
             f"{path} cannot be read ({error}); training writes it with every checkpoint"
         ) from error

@@ -14,6 +14,7 @@ from maniskill_tomato.experiments.configs import BenchmarkConfig
 from maniskill_tomato.experiments.policy_runs import Condition, PolicySpec, parse_policies, run_policies
 from maniskill_tomato.experiments.result_store import ResultStore
 from maniskill_tomato.experiments.view_grid import draw_view_grid
+from maniskill_tomato.folder_lock import only_writer
 from maniskill_tomato.plants.episode_list import EPISODE_LISTS, load_episodes
 from maniskill_tomato.plants.mesh_set import MeshSource
 from maniskill_tomato.policies.registry import PRIVILEGED
@@ -62,7 +63,13 @@ def run_benchmark(config: BenchmarkConfig) -> BenchmarkResult:
 
     Raises:
         InvalidInputError: An option cannot be used, or the folder holds another benchmark.
+        CheckpointError: Another process measures in the folder.
     """
+    with only_writer(config.out, "measures"):
+        return _run_benchmark(config)
+
+
+def _run_benchmark(config: BenchmarkConfig) -> BenchmarkResult:
     specs = parse_policies(config.policies)
     sweep_specs = _chosen_policies(config, specs)
     processes = config.jobs or len(os.sched_getaffinity(0))

@@ -14,7 +14,7 @@ LIMIT_VARIABLE: Final = "TOMATO_PLANT_STORE_MB"
 """Environment variable with the most that one process keeps, in megabytes."""
 
 DEFAULT_LIMIT_MB: Final = 512
-"""Some 80 plants with their neighbours in the row, or 230 alone, with the meshes that rays are cast against."""
+"""Some 50 plants with their neighbours in the row, or 190 alone, with the meshes that rays are cast against."""
 
 BYTES_OF_A_VERTEX: Final = 64
 """Position, normal and texture coordinates, and the positions of its organ and its plant once more."""

@@ -24,10 +24,11 @@ from torch import Tensor
 from maniskill_tomato import cli
 from maniskill_tomato.errors import CheckpointError, InvalidInputError, TrainingDivergedError
 from maniskill_tomato.files import write_tensors
+from maniskill_tomato.folder_lock import only_writer
 from maniskill_tomato.learning.rl.env_state import env_state, set_env_state
 from maniskill_tomato.learning.rl.envs import make_learner_env
 from maniskill_tomato.learning.rl.presets import TrainConfig, get_preset
-from maniskill_tomato.learning.rl.run_folder import checkpoints, clear_run, only_writer
+from maniskill_tomato.learning.rl.run_folder import checkpoints, clear_run
 from maniskill_tomato.learning.rl.trainer import Trainer, TrainResult
 from maniskill_tomato.policies.trained_actor import load_checkpoint
 
@@ -455,7 +456,7 @@ def test_nothing_that_is_not_finite_reaches_a_checkpoint(tmp_path: Path) -> None
 
 def test_one_process_at_a_time_trains_in_a_folder(tmp_path: Path) -> None:
     crashed(tmp_path / "run")
-    with only_writer(tmp_path / "run"):
+    with only_writer(tmp_path / "run", "trains"):
         with pytest.raises(CheckpointError, match="another process trains in"):
             train(tmp_path / "run", resume=True)
         with pytest.raises(CheckpointError, match="another process trains in"):

@@ -1,17 +1,14 @@
-"""The folder of a run: what it holds, who writes to it, and its newest checkpoint that is whole."""
+"""The folder of a run: what it holds, and its newest checkpoint that is whole."""
 
-import contextlib
-import fcntl
 import logging
-import os
 import shutil
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import maniskill_tomato
 from maniskill_tomato.errors import CheckpointError, InvalidInputError
 from maniskill_tomato.files import write_json
+from maniskill_tomato.folder_lock import only_writer
 from maniskill_tomato.learning.rl.presets import MAY_CHANGE, TrainConfig
 from maniskill_tomato.policies.trained_actor import load_checkpoint
 
@@ -56,7 +53,7 @@ def clear_run(run_dir: Path) -> None:
     """
     if not (run_dir / "config.json").is_file():
         return
-    with only_writer(run_dir):
+    with only_writer(run_dir, "trains"):
         remove_results(run_dir)
         (run_dir / LOG_NAME).unlink(missing_ok=True)
 
@@ -69,36 +66,6 @@ def remove_results(run_dir: Path) -> None:
         for path in run_dir.glob(pattern):
             path.unlink()
     shutil.rmtree(run_dir / "wandb", ignore_errors=True)
-
-
-@contextlib.contextmanager
-def only_writer(run_dir: Path) -> Iterator[None]:
-    """Holds the folder for one process; the lock goes with the process, however that ends.
-
-    Raises:
-        CheckpointError: Another process trains in it, or it cannot be made.
-    """
-    try:
-        run_dir.mkdir(parents=True, exist_ok=True)
-        descriptor = os.open(run_dir, os.O_RDONLY)
-    except OSError as error:
-        raise CheckpointError(
-            f"cannot write to {run_dir}: {error.strerror or error}; choose another --out"
-        ) from error
-    try:
-        try:
-            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError as error:
-            raise CheckpointError(
-                f"another process trains in {run_dir}; wait for it, or stop it first"
-            ) from error
-        except OSError as error:  # Some network file systems have no locks.
-            logger.warning(
-                "%s cannot be locked (%s); take care that only one process uses it", run_dir, error
-            )
-        yield
-    finally:
-        os.close(descriptor)
 
 
 def write_config(

@@ -15,6 +15,7 @@ from torch import Tensor
 
 from maniskill_tomato.errors import CheckpointError, InvalidInputError, TrainingDivergedError
 from maniskill_tomato.files import write_tensors
+from maniskill_tomato.folder_lock import only_writer
 from maniskill_tomato.learning.interrupt import StopRequest, stop_on_signals
 from maniskill_tomato.learning.rl.agent import begin_with, check_fits, update
 from maniskill_tomato.learning.rl.checkpoint import make_checkpoint
@@ -29,7 +30,6 @@ from maniskill_tomato.learning.rl.run_folder import (
     checkpoints,
     clear_run,
     newest_good_checkpoint,
-    only_writer,
     remove_results,
     write_config,
 )
@@ -146,7 +146,7 @@ class Trainer:
             CheckpointError: The disk does not take a file, another process trains in the folder, or there is
                 nothing to go on from. What was saved before stays.
         """
-        with only_writer(self._run_dir):
+        with only_writer(self._run_dir, "trains"):
             try:
                 return self._run()
             except OSError as error:

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from maniskill_tomato.errors import InvalidInputError
-from maniskill_tomato.segmentation.datasets.picture_files import read_picture
+from maniskill_tomato.segmentation.datasets.picture_files import read_depth, read_picture
 from maniskill_tomato.segmentation.masks import Box, EncodedMask
 
 FRUIT_CATEGORIES = ("tomato_ripe", "tomato_turning", "tomato_unripe")
@@ -138,14 +138,13 @@ class AnnotatedImage:
         """
         if self.depth_path is None:
             return None
-        import cv2
-
-        depth = cv2.imread(str(self.depth_path), cv2.IMREAD_UNCHANGED)
-        if depth is None or depth.dtype != np.uint16 or depth.shape != (self.height, self.width):
+        depth = read_depth(self.depth_path)
+        if depth.shape != (self.height, self.width):
             raise InvalidInputError(
-                f"{self.depth_path} must be a 16-bit image of {self.width} x {self.height} pixels, in millimetres"
+                f"{self.depth_path} must have {self.width} x {self.height} pixels, "
+                f"got {depth.shape[1]} x {depth.shape[0]}"
             )
-        return np.asarray(depth, dtype=np.float64) / 1000.0
+        return depth
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -1,17 +1,20 @@
 """Image files: RGB in memory, JPEG or PNG on the disk."""
 
+import io
+import warnings
 from pathlib import Path
 from typing import Any, Final
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+from PIL import Image as PillowImage
 
 from maniskill_tomato.errors import InvalidInputError
 from maniskill_tomato.files import write_atomically
 
-LARGEST_PICTURE: Final = 200_000_000
-"""In [px]."""
+LARGEST_PICTURE: Final = 178_000_000
+"""In [px]. Pillow, which reads the head, stops at 179 million."""
 
 
 def is_truncated_jpeg(content: bytes) -> bool:
@@ -23,13 +26,6 @@ def is_truncated_jpeg(content: bytes) -> bool:
     return scan < 0 or content.find(b"\xff\xd9", scan) < 0
 
 
-def _png_size(content: bytes) -> int | None:
-    """Pixels of a PNG by its head; None for other files."""
-    if not content.startswith(b"\x89PNG\r\n\x1a\n") or len(content) < 24:
-        return None
-    return int.from_bytes(content[16:20], "big") * int.from_bytes(content[20:24], "big")
-
-
 def read_picture(path: Path) -> NDArray[np.uint8]:
     """An image file as RGB. Shape (height, width, 3).
 
@@ -37,6 +33,23 @@ def read_picture(path: Path) -> NDArray[np.uint8]:
         InvalidInputError: There is no such file, or it is not an image that OpenCV can decode, cut off, or
             too large.
     """
+    picture = _decoded(path, cv2.IMREAD_COLOR)
+    return np.ascontiguousarray(picture[..., ::-1], dtype=np.uint8)
+
+
+def read_depth(path: Path) -> NDArray[np.float64]:
+    """An image of 16 bits in millimetres as depth, in [m]. Shape (height, width).
+
+    Raises:
+        InvalidInputError: As of `read_picture`, or it has other pixels.
+    """
+    depth = _decoded(path, cv2.IMREAD_UNCHANGED)
+    if depth.dtype != np.uint16 or depth.ndim != 2:
+        raise InvalidInputError(f"{path} must be an image of one channel of 16 bits, in millimetres")
+    return np.asarray(depth, dtype=np.float64) / 1000.0
+
+
+def _decoded(path: Path, flags: int) -> NDArray[Any]:
     if not path.is_file():
         raise InvalidInputError(f"there is no image {path}")
     try:
@@ -45,15 +58,27 @@ def read_picture(path: Path) -> NDArray[np.uint8]:
         raise InvalidInputError(f"{path} cannot be read: {error.strerror or error}") from error
     if is_truncated_jpeg(content):
         raise InvalidInputError(f"{path} is a JPEG that ends too early; copy or download it again")
-    if (size := _png_size(content)) is not None and size > LARGEST_PICTURE:
-        raise InvalidInputError(f"{path} has {size} pixels; {LARGEST_PICTURE} are allowed")
+    if (size := _pixels(content)) > LARGEST_PICTURE:
+        raise InvalidInputError(f"{path} has more than {LARGEST_PICTURE} pixels, which are allowed")
     try:
-        picture = cv2.imdecode(np.frombuffer(content, np.uint8), cv2.IMREAD_COLOR) if content else None
+        picture: Any = cv2.imdecode(np.frombuffer(content, np.uint8), flags) if size else None
     except (cv2.error, MemoryError) as error:
         raise InvalidInputError(f"{path} cannot be read as an image: {error}") from error
     if picture is None:
         raise InvalidInputError(f"{path} cannot be read as an image; use JPEG or PNG")
-    return np.ascontiguousarray(picture[..., ::-1], dtype=np.uint8)
+    decoded: NDArray[Any] = picture
+    return decoded
+
+
+def _pixels(content: bytes) -> int:
+    """Pixels of an image by its head, before memory is set aside for them; 0 for what is no image."""
+    try:
+        with warnings.catch_warnings(action="ignore"), PillowImage.open(io.BytesIO(content)) as picture:
+            return picture.width * picture.height
+    except PillowImage.DecompressionBombError:
+        return LARGEST_PICTURE + 1
+    except Exception:  # A broken head makes Pillow's readers raise whatever they meet.
+        return 0
 
 
 def write_picture(path: Path, image: NDArray[Any], jpeg_quality: int | None = None) -> None:

@@ -15,6 +15,7 @@ import numpy as np
 
 from maniskill_tomato.errors import InvalidInputError, RenderingUnavailableError
 from maniskill_tomato.files import write_atomically
+from maniskill_tomato.folder_lock import only_writer
 from maniskill_tomato.plants.mesh_set import MeshSet, MeshSource
 from maniskill_tomato.plants.organs import Plant
 from maniskill_tomato.plants.seed_splits import SEED_SPLITS
@@ -122,8 +123,19 @@ def make_dataset(
     Raises:
         InvalidInputError: The folder holds another data set.
         RenderingUnavailableError: There is no Vulkan device.
-        CheckpointError: A file cannot be written.
+        CheckpointError: A file cannot be written, or another process renders in the folder.
     """
+    with only_writer(out, "renders"):
+        return _make(config, out, jobs, real, on_scene)
+
+
+def _make(
+    config: DatasetConfig,
+    out: Path,
+    jobs: int,
+    real: AnnotatedImages | None,
+    on_scene: Callable[[int], object] | None,
+) -> AnnotatedImages:
     _claim(config, out)
     missing = [k for k in range(config.scenes) if not _finished(config, out, k)]
     if on_scene is not None and len(missing) < config.scenes:

@@ -142,5 +142,5 @@ def read_history(results: Path) -> list[dict[str, float]]:
             }
             for row in rows
         ]
-    except (OSError, KeyError, TypeError, ValueError) as error:
+    except (OSError, AttributeError, KeyError, TypeError, ValueError, csv.Error) as error:
         raise CheckpointError(f"{results} is no list of losses of Ultralytics ({error})") from error
