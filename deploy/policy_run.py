@@ -161,9 +161,10 @@ def run_goal(
         facts = {**prepared.facts, "devices": {"arm": arm.describe(), "camera": camera.describe()}}
         every = list(recorders)
         if config.record:
-            mount = profile.T_flange_camera.tolist()
-            info = {**facts, "profile_text": profile.text, "T_flange_camera": mount}
-            every.append(stack.enter_context(McapRecorder(config.out / RECORDING, info)))
+            mount = profile.T_flange_camera
+            info = {**facts, "profile_text": profile.text, "T_flange_camera": mount.tolist()}
+            recorder = McapRecorder(config.out / RECORDING, info, workcell.clock, mount)
+            every.append(stack.enter_context(recorder))
         stack.enter_context(stops)
         # What is slow the first time is done before the loop's first beat, from which on the heartbeat is watched.
         load_kernels()

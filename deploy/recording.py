@@ -1,16 +1,17 @@
-"""Recordings of runs as MCAP files: pictures, joints, masks, decisions. Foxglove and other viewers open them.
+"""Recordings of runs as MCAP files that Foxglove, rerun and `deploy replay` open.
 
-Topics, all JSON: `/info` (once: profile, policy, seed), `/camera/color`, `/camera/depth`, `/camera/mask`
-(`foxglove.CompressedImage`: PNG; depth in whole millimetres), `/arm/state`, `/step` (everything else of a look, numbers
-as they were), `/truth` (simulated cameras only), `/log` (`foxglove.Log`).
+As `foxglove.*` messages in Protobuf: `/tf` (every link), `/joint_states`, `/camera/calibration`, `/camera/color`,
+`/camera/mask` (PNG), `/camera/depth` (16UC1, in [mm]), `/camera/depth_m` (32FC1, in [m], where millimetres lose
+something), `/camera/points`, `/arm/shape` (once) and `/log`. As ROS 2's string: `/robot_description` (once). As JSON:
+`/info` (once: profile, policy, seed), `/step` (everything else of a look, numbers as they were) and `/truth`
+(simulated cameras only). All times are the run's clock, counted from the date at which the recording began.
 """
 
 import base64
 import json
 import logging
 import struct
-import zlib
-from collections.abc import Iterator
+import time
 from contextlib import suppress
 from pathlib import Path
 from typing import Any, BinaryIO, Final
@@ -19,92 +20,102 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from maniskill_tomato.deploy.deploy_errors import CutOffError, RecordingError
-from maniskill_tomato.deploy.interface import Frame
+from maniskill_tomato.deploy.clock import Clock
+from maniskill_tomato.deploy.deploy_errors import RecordingError
+from maniskill_tomato.deploy.interface import Float64, Frame
+from maniskill_tomato.deploy.recording_schemas import INFO, STEP, TRUTH
 from maniskill_tomato.deploy.run_records import Step
+from maniskill_tomato.deploy.viewer_arm import link_frames, simple_urdf
 
 _logger = logging.getLogger(__name__)
 
 CHUNK: Final = 32 * 1024
 """So much is kept in memory before it goes to the disk, in bytes: less than one look."""
 
-FORMAT: Final = "maniskill-tomato-deploy-1"
+FORMAT: Final = "maniskill-tomato-deploy-2"
 
-_IMAGE: Final = {
-    "type": "object",
-    "properties": {
-        "timestamp": {
-            "type": "object",
-            "properties": {"sec": {"type": "integer"}, "nsec": {"type": "integer"}},
-        },
-        "frame_id": {"type": "string"},
-        "data": {"type": "string", "contentEncoding": "base64"},
-        "format": {"type": "string"},
-    },
+JSON_TOPICS: Final = {
+    "/info": ("maniskill_tomato.RunInfo", INFO),
+    "/step": ("maniskill_tomato.Step", STEP),
+    "/truth": ("maniskill_tomato.Truth", TRUTH),
 }
-_LOG: Final = {
-    "type": "object",
-    "properties": {
-        "timestamp": _IMAGE["properties"]["timestamp"],  # type: ignore[index]
-        "level": {"type": "integer"},
-        "message": {"type": "string"},
-        "name": {"type": "string"},
-    },
-}
-_ANY: Final = {"type": "object"}
+"""Name and JSON Schema of our own messages."""
 
-TOPICS: Final[dict[str, tuple[str, dict[str, Any]]]] = {
-    "/info": ("maniskill_tomato.RunInfo", _ANY),
-    "/camera/color": ("foxglove.CompressedImage", _IMAGE),
-    "/camera/depth": ("foxglove.CompressedImage", _IMAGE),
-    "/camera/mask": ("foxglove.CompressedImage", _IMAGE),
-    "/arm/state": ("maniskill_tomato.ArmState", _ANY),
-    "/step": ("maniskill_tomato.Step", _ANY),
-    "/truth": ("maniskill_tomato.Truth", _ANY),
-    "/log": ("foxglove.Log", _LOG),
+VIEWER_TOPICS: Final = {
+    "/tf": "FrameTransforms",
+    "/joint_states": "JointStates",
+    "/camera/calibration": "CameraCalibration",
+    "/camera/color": "CompressedImage",
+    "/camera/mask": "CompressedImage",
+    "/camera/depth": "RawImage",
+    "/camera/depth_m": "RawImage",
+    "/camera/points": "PointCloud",
+    "/arm/shape": "SceneUpdate",
+    "/log": "Log",
 }
-"""Schema of each topic."""
+"""The `foxglove` message of each topic for viewers."""
+
+DESCRIPTION: Final = "/robot_description"
 
 
 class McapRecorder:
     """Writes a run while it happens; a context manager that finishes the file."""
 
-    def __init__(self, path: Path, info: dict[str, Any]) -> None:
+    def __init__(self, path: Path, info: dict[str, Any], clock: Clock, T_flange_camera: Float64) -> None:
         """Begins the file.
 
         Args:
             path: Where to; the folder is made.
             info: What was run: profile text, policy, seed, and so on.
+            clock: The run's, which stamps of pictures and events come from.
+            T_flange_camera: The colour camera's optical frame in `link_ee`. Shape (4, 4).
 
         Raises:
-            RecordingError: It cannot be written, or the package `mcap` is missing.
+            RecordingError: It cannot be written, or a package is missing.
         """
         try:
+            from foxglove import messages
             from mcap.writer import Writer
+
+            from maniskill_tomato.deploy import viewer_messages
         except ImportError as error:
             raise RecordingError(
-                "recordings need the package mcap: install maniskill-tomato[deploy], or pass --no-record"
+                f"recordings need a package that is missing ({error}): install maniskill-tomato[deploy], or pass "
+                "--no-record"
             ) from error
         self.path = path
         self._failed = False
+        self._made, self._timestamp = viewer_messages, messages.Timestamp
+        self._T_flange_camera = T_flange_camera
+        self._clock_start, self._unix_start_ns = clock.now(), time.time_ns()
+        schemas = {name: getattr(messages, name).get_schema() for name in VIEWER_TOPICS.values()}
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
             self._file: BinaryIO = path.open("wb")
             self._writer: Any = Writer(self._file, chunk_size=CHUNK)
             self._writer.start(library="maniskill-tomato")
-            self._channels = {
-                topic: self._writer.register_channel(
-                    topic=topic,
-                    message_encoding="json",
-                    schema_id=self._writer.register_schema(
-                        name=name, encoding="jsonschema", data=json.dumps(schema).encode()
-                    ),
-                )
-                for topic, (name, schema) in TOPICS.items()
+            ids = {
+                name: self._writer.register_schema(name=s.name, encoding=s.encoding, data=s.data)
+                for name, s in schemas.items()
             }
+            self._channels = {
+                topic: self._channel(topic, "protobuf", ids[name]) for topic, name in VIEWER_TOPICS.items()
+            }
+            for topic, (name, schema) in JSON_TOPICS.items():
+                text = json.dumps({"title": name, **schema}).encode()
+                number = self._writer.register_schema(name=name, encoding="jsonschema", data=text)
+                self._channels[topic] = self._channel(topic, "json", number)
+            text = self._writer.register_schema(
+                name="std_msgs/msg/String", encoding="ros2msg", data=b"string data"
+            )
+            self._channels[DESCRIPTION] = self._channel(DESCRIPTION, "cdr", text)
         except OSError as error:
             raise self._error(error) from error
-        self._write("/info", 0.0, {"format": FORMAT, **info})
+        start = {"clock_start": self._clock_start, "unix_start_ns": self._unix_start_ns}
+        self._write_json("/info", self._clock_start, {"format": FORMAT, **start, **info})
+        self._write(DESCRIPTION, self._clock_start, _ros_string(simple_urdf()))
+        began = self._time(self._clock_start)
+        self._write("/arm/shape", self._clock_start, viewer_messages.arm_shape(began, simple_urdf()).encode())
 
     def __enter__(self) -> "McapRecorder":
         return self
@@ -123,37 +134,52 @@ class McapRecorder:
             self._file.close()
 
     def step(self, step: Step) -> None:
-        frame, stamp = step.frame, step.frame.stamp
-        self._write("/camera/color", stamp, _image(stamp, "camera_color_optical_frame", _bgr(frame.color)))
-        depth, encoding = encode_depth(frame.depth)
-        message = {"timestamp": _time(stamp), "frame_id": "camera_color_optical_frame", "format": encoding}
-        self._write("/camera/depth", stamp, {**message, "data": depth})
+        frame, stamp, made = step.frame, step.frame.stamp, self._made
+        at = self._time(stamp)
+        millimetres, is_exact = made.in_millimetres(frame.depth)
+        links = link_frames(step.joint_positions, self._T_flange_camera)
+        # Viewers place a picture by the transforms that came before it.
+        self._write("/tf", stamp, made.transforms(at, links).encode())
+        self._write("/joint_states", stamp, made.joint_states(at, step.joint_positions).encode())
+        self._write("/camera/calibration", stamp, made.calibration(at, frame.intrinsics).encode())
+        self._write("/camera/color", stamp, made.picture(at, frame.color).encode())
+        self._write("/camera/depth", stamp, made.depth_image(at, millimetres).encode())
+        if not is_exact:
+            self._write("/camera/depth_m", stamp, made.depth_image(at, frame.depth).encode())
+        self._write("/camera/points", stamp, made.points(at, frame).encode())
         mask = step.view.mask.astype(np.uint8) * 255
-        self._write("/camera/mask", stamp, _image(stamp, "camera_color_optical_frame", mask))
-        self._write(
-            "/arm/state", stamp, {"timestamp": _time(stamp), "position": step.joint_positions.tolist()}
-        )
+        self._write("/camera/mask", stamp, made.picture(at, mask).encode())
         if frame.truth is not None:
-            self._write("/truth", stamp, _truth(frame))
-        self._write("/step", stamp, _step(step))
+            self._write_json("/truth", stamp, _truth(frame))
+        self._write_json("/step", stamp, _step(step))
 
     def event(self, stamp: float, text: str) -> None:
-        self._write(
-            "/log",
-            stamp,
-            {"timestamp": _time(stamp), "level": 2, "message": text, "name": "deploy"},
-        )
+        self._write("/log", stamp, self._made.log_line(self._time(stamp), text).encode())
 
-    def _write(self, topic: str, stamp: float, message: dict[str, Any]) -> None:
+    def _channel(self, topic: str, encoding: str, schema_id: int) -> int:
+        number: int = self._writer.register_channel(
+            topic=topic, message_encoding=encoding, schema_id=schema_id
+        )
+        return number
+
+    def _nanoseconds(self, stamp: float) -> int:
+        """A moment of the run's clock as a date, in [ns] since 1970."""
+        return self._unix_start_ns + round((stamp - self._clock_start) * 1e9)
+
+    def _time(self, stamp: float) -> Any:
+        seconds, nanoseconds = divmod(self._nanoseconds(stamp), 10**9)
+        return self._timestamp(seconds, nanoseconds)
+
+    def _write_json(self, topic: str, stamp: float, message: dict[str, Any]) -> None:
+        self._write(topic, stamp, json.dumps(message).encode())
+
+    def _write(self, topic: str, stamp: float, data: bytes) -> None:
         if self._failed:
             raise RecordingError(f"the recording {self.path} ended early: its disk is full or gone")
-        nanoseconds = max(0, round(stamp * 1e9))
+        nanoseconds = self._nanoseconds(stamp)
         try:
             self._writer.add_message(
-                channel_id=self._channels[topic],
-                log_time=nanoseconds,
-                publish_time=nanoseconds,
-                data=json.dumps(message).encode(),
+                channel_id=self._channels[topic], log_time=nanoseconds, publish_time=nanoseconds, data=data
             )
             self._file.flush()
         except OSError as error:
@@ -167,93 +193,10 @@ class McapRecorder:
         )
 
 
-def read_messages(path: Path) -> Iterator[tuple[str, dict[str, Any]]]:
-    """Topic and content of every message of a recording, in the order in which they were written.
-
-    Raises:
-        CutOffError: The file ends early; everything before that was given.
-        RecordingError: The file is missing, damaged, or no recording of ours.
-    """
-    try:
-        from mcap.exceptions import EndOfFile, McapError
-        from mcap.records import Channel, Message
-        from mcap.stream_reader import StreamReader
-    except ImportError as error:
-        raise RecordingError("recordings need the package mcap: install maniskill-tomato[deploy]") from error
-
-    if not path.is_file():
-        raise RecordingError(f"no recording at {path}; `deploy run` writes run.mcap into its --out folder")
-    topics: dict[int, str] = {}
-    with path.open("rb") as file:
-        try:
-            for record in StreamReader(file, record_size_limit=256 * 2**20).records:
-                if isinstance(record, Channel):
-                    topics[record.id] = record.topic
-                elif isinstance(record, Message):
-                    content = json.loads(record.data)
-                    if not isinstance(content, dict):
-                        raise ValueError("a message is no object")
-                    yield topics[record.channel_id], content
-        except (McapError, ValueError, KeyError, EOFError, OSError, struct.error, zlib.error) as error:
-            if isinstance(error, EndOfFile | EOFError | struct.error) and not file.read(1):
-                raise CutOffError(
-                    f"{path} is cut off; `deploy replay` plays the looks that are whole"
-                ) from error
-            raise RecordingError(
-                f"{path} is no readable recording ({type(error).__name__}: {error}); it may have been cut off"
-            ) from error
-
-
-def encode_depth(depth: NDArray[np.float32]) -> tuple[str, str]:
-    """A depth image without loss: PNG of whole millimetres where it has no others, else packed numbers.
-
-    Returns:
-        Base64, and the format: `png` or `zlib-float32`.
-    """
-    millimetres = np.round(depth.astype(np.float64) * 1000.0)
-    whole = np.array_equal((millimetres / 1000.0).astype(np.float32), depth)
-    if whole and float(millimetres.max(initial=0.0)) <= 65535:
-        return _png(millimetres.astype(np.uint16)), "png"
-    return base64.b64encode(zlib.compress(np.ascontiguousarray(depth).tobytes(), 3)).decode(), "zlib-float32"
-
-
-def decode_depth(data: str, encoding: str, shape: tuple[int, int]) -> NDArray[np.float32]:
-    """What `encode_depth` packed. Shape (H, W)."""
-    if encoding == "png":
-        return (decode_png(data).astype(np.float64) / 1000.0).astype(np.float32)
-    content = zlib.decompress(base64.b64decode(data))
-    return np.frombuffer(content, dtype=np.float32).reshape(shape).copy()
-
-
-def decode_png(data: str) -> NDArray[Any]:
-    """The pixels of a PNG in base64, channels as OpenCV gives them.
-
-    Raises:
-        ValueError: It is none.
-    """
-    pixels: Any = cv2.imdecode(np.frombuffer(base64.b64decode(data), dtype=np.uint8), cv2.IMREAD_UNCHANGED)
-    if pixels is None:
-        raise ValueError("a picture is damaged")
-    found: NDArray[Any] = pixels
-    return found
-
-
 def pack(array: NDArray[Any]) -> dict[str, Any]:
     """An array as JSON, bit by bit."""
     data = base64.b64encode(np.ascontiguousarray(array).tobytes()).decode()
     return {"dtype": str(array.dtype), "shape": list(array.shape), "data": data}
-
-
-def unpack(packed: dict[str, Any]) -> NDArray[Any]:
-    """What `pack` gave; numbers only.
-
-    Raises:
-        ValueError: It is something else.
-    """
-    kind = np.dtype(str(packed["dtype"]))
-    if kind.kind not in "fiub":
-        raise ValueError(f"{packed['dtype']} is no kind of number")
-    return np.frombuffer(base64.b64decode(packed["data"]), dtype=kind).reshape(packed["shape"]).copy()
 
 
 def _step(step: Step) -> dict[str, Any]:
@@ -303,10 +246,6 @@ def _truth(frame: Frame) -> dict[str, Any]:
     }
 
 
-def _image(stamp: float, frame_id: str, pixels: NDArray[Any]) -> dict[str, Any]:
-    return {"timestamp": _time(stamp), "frame_id": frame_id, "data": _png(pixels), "format": "png"}
-
-
 def _png(pixels: NDArray[Any]) -> str:
     ok, content = cv2.imencode(".png", pixels, [cv2.IMWRITE_PNG_COMPRESSION, 3])
     if not ok:
@@ -314,10 +253,7 @@ def _png(pixels: NDArray[Any]) -> str:
     return base64.b64encode(content.tobytes()).decode()
 
 
-def _bgr(color: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    return np.ascontiguousarray(color[..., ::-1])
-
-
-def _time(stamp: float) -> dict[str, int]:
-    nanoseconds = max(0, round(stamp * 1e9))
-    return {"sec": nanoseconds // 10**9, "nsec": nanoseconds % 10**9}
+def _ros_string(text: str) -> bytes:
+    """A `std_msgs/msg/String` in CDR, little-endian."""
+    content = text.encode() + b"\0"
+    return b"\0\1\0\0" + struct.pack("<I", len(content)) + content

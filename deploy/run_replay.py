@@ -4,6 +4,7 @@ The arm stands where it stood then, whatever is commanded now, and the camera sh
 decision is therefore compared on the same pictures, even after one that differs.
 """
 
+import base64
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -19,7 +20,14 @@ from maniskill_tomato.deploy.inspection_run import whole_row
 from maniskill_tomato.deploy.interface import Arm, ArmState, Camera, Float64, Frame, FrameTruth, JointMove
 from maniskill_tomato.deploy.loop import TASK, Loop
 from maniskill_tomato.deploy.profile import Profile, TargetConfig, parse_profile
-from maniskill_tomato.deploy.recording import FORMAT, decode_depth, decode_png, read_messages, unpack
+from maniskill_tomato.deploy.recording_reader import (
+    FORMATS,
+    color_picture,
+    decode_png,
+    depth_picture,
+    read_messages,
+    unpack,
+)
 from maniskill_tomato.deploy.robot_perception import open_perception
 from maniskill_tomato.deploy.run_records import RunResult, Step
 from maniskill_tomato.deploy.safety import Safety
@@ -90,7 +98,7 @@ def load_recording(path: Path) -> RecordedRun:
     """
     info: dict[str, Any] | None = None
     steps: list[RecordedStep] = []
-    parts: dict[str, dict[str, Any]] = {}
+    parts: dict[str, Any] = {}
     is_cut_off = False
     try:
         for topic, message in read_messages(path):
@@ -99,15 +107,15 @@ def load_recording(path: Path) -> RecordedRun:
             elif topic == "/step":
                 try:
                     steps.append(RecordedStep(frame=_frame(parts, message), facts=message))
-                except (KeyError, TypeError, ValueError) as error:
+                except (KeyError, TypeError, ValueError, AttributeError) as error:
                     raise RecordingError(f"{path}: look {len(steps)} is incomplete ({error})") from error
                 parts = {}
             elif topic != "/log":
                 parts[topic] = message
     except CutOffError:
         is_cut_off = True
-    if info is None or info.get("format") != FORMAT:
-        raise RecordingError(f"{path} is no recording of `deploy run` ({FORMAT})")
+    if info is None or info.get("format") not in FORMATS:
+        raise RecordingError(f"{path} is no recording of `deploy run` ({' or '.join(FORMATS)})")
     if not steps:
         why = "it is cut off" if is_cut_off else "the run ended"
         raise RecordingError(f"{path} holds no look; {why} before its first")
@@ -298,14 +306,11 @@ def _same(recorded: Any, now: Any) -> bool:
     return bool(np.allclose(np.array(recorded), np.array(now), rtol=0.0, atol=TOLERANCE))
 
 
-def _frame(parts: dict[str, dict[str, Any]], facts: dict[str, Any]) -> Frame:
+def _frame(parts: dict[str, Any], facts: dict[str, Any]) -> Frame:
     intrinsics = CameraIntrinsics(**facts["intrinsics"])
-    color = decode_png(parts["/camera/color"]["data"])
-    depth = parts["/camera/depth"]
-    shape = (intrinsics.height, intrinsics.width)
     return Frame(
-        color=np.ascontiguousarray(color[..., ::-1]),
-        depth=decode_depth(depth["data"], depth["format"], shape),
+        color=color_picture(parts),
+        depth=depth_picture(parts, (intrinsics.height, intrinsics.width)),
         intrinsics=intrinsics,
         stamp=float(facts["stamp"]),
         number=int(facts["frame_number"]),
@@ -316,7 +321,7 @@ def _frame(parts: dict[str, dict[str, Any]], facts: dict[str, Any]) -> Frame:
 def _truth(message: dict[str, Any]) -> FrameTruth:
     rays = {name: torch.from_numpy(unpack(packed)) for name, packed in message["rays"].items()}
     return FrameTruth(
-        labels=decode_png(message["labels"]).astype(np.int32),
+        labels=decode_png(base64.b64decode(message["labels"])).astype(np.int32),
         target_label=int(message["target_label"]),
         target_position=np.array(message["target_position"], dtype=np.float64),
         visible_fraction=float(message["visible_fraction"]),

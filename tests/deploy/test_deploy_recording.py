@@ -10,13 +10,16 @@ import numpy as np
 import pytest
 
 from maniskill_tomato.cli import main
+from maniskill_tomato.deploy.clock import SimulatedClock
 from maniskill_tomato.deploy.deploy_errors import RecordingError
 from maniskill_tomato.deploy.interface import Frame
 from maniskill_tomato.deploy.policy_run import RunConfig, run
 from maniskill_tomato.deploy.profile import Profile, load_profile, parse_profile
-from maniskill_tomato.deploy.recording import McapRecorder, decode_depth, encode_depth, read_messages
+from maniskill_tomato.deploy.recording import McapRecorder
+from maniskill_tomato.deploy.recording_reader import read_messages
 from maniskill_tomato.deploy.run_records import RunResult
 from maniskill_tomato.deploy.run_replay import load_recording, replay
+from maniskill_tomato.errors import TomatoError
 from maniskill_tomato.robot.d435 import T_flange_camera_color_optical
 
 TEXT = """
@@ -62,10 +65,10 @@ def test_the_recording_holds_what_the_loop_saw(finished: tuple[Path, RunResult])
     messages = list(read_messages(out / "run.mcap"))
     topics = [topic for topic, _ in messages]
     looks = len(result.visible_fractions)
-    for topic in ("/camera/color", "/camera/depth", "/camera/mask", "/arm/state", "/step", "/truth"):
+    for topic in ("/camera/color", "/camera/depth", "/camera/mask", "/joint_states", "/step", "/truth"):
         assert topics.count(topic) == looks
     assert messages[0][0] == "/info" and messages[0][1]["seed"] == 9
-    assert any(topic == "/log" and "end: " in message["message"] for topic, message in messages)
+    assert any(topic == "/log" and "end: " in message.message for topic, message in messages)
     recorded = load_recording(out / "run.mcap")
     fractions = [step.facts["visible_fraction"] for step in recorded.steps]
     assert [round(v, 4) for v in fractions] == list(result.visible_fractions)
@@ -78,14 +81,21 @@ def test_the_recording_holds_what_the_loop_saw(finished: tuple[Path, RunResult])
     assert seen.any() and abs(float(np.median(frame.depth[seen])) - distance) < 0.1
 
 
-def test_other_mcap_readers_open_it(finished: tuple[Path, RunResult]) -> None:
-    from mcap.reader import make_reader
-
-    with (finished[0] / "run.mcap").open("rb") as file:
-        summary = make_reader(file).get_summary()
-    assert summary is not None and summary.statistics is not None
-    names = {schema.name for schema in summary.schemas.values()}
-    assert {"foxglove.CompressedImage", "foxglove.Log", "maniskill_tomato.Step"} <= names
+def test_recordings_of_the_first_format_are_replayed() -> None:
+    """One that `deploy run` wrote when all messages were JSON."""
+    path = Path(__file__).parent / "data" / "json_recording.mcap"
+    assert dict(read_messages(path))["/info"]["format"] == "maniskill-tomato-deploy-1"
+    recorded = load_recording(path)
+    assert [round(step.facts["visible_fraction"], 4) for step in recorded.steps] == [0.1668, 0.2963, 0.5049]
+    for step in recorded.steps:
+        assert step.frame.truth is not None
+        camera = np.array(step.facts["T_world_camera"])
+        target = np.linalg.inv(camera) @ [*step.frame.truth.target_position, 1.0]
+        shown = step.frame.depth[step.frame.truth.labels == step.frame.truth.target_label]
+        assert abs(float(np.median(shown[shown > 0.0])) - target[2]) < 0.03
+        red, green, _ = step.frame.color[step.frame.truth.labels == step.frame.truth.target_label].mean(0)
+        assert red > green, "the target is ripe"
+    assert replay(recorded).steps == 3
 
 
 def test_replay_of_an_unchanged_run_differs_nowhere(finished: tuple[Path, RunResult]) -> None:
@@ -103,15 +113,6 @@ def test_replay_with_another_policy_or_envelope_says_where_it_differs(
     assert {d.what for d in found.differences} >= {"action"}
     assert str(found.differences[0]).startswith("look 0: action was [")
     assert all(d.what != "visible_fraction" for d in found.differences), "the pictures are the same"
-
-
-def test_depth_images_are_packed_without_loss() -> None:
-    rng = np.random.default_rng(0)
-    whole = (rng.integers(0, 4000, (12, 16)) / 1000.0).astype(np.float32)
-    for depth, kind in ((whole, "png"), (rng.random((12, 16), dtype=np.float32), "zlib-float32")):
-        data, encoding = encode_depth(depth)
-        assert encoding == kind
-        np.testing.assert_array_equal(decode_depth(data, encoding, (12, 16)), depth)
 
 
 def test_a_disk_that_fills_up_ends_the_run_as_a_fault(tmp_path: Path) -> None:
@@ -135,7 +136,7 @@ def test_a_disk_that_is_full_from_the_start_is_told_before_anything_moves() -> N
     with pytest.raises(
         RecordingError, match=r"cannot write the recording /dev/full.*No space left.*--no-record"
     ):
-        McapRecorder(Path("/dev/full"), {})
+        McapRecorder(Path("/dev/full"), {}, SimulatedClock(), np.array(T_flange_camera_color_optical))
 
 
 def test_a_recording_that_was_cut_off_is_replayed_as_far_as_it_is_whole(
@@ -200,3 +201,18 @@ def test_damaged_and_foreign_files_are_errors_not_tracebacks(
             load_recording(path)
     with pytest.raises(RecordingError, match="no recording at"):
         load_recording(tmp_path / "missing.mcap")
+
+
+def test_a_recording_with_damage_anywhere_is_an_error_or_whole(
+    tmp_path: Path, finished: tuple[Path, RunResult]
+) -> None:
+    content = (finished[0] / "run.mcap").read_bytes()
+    damaged, rng, refused = tmp_path / "damaged.mcap", np.random.default_rng(1), 0
+    for _ in range(60):
+        at = int(rng.integers(0, len(content) - 8))
+        damaged.write_bytes(content[:at] + rng.bytes(8) + content[at + 8 :])
+        try:
+            load_recording(damaged)
+        except TomatoError:
+            refused += 1
+    assert refused > 10

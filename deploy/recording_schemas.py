@@ -1,0 +1,116 @@
+"""JSON Schemas of a recording's own messages: what was run, what was decided, what a simulated camera knew."""
+
+from typing import Any, Final
+
+Schema = dict[str, Any]
+
+_NUMBER: Final[Schema] = {"type": "number"}
+_INTEGER: Final[Schema] = {"type": "integer"}
+_TEXT: Final[Schema] = {"type": "string"}
+_JOINTS: Final[Schema] = {"type": "array", "items": _NUMBER, "minItems": 7, "maxItems": 7}
+_POINT: Final[Schema] = {"type": "array", "items": _NUMBER, "minItems": 3, "maxItems": 3}
+_POSE: Final[Schema] = {
+    "type": "array",
+    "items": {"type": "array", "items": _NUMBER, "minItems": 4, "maxItems": 4},
+    "minItems": 4,
+    "maxItems": 4,
+}
+_PACKED: Final[Schema] = {
+    "type": "object",
+    "properties": {
+        "dtype": _TEXT,
+        "shape": {"type": "array", "items": _INTEGER},
+        "data": {"type": "string", "contentEncoding": "base64"},
+    },
+    "required": ["dtype", "shape", "data"],
+}
+
+
+def _optional(schema: Schema) -> Schema:
+    return {"anyOf": [schema, {"type": "null"}]}
+
+
+def _object(properties: dict[str, Schema], *optional: str) -> Schema:
+    return {
+        "type": "object",
+        "properties": properties,
+        "required": [name for name in properties if name not in optional],
+    }
+
+
+INFO: Final = _object(
+    {
+        "format": {**_TEXT, "description": "of this recording"},
+        "clock_start": {**_NUMBER, "description": "the run's clock when the recording began, in [s]"},
+        "unix_start_ns": {**_INTEGER, "description": "the machine's date then, in [ns] since 1970"},
+        "profile": _TEXT,
+        "profile_text": {**_TEXT, "description": "TOML"},
+        "policy": _TEXT,
+        "policy_name": _TEXT,
+        "perception": _TEXT,
+        "seed": _INTEGER,
+        "mode": _TEXT,
+        "simulated": {"type": "boolean"},
+        "version": _TEXT,
+        "devices": {"type": "object"},
+        "T_flange_camera": _POSE,
+        "row_moves": _INTEGER,
+    },
+    *(
+        "profile",
+        "profile_text",
+        "policy",
+        "policy_name",
+        "perception",
+        "seed",
+        "mode",
+        "simulated",
+        "version",
+    ),
+    *("devices", "T_flange_camera", "row_moves"),
+)
+"""Of `/info`."""
+
+STEP: Final = _object(
+    {
+        "number": {**_INTEGER, "description": "counts the looks from 0"},
+        "stamp": {**_NUMBER, "description": "of the picture, by the run's clock, in [s]"},
+        "frame_number": _INTEGER,
+        "intrinsics": _object(
+            {
+                "width": _INTEGER,
+                "height": _INTEGER,
+                "fx": _NUMBER,
+                "fy": _NUMBER,
+                "cx": _NUMBER,
+                "cy": _NUMBER,
+            }
+        ),
+        "joint_positions": {**_JOINTS, "description": "in [rad]"},
+        "T_world_camera": {**_POSE, "description": "the colour camera's optical frame"},
+        "target_position": {**_POINT, "description": "base frame, in [m]"},
+        "visible_fraction": {**_NUMBER, "description": "V_f"},
+        "fruits_seen": _INTEGER,
+        "moves_left": _INTEGER,
+        "action": {**_optional(_POINT), "description": "right, up, forward in [-1, 1]"},
+        "commanded": {**_optional(_JOINTS), "description": "joint positions that were sent, in [rad]"},
+        "outcome": _TEXT,
+        "detail": {**_TEXT, "description": "why a move was refused or the run ended"},
+        "timing_ms": {"type": "object", "additionalProperties": _NUMBER},
+    }
+)
+"""Of `/step`."""
+
+TRUTH: Final = _object(
+    {
+        "labels": {"type": "string", "contentEncoding": "base64", "description": "PNG of 16 bits"},
+        "target_label": _INTEGER,
+        "target_position": _POINT,
+        "visible_fraction": _NUMBER,
+        "ripe_labels": {"type": "array", "items": _INTEGER},
+        "fruit_labels": {"type": "array", "items": _INTEGER},
+        "ripe_fractions": {"type": "array", "items": _NUMBER},
+        "rays": _object({"direction_c": _PACKED, "distance": _PACKED, "label": _PACKED}),
+    }
+)
+"""Of `/truth`."""

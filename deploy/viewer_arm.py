@@ -1,0 +1,77 @@
+"""The arm as viewers of a recording show it: where every link is, and a URDF of simple shapes."""
+
+from dataclasses import dataclass
+from functools import cache
+from xml.etree import ElementTree
+
+import numpy as np
+import torch
+from scipy.spatial.transform import Rotation
+
+from maniskill_tomato.deploy.interface import Float64
+from maniskill_tomato.robot.d435 import CAMERA_LINK_NAME, camera_link_pose
+from maniskill_tomato.robot.iiwa14 import EE_LINK_NAME, LINK_NAMES
+from maniskill_tomato.robot.kinematics import link_transforms
+from maniskill_tomato.robot.robot_description import urdf_path
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class LinkFrame:
+    """Where a link is in the link that carries it."""
+
+    parent: str
+    child: str
+    T_parent_child: Float64
+    """Shape (4, 4)."""
+
+
+def link_frames(joint_positions: Float64, T_flange_camera: Float64) -> tuple[LinkFrame, ...]:
+    """Every link of the URDF but the base, each in its parent.
+
+    Args:
+        joint_positions: In [rad]. Shape (7,).
+        T_flange_camera: The colour camera's optical frame in `link_ee`, as calibrated. Shape (4, 4).
+    """
+    poses = link_transforms(torch.as_tensor(np.array(joint_positions, dtype=np.float64))[None])[0].numpy()
+    arm = (
+        LinkFrame(parent=parent, child=child, T_parent_child=np.linalg.inv(poses[k]) @ poses[k + 1])
+        for k, (parent, child) in enumerate(zip(LINK_NAMES, LINK_NAMES[1:], strict=False))
+    )
+    housing = LinkFrame(
+        parent=EE_LINK_NAME, child=CAMERA_LINK_NAME, T_parent_child=camera_link_pose(T_flange_camera)
+    )
+    return (*arm, housing, *_camera_frames())
+
+
+@cache
+def simple_urdf() -> str:
+    """The URDF with the boxes, cylinders and spheres that stand for its meshes, so that it needs no other file."""
+    root = _urdf()
+    for link in root.iter("link"):
+        for meshes in link.findall("visual"):
+            link.remove(meshes)
+        for shape in link.findall("collision"):
+            shape.tag = "visual"
+    return ElementTree.tostring(root, encoding="unicode")
+
+
+def _urdf() -> ElementTree.Element:
+    return ElementTree.parse(urdf_path()).getroot()
+
+
+@cache
+def _camera_frames() -> tuple[LinkFrame, ...]:
+    """What is fixed to the camera's housing."""
+    frames = []
+    for joint in _urdf().iter("joint"):
+        parent, child = joint.find("parent"), joint.find("child")
+        assert parent is not None and child is not None
+        if child.attrib["link"] in (*LINK_NAMES, CAMERA_LINK_NAME):
+            continue
+        origin = joint.find("origin")
+        assert joint.attrib["type"] == "fixed" and origin is not None
+        T = np.eye(4)
+        T[:3, :3] = Rotation.from_euler("xyz", [float(v) for v in origin.attrib["rpy"].split()]).as_matrix()
+        T[:3, 3] = [float(v) for v in origin.attrib["xyz"].split()]
+        frames.append(LinkFrame(parent=parent.attrib["link"], child=child.attrib["link"], T_parent_child=T))
+    return tuple(frames)
