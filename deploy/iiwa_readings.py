@@ -2,7 +2,7 @@
 
 import math
 from dataclasses import dataclass
-from typing import Final, NamedTuple
+from typing import ClassVar, Final, NamedTuple
 
 import numpy as np
 import torch
@@ -10,6 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from maniskill_tomato.deploy.deploy_errors import FaultError
 from maniskill_tomato.deploy.interface import LIMIT_SLACK, ArmState, Float64
+from maniskill_tomato.deploy.profile_bounds import Laxer
 from maniskill_tomato.deploy.rigid import difference, transform
 from maniskill_tomato.errors import InvalidInputError, check_ranges
 from maniskill_tomato.robot import iiwa14
@@ -20,6 +21,10 @@ SPEED_SLACK: Final = 1.2
 
 READING_SLACK: Final = 0.005
 """How far two readings may differ beyond that, in [rad]."""
+
+
+LARGEST_TORQUE_SHARE: Final = 0.5
+"""A torque window wider than this share of what a joint can do would guard nothing."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -46,19 +51,36 @@ class IiwaConfig:
     rest_tolerance: float = 0.01
     """How far a joint may be from where it stood without a move, in [rad]."""
 
+    LAXER: ClassVar[dict[str, Laxer]] = {
+        "torque_margin": "more",
+        "pose_tolerance_m": "more",
+        "pose_tolerance_rad": "more",
+        "arrival_tolerance": "more",
+        "rest_tolerance": "more",
+        "largest_segment": "more",
+        "acceleration_fraction": "more",
+        "contact_force": "more",
+        "contact_tolerance": "more",
+        "reply_timeout_s": "more",
+        "move_margin_s": "more",
+    }
+    """Which way an option relaxes a check, in this class and in those of the drivers."""
+
     def __post_init__(self) -> None:
+        most = LARGEST_TORQUE_SHARE * iiwa14.TORQUE_LIMITS
         if len(self.torque_margin) != iiwa14.NUM_JOINTS or not all(
-            0.0 < t <= 400.0 for t in self.torque_margin
+            0.0 < t <= m for t, m in zip(self.torque_margin, most, strict=True)
         ):
             raise InvalidInputError(
-                f"torque_margin must be {iiwa14.NUM_JOINTS} torques above 0 and up to 400 N m, got {self.torque_margin}"
+                f"torque_margin must be {iiwa14.NUM_JOINTS} torques above 0 and up to half of what the joints can do, "
+                f"{most.tolist()} N m, got {self.torque_margin}"
             )
         check_ranges(
             self,
-            pose_tolerance_m=(1e-5, 0.05),
-            pose_tolerance_rad=(1e-5, 0.1),
-            arrival_tolerance=(1e-5, 0.1),
-            rest_tolerance=(1e-5, 0.1),
+            pose_tolerance_m=(1e-5, 0.01),
+            pose_tolerance_rad=(1e-5, 0.05),
+            arrival_tolerance=(1e-5, 0.02),
+            rest_tolerance=(1e-5, 0.05),
         )
 
 

@@ -222,6 +222,10 @@ class Arm(Device):
             NotConnectedError: As for `read`; likewise `DeviceTimeoutError` and `ProtocolError`.
         """
 
+    def relaxations(self) -> tuple[str, ...]:
+        """What the driver's options relax against their defaults, in words, for people to read at every start."""
+        return ()
+
     def move_seconds(self, turn: Float64, speed_fraction: float) -> float:
         """How long a move takes that nothing holds up, with what the driver needs between its pieces.
 

@@ -12,6 +12,7 @@ import numpy as np
 from maniskill_tomato.deploy.capture import CaptureConfig
 from maniskill_tomato.deploy.deploy_errors import ProfileError
 from maniskill_tomato.deploy.interface import Float64
+from maniskill_tomato.deploy.profile_bounds import BOUNDS, check_bounds, relaxed, with_base_zone
 from maniskill_tomato.deploy.profile_files import profile_names, profile_path
 from maniskill_tomato.deploy.robot_perception import TRUE_MASKS, Sight
 from maniskill_tomato.deploy.run_records import LoopConfig
@@ -120,6 +121,10 @@ class Profile:
     capture: CaptureConfig = field(default_factory=CaptureConfig)
     stop: StopConfig = field(default_factory=StopConfig)
 
+    def relaxations(self) -> tuple[str, ...]:
+        """What it relaxes against the defaults, in words; the arm's options aside."""
+        return tuple(line for table in BOUNDS for line in relaxed(table, getattr(self, table)))
+
 
 def load_profile(name_or_file: str) -> Profile:
     """Reads and checks a profile.
@@ -175,7 +180,13 @@ def parse_profile(text: str, path: Path, T_flange_camera: Any = None) -> Profile
     mount, calibrated = _calibration(calibration, path)
 
     def read(key: str, kind: Any) -> Any:
-        return parse_table(kind, _table(data, key, where), f"{where}: {key}")
+        config = parse_table(kind, _table(data, key, where), f"{where}: {key}")
+        try:
+            if key in BOUNDS:
+                check_bounds(key, config)
+        except InvalidInputError as error:
+            raise ProfileError(f"{where}: {error}") from error
+        return config
 
     return Profile(
         name=path.stem,
@@ -189,7 +200,7 @@ def parse_profile(text: str, path: Path, T_flange_camera: Any = None) -> Profile
         calibrated=calibrated,
         perception=read("perception", PerceptionConfig),
         target=read("target", TargetConfig),
-        safety=read("safety", SafetyConfig),
+        safety=with_base_zone(read("safety", SafetyConfig)),
         loop=read("loop", LoopConfig),
         capture=read("capture", CaptureConfig),
         stop=read("stop", StopConfig),

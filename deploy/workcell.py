@@ -1,5 +1,6 @@
 """The devices of a profile, and what connects them to the policy."""
 
+import logging
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -15,6 +16,8 @@ from maniskill_tomato.deploy.profile import Profile
 from maniskill_tomato.deploy.robot_perception import Perception, open_perception
 from maniskill_tomato.deploy.safety import Safety
 from maniskill_tomato.deploy.stops import Stops
+
+_logger = logging.getLogger(__name__)
 
 TWIN_START = 1_000.0
 """What the twin's clock shows at first, in [s]."""
@@ -121,6 +124,8 @@ def make_workcell(
     context = DriverContext(clock=checked, seed=seed)
     arm = make_arm(profile.arm_driver, profile.arm_options, context)
     camera = make_camera(profile.camera_driver, profile.camera_options, context)
+    for line in (*profile.relaxations(), *arm.relaxations()):
+        _logger.warning("the profile relaxes %s", line)
     is_allowed = arm.simulated or profile.calibrated or calibrates
     safety = Safety(profile.safety, profile.T_flange_camera)
     return Workcell(

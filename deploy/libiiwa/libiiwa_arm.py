@@ -32,6 +32,7 @@ from maniskill_tomato.deploy.libiiwa.client import TOLD_TO_STOP, LibiiwaClient
 from maniskill_tomato.deploy.libiiwa.libiiwa_config import LibiiwaConfig
 from maniskill_tomato.deploy.libiiwa.messages import ERRORS, Code, RobotState
 from maniskill_tomato.deploy.libiiwa.robot_connection import RobotConnection
+from maniskill_tomato.deploy.profile_bounds import relaxed
 from maniskill_tomato.deploy.toml_tables import parse_table
 from maniskill_tomato.robot import iiwa14
 
@@ -192,6 +193,9 @@ class LibiiwaArm(Arm):
             self._torque_before = state.external_torque
             self._next_piece(client, state)
         return JointMove(joint_positions=target, speed_fraction=self._speed)
+
+    def relaxations(self) -> tuple[str, ...]:
+        return tuple(relaxed("arm", self._config, self._config.LAXER))
 
     def move_seconds(self, turn: Float64, speed_fraction: float) -> float:
         acceleration, rest = self._config.acceleration_fraction, np.zeros(iiwa14.NUM_JOINTS)

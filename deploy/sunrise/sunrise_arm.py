@@ -26,6 +26,7 @@ from maniskill_tomato.deploy.drivers import DriverContext
 from maniskill_tomato.deploy.iiwa_pieces import move_seconds, straight_pieces
 from maniskill_tomato.deploy.iiwa_readings import Reading, ReadingLog, pose_difference
 from maniskill_tomato.deploy.interface import Arm, ArmState, Float64, JointMove
+from maniskill_tomato.deploy.profile_bounds import relaxed
 from maniskill_tomato.deploy.sunrise.client import SunriseClient
 from maniskill_tomato.deploy.sunrise.line_connection import LineConnection
 from maniskill_tomato.deploy.sunrise.sunrise_config import SunriseConfig
@@ -132,6 +133,9 @@ class SunriseArm(Arm):
             self._measure()
             state = self._readings.state()
         return state
+
+    def relaxations(self) -> tuple[str, ...]:
+        return tuple(relaxed("arm", self._config, self._config.LAXER))
 
     def move_seconds(self, turn: Float64, speed_fraction: float) -> float:
         ends = straight_pieces(np.zeros(iiwa14.NUM_JOINTS), turn, self._config.largest_segment)

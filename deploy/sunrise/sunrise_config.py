@@ -36,9 +36,9 @@ class SunriseConfig(IiwaConfig):
         check_ranges(
             self,
             port=(1, 65535),
-            largest_segment=(0.005, 6.2),
+            largest_segment=(0.005, 0.5),
             connect_timeout_s=(0.01, 60.0),
             connect_pause_s=(0.0, 10.0),
-            reply_timeout_s=(0.01, 60.0),
-            move_margin_s=(0.01, 60.0),
+            reply_timeout_s=(0.01, 30.0),
+            move_margin_s=(0.01, 30.0),
         )

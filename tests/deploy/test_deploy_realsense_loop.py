@@ -53,7 +53,7 @@ segmenter = "{segmenter}"
 source = "{source}"
 {position}
 [safety]
-max_frame_age = 100.0
+max_frame_age = 60.0
 [loop]
 max_moves = 2
 threshold = 0.99
