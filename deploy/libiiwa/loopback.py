@@ -48,12 +48,14 @@ FaultKind = Literal[
     "not_ready",
     "failed",
     "contact",
+    "hurry",
 ]
 """What goes wrong: `silent` obeys but never answers again; `slow` answers after `seconds`; `split` sends the answer in
 pieces; `double` sends it twice; `partial` sends half of it, and no other; `garbage` sends random bytes; `nan` joint
 angles that are no numbers; `jump` joint angles `radians` away; `refused` does not do this and answers with an error.
 `seconds` later: `drop` ends the application; `cut` is a pulled cable, which the robot does not notice; `not_ready` is
-a released enabling switch; `failed` an error in the move; `contact` something that the arm runs into."""
+a released enabling switch; `failed` an error in the move; `contact` something that the arm runs into.
+From the next move on `hurry` ignores the speed that was set."""
 
 LATER: Final = ("drop", "cut", "not_ready", "failed", "contact")
 """These happen `seconds` after their command."""
@@ -92,6 +94,8 @@ class LoopbackRobot:
     """How moves are made at the start: 51 asynchronously, 52 synchronously."""
     flag_lag_s: float = 0.0
     """For so long after its start a move is not reported to be active, in [s]."""
+    start_lag_s: float = 0.0
+    """For so long after its start the arm still stands, in [s]."""
     tries_for_s: float = 0.0
     """For so long it tries to connect, in [s]; the real application tries once."""
     faults: Sequence[Fault] = ()
@@ -122,7 +126,7 @@ class LoopbackRobot:
         self._force = [0.0] * 3
         self._joint_fault: Fault | None = None
         self._reply_fault: Fault | None = None
-        self._mute = self._cut = self._refuse = False
+        self._mute = self._cut = self._refuse = self._hurries = False
 
     @property
     def over(self) -> bool:
@@ -189,11 +193,14 @@ class LoopbackRobot:
             raise _ApplicationOver(f"code {numbers[0]}")
         code = None if math.isnan(numbers[0]) else round(numbers[0])
         fault = self._schedule.due(str(code))
-        if fault is not None:
+        if fault is not None and fault.kind not in LATER:
             self._begin(fault)
         done = code is not None and not self._refuse and self._execute(code, numbers[1:])
         if self._refuse:
             self._error, self._refuse = -11, False
+        if fault is not None and fault.kind in LATER:
+            # Counted from when the command was carried out, however busy this machine is.
+            self._begin(fault)
         self._reply(done)
 
     def _execute(self, code: int, values: tuple[float, ...]) -> bool:
@@ -285,7 +292,7 @@ class LoopbackRobot:
         if not (speed > 0.0 and acceleration > 0.0):
             raise _ApplicationOver(f"a move at the speed {speed}")
         self._stopped_by_condition, self._move_began = False, time.monotonic()
-        self.arm.start(target, speed, acceleration)
+        self.arm.start(target, 1.0 if self._hurries else speed, acceleration, self.start_lag_s)
         if self.execution == 52:
             while self.arm.moves:
                 time.sleep(0.001)
@@ -355,6 +362,8 @@ class LoopbackRobot:
             timer.start()
         elif fault.kind == "silent":
             self._mute = True
+        elif fault.kind == "hurry":
+            self._hurries = True
         elif fault.kind == "refused":
             self._refuse = True
         elif fault.kind in ("nan", "jump"):

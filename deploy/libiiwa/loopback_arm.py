@@ -103,16 +103,17 @@ class CancellableArm:
             last = self._phases[-1]
             return bool(self._now() < last.began + last.duration)
 
-    def start(self, target: Sequence[float], speed: float, acceleration: float) -> None:
+    def start(self, target: Sequence[float], speed: float, acceleration: float, after_s: float = 0.0) -> None:
         """Begins a move; one that is under way is braked first.
 
         Args:
             target: Joint angles, in [rad]. Shape (7,).
             speed: Share of the largest joint speeds.
             acceleration: Share of the largest joint accelerations.
+            after_s: How long it stands before it moves, in [s].
         """
         with self._lock:
-            began = self._brake()
+            began = self._brake() + after_s
             start = self._position(began)
             change = np.array(target, dtype=np.float64) - start
             if not np.any(change):

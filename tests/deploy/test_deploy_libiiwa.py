@@ -32,6 +32,7 @@ from maniskill_tomato.deploy.drivers import DriverContext, make_arm, make_camera
 from maniskill_tomato.deploy.interface import Arm, JointMove
 from maniskill_tomato.deploy.libiiwa.loopback import LoopbackRobot
 from maniskill_tomato.deploy.libiiwa.messages import Code, Messages
+from maniskill_tomato.deploy.libiiwa.robot_connection import RobotConnection
 from maniskill_tomato.deploy.loopback_faults import Fault
 from maniskill_tomato.deploy.profile import load_profile
 from maniskill_tomato.errors import InvalidInputError
@@ -330,7 +331,7 @@ def test_an_error_that_was_there_before_is_noticed_by_where_the_arm_stands() -> 
 
 
 def test_a_move_whose_flag_comes_late_is_not_taken_for_one_that_has_ended() -> None:
-    with met(robot={"flag_lag_s": 0.3}) as (robot, arm):
+    with met(robot={"flag_lag_s": 0.25, "start_lag_s": 0.2}) as (robot, arm):
         arm.command(move_to(NEAR))
         finish(arm)
         np.testing.assert_allclose(robot.arm.qpos, NEAR, atol=1e-6)
@@ -338,7 +339,7 @@ def test_a_move_whose_flag_comes_late_is_not_taken_for_one_that_has_ended() -> N
 
 def test_a_contact_ends_the_move_by_the_condition_that_was_set_and_is_a_fault() -> None:
     faults = [Fault(kind="contact", command="102", seconds=0.2)]
-    with met(robot={"faults": faults}) as (robot, arm):
+    with met(robot={"faults": faults}, torque_margin=[400.0] * 7) as (robot, arm):
         begin(arm, robot)
         with pytest.raises(
             FaultError, match=r"touched something: the torque at joint 2 changed by 60\.0 N m"
@@ -479,6 +480,20 @@ def test_answers_cut_by_the_network_are_put_together_and_slow_ones_waited_for() 
         np.testing.assert_allclose(robot.arm.qpos, NEAR, atol=1e-6)
 
 
+def test_what_comes_unasked_ends_the_connection_before_it_can_answer_anything() -> None:
+    port, peers = free_port(), list[socket.socket]()
+    thread = threading.Thread(target=lambda: peers.append(dial(port)), daemon=True)
+    thread.start()
+    connection = RobotConnection("127.0.0.1", port, "127.0.0.1", 30.0)
+    thread.join(30.0)
+    peers[0].sendall(b"late")
+    time.sleep(0.05)
+    with pytest.raises(ProtocolError, match="something unasked"):
+        connection.exchange(b"question", 4, 1.0)
+    assert peers[0].recv(8) == b"" and not connection.is_open
+    peers[0].close()
+
+
 def test_the_application_ends_with_the_connection_and_must_be_started_again() -> None:
     port = free_port()
     arm = driver(port)
@@ -601,6 +616,17 @@ def test_requests_and_states_are_big_endian_numbers_without_anything_else(double
     np.testing.assert_allclose(state.joint_positions, np.linspace(-0.6, 0.6, 7), atol=1e-7)
     np.testing.assert_allclose(state.external_torque, range(7))
     np.testing.assert_allclose(state.pose, [0.1, 0.2, 0.3, 0.1, 0.2, 0.3], atol=1e-7)
+
+
+@pytest.mark.parametrize(
+    ("index", "value"), [(0, 0.5), (35, 2.0), (36, -1.0), (37, 0.1), (34, -17.0), (34, 0.0)]
+)
+def test_flags_and_errors_that_the_application_does_not_have_are_no_state(index: int, value: float) -> None:
+    numbers = [0.0] * 34 + [-10.0, 0.0, 1.0, 0.0]
+    Messages(False).state(struct.pack(">38f", *numbers))
+    numbers[index] = value
+    with pytest.raises(ProtocolError, match="its"):
+        Messages(False).state(struct.pack(">38f", *numbers))
 
 
 @settings(max_examples=200, deadline=None)

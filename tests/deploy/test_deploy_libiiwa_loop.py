@@ -63,12 +63,12 @@ def run(
         port=port,
         qpos=start.tolist(),
         media_flange_m=0.026,
-        tries_for_s=60.0,
+        tries_for_s=600.0,
         faults=faults,
     ) as robot:
         workcell = rehearsal(
             "libiiwa",
-            {**reach, "reply_timeout_s": reply_timeout_s},
+            {**reach, "connect_timeout_s": 600.0, "reply_timeout_s": reply_timeout_s},
             lambda: robot.arm.qpos,
             SEED,
             moves,
@@ -146,6 +146,7 @@ def test_a_lost_heartbeat_in_a_move_halts_the_arm_while_the_loop_still_hangs() -
         (Fault(kind="failed", command="102", seconds=0.05), "fault", "asynchronous move failed"),
         (Fault(kind="not_ready", command="102", seconds=0.05), "fault", "enabling switch"),
         (Fault(kind="nan", command="102"), "protocol", "not finite"),
+        (Fault(kind="hurry", command="102"), "fault", "does not move as planned"),
     ],
 )
 def test_a_fault_of_the_robot_ends_the_run_with_its_reason(fault: Fault, reason: str, word: str) -> None:
@@ -165,7 +166,7 @@ def test_the_check_knows_the_profile_and_says_that_a_move_can_be_stopped(tmp_pat
     profile.write_text(
         text.replace('controller = "172.31.1.147"', 'controller = "127.0.0.1"').replace("12225", str(port))
     )
-    with LoopbackRobot(port=port, tries_for_s=60.0) as robot:
+    with LoopbackRobot(port=port, tries_for_s=600.0) as robot:
         found = {finding.what: finding for finding in check(load_profile(str(profile)), "nbv", 0, None)}
         assert robot.wait(5.0)
     assert "flange_difference_mm 0.0" in found["arm"].detail
