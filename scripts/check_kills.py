@@ -187,7 +187,7 @@ def commands(images: Path) -> dict[str, Command]:
         "--batch-size 32 --checkpoint-every 100 --out OUT"
     )
     go_on = words("train --resume OUT")
-    dataset = words("dataset --count 48 --width 64 --height 64 --jobs 2 --out OUT")
+    dataset = words("dataset --count 14 --width 64 --height 64 --jobs 2 --out OUT")
     benchmark = words(
         "benchmark --policies random_viewpoint,fixed_sweep --episodes 8 --no-pictures --jobs 2 --out OUT"
     )

@@ -124,3 +124,18 @@ def test_names_of_modules_in_the_text_exist(page: Path) -> None:
         name for name in folders if not any((ROOT / top / name).is_dir() for top in ("", "maniskill_tomato"))
     }
     assert missing | gone == set()
+
+
+def test_every_test_that_a_page_names_exists() -> None:
+    places = {path.name: path for path in (ROOT / "tests").rglob("test_*.py")}
+    named = {
+        (file, name)
+        for page in PAGES
+        for file, name in re.findall(r"`(test_\w+\.py)::(\w+)`", page.read_text(encoding="utf-8"))
+    }
+    missing = {
+        (file, name)
+        for file, name in named
+        if file not in places or f"def test_{name}(" not in places[file].read_text(encoding="utf-8")
+    }
+    assert len(named) > 40 and missing == set()

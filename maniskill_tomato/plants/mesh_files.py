@@ -49,8 +49,17 @@ def read_objects(path: Path) -> list[MeshObject]:
     suffix = path.suffix.lower()
     if suffix not in MESH_SUFFIXES:
         raise InvalidInputError.choice(f"the ending of the mesh file {path.name}", path.suffix, MESH_SUFFIXES)
-    objects = list(_read_npz(path) if suffix == ".npz" else _read_scene(path, suffix))
+    try:
+        objects = list(_read_npz(path) if suffix == ".npz" else _read_scene(path, suffix))
+    except InvalidInputError:
+        raise
+    except Exception as error:  # What a broken file makes trimesh and NumPy raise has no common base.
+        raise InvalidInputError(f"{path} cannot be read as {suffix[1:].upper()}: {error}") from error
     for found in objects:
+        if found.faces.size and not 0 <= found.faces.min() <= found.faces.max() < len(found.vertices):
+            raise InvalidInputError(
+                f"{path}: object {found.name!r} has triangles between corners that are not there"
+            )
         if not np.isfinite(found.vertices).all():
             raise InvalidInputError(f"{path}: object {found.name!r} has corners that are not finite numbers")
     if not objects:
@@ -85,10 +94,7 @@ def _read_scene(path: Path, suffix: str) -> Iterator[MeshObject]:
     import trimesh
 
     options: dict[str, Any] = {"split_objects": True} if suffix == ".obj" else {}
-    try:
-        scene = trimesh.load_scene(path, process=False, **options)
-    except Exception as error:  # Its readers raise whatever a broken file makes them raise.
-        raise InvalidInputError(f"{path} cannot be read as {suffix[1:].upper()}: {error}") from error
+    scene = trimesh.load_scene(path, process=False, **options)
     parents = scene.graph.transforms.parents
     for node in scene.graph.nodes_geometry:
         T_scene_node, geometry = scene.graph[node]

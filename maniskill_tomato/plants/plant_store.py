@@ -1,6 +1,8 @@
 """Plants and what is made of them, kept for environments that show them again, within a number of bytes."""
 
+import ctypes
 import os
+import sys
 import threading
 from collections import OrderedDict
 from collections.abc import Callable, Hashable
@@ -22,6 +24,8 @@ BYTES_OF_A_VERTEX: Final = 64
 BYTES_OF_A_FACE: Final = 40
 """Vertex indices of its part, organ and plant."""
 
+GIVE_BACK_EVERY: Final = 64_000_000
+"""After so many bytes that were let go, the allocator's holes between what is kept go back to the system."""
 
 T = TypeVar("T")
 
@@ -38,6 +42,7 @@ class ByteStore:
         self._limit = limit
         self._kept: OrderedDict[Hashable, tuple[Any, int]] = OrderedDict()
         self._lock = threading.Lock()
+        self._gone = 0
         self.size = 0
         """Of everything that is kept, in [bytes]."""
 
@@ -63,10 +68,22 @@ class ByteStore:
             while self.size > limit:
                 _, (_, gone) = self._kept.popitem(last=False)
                 self.size -= gone
+                self._gone += gone
+            give_back = self._gone > GIVE_BACK_EVERY
+            self._gone = 0 if give_back else self._gone
+        if give_back:
+            _trim()
         return thing
 
     def __len__(self) -> int:
         return len(self._kept)
+
+
+def _trim() -> None:
+    """Asks glibc to return free pages, which it does not do by itself; other allocators are left alone."""
+    trim = getattr(ctypes.CDLL(None), "malloc_trim", None) if sys.platform == "linux" else None
+    if trim is not None:
+        trim(0)
 
 
 @cache

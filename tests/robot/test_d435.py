@@ -118,7 +118,13 @@ def test_rays_through_all_pixels_project_back_onto_their_centres() -> None:
     np.testing.assert_allclose(camera.project(1.7 * camera.ray_directions(centres)), centres, atol=1e-9)
 
 
-@pytest.mark.parametrize("field", [{"width": 0}, {"height": -1}, {"fx": 0.0}, {"fy": float("nan")}])
+@pytest.mark.parametrize(
+    "field",
+    [
+        *({"width": 0}, {"height": -1}, {"fx": 0.0}, {"fy": float("nan")}, {"width": 10**9}, {"fx": 1e9}),
+        *({"cx": float("inf")}, {"cy": float("nan")}, {"cy": -1e9}),
+    ],
+)
 def test_impossible_intrinsics_are_refused(field: dict[str, float]) -> None:
     values: dict[str, float] = dict(width=64, height=48, fx=50.0, fy=50.0, cx=32.0, cy=24.0) | field
     with pytest.raises(InvalidInputError, match=next(iter(field))):
