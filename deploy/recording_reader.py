@@ -1,7 +1,6 @@
 """Reads recordings of runs: of today's format, and of the first, whose messages were all JSON."""
 
 import base64
-import json
 import struct
 import zlib
 from collections.abc import Callable, Iterator
@@ -14,6 +13,8 @@ from numpy.typing import NDArray
 
 from maniskill_tomato.deploy.deploy_errors import CutOffError, RecordingError
 from maniskill_tomato.deploy.recording import DESCRIPTION, FORMAT
+from maniskill_tomato.segmentation.datasets.picture_files import LARGEST_PICTURE, pixels_of
+from maniskill_tomato.text_files import parse_json
 
 JSON_FORMAT: Final = "maniskill-tomato-deploy-1"
 """Of recordings whose pictures are in JSON."""
@@ -78,7 +79,7 @@ def read_messages(path: Path) -> Iterator[tuple[str, Any]]:
 
 
 def _decoded_json(data: bytes) -> dict[str, Any]:
-    content = json.loads(data)
+    content = parse_json(data.decode())
     if not isinstance(content, dict):
         raise ValueError("a message is no object")
     return content
@@ -106,7 +107,8 @@ def depth_picture(messages: dict[str, Any], shape: tuple[int, int]) -> NDArray[n
         content = base64.b64decode(message["data"])
         if message["format"] == "png":
             return (decode_png(content).astype(np.float64) / 1000.0).astype(np.float32)
-        return np.frombuffer(zlib.decompress(content), dtype=np.float32).reshape(shape).copy()
+        unpacked = zlib.decompressobj().decompress(content, 4 * shape[0] * shape[1] + 1)
+        return np.frombuffer(unpacked, dtype=np.float32).reshape(shape).copy()
     if message.encoding == "32FC1":
         return np.frombuffer(message.data, dtype="<f4").reshape(shape).astype(np.float32)
     return (np.frombuffer(message.data, dtype="<u2").reshape(shape) / 1000.0).astype(np.float32)
@@ -118,6 +120,8 @@ def decode_png(content: bytes) -> NDArray[Any]:
     Raises:
         ValueError: It is none.
     """
+    if pixels_of(content) > LARGEST_PICTURE:
+        raise ValueError(f"a picture has more than {LARGEST_PICTURE} pixels")
     pixels: Any = cv2.imdecode(np.frombuffer(content, dtype=np.uint8), cv2.IMREAD_UNCHANGED)
     if pixels is None:
         raise ValueError("a picture is damaged")

@@ -29,7 +29,7 @@ import torch
 import tyro
 
 from maniskill_tomato.deploy.deploy_errors import CutOffError
-from maniskill_tomato.deploy.recording import read_messages
+from maniskill_tomato.deploy.recording_reader import read_messages
 from maniskill_tomato.files import read_tensors, write_json
 
 MARK = "TOMATO_CHECK_KILLS"

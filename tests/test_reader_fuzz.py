@@ -19,6 +19,7 @@ from hypothesis import strategies as st
 from maniskill_tomato.array_files import read_arrays
 from maniskill_tomato.deploy.calibration.view_folder import read_views
 from maniskill_tomato.deploy.profile import load_profile
+from maniskill_tomato.deploy.run_replay import load_recording
 from maniskill_tomato.errors import TomatoError
 from maniskill_tomato.experiments.result_store import ResultStore
 from maniskill_tomato.experiments.training_runs import read_columns
@@ -87,6 +88,7 @@ READERS = {
     "episode list": Reader(read_episodes, ("episodes.json",)),
     "episodes of a run": Reader(read_columns, ("episodes.csv",)),
     "epochs of YOLO": Reader(read_history, ("results.csv",)),
+    "recording": Reader(load_recording, ("recording.mcap", "recording_json.mcap")),
     "results": Reader(_results, ("results.jsonl",)),
     "settings": Reader(lambda p: ResultStore(p.parent, {"env_id": "x"}), ("settings.json",)),
 }

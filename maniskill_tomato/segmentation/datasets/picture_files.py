@@ -58,7 +58,7 @@ def _decoded(path: Path, flags: int) -> NDArray[Any]:
         raise InvalidInputError(f"{path} cannot be read: {error.strerror or error}") from error
     if is_truncated_jpeg(content):
         raise InvalidInputError(f"{path} is a JPEG that ends too early; copy or download it again")
-    if (size := _pixels(content)) > LARGEST_PICTURE:
+    if (size := pixels_of(content)) > LARGEST_PICTURE:
         raise InvalidInputError(f"{path} has more than {LARGEST_PICTURE} pixels, which are allowed")
     try:
         picture: Any = cv2.imdecode(np.frombuffer(content, np.uint8), flags) if size else None
@@ -70,7 +70,7 @@ def _decoded(path: Path, flags: int) -> NDArray[Any]:
     return decoded
 
 
-def _pixels(content: bytes) -> int:
+def pixels_of(content: bytes) -> int:
     """Pixels of an image by its head, before memory is set aside for them; 0 for what is no image."""
     try:
         with warnings.catch_warnings(action="ignore"), PillowImage.open(io.BytesIO(content)) as picture:
