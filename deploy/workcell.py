@@ -109,7 +109,7 @@ def make_workcell(
     Args:
         profile: Which.
         seed: Of simulated devices: the twin's episode.
-        clock: Another clock than the machine's, or for the twin than a simulated one.
+        clock: Another clock than the machine's, or than a simulated one where both devices are simulated.
         calibrates: Whether the run is there to calibrate the camera. Without a calibration every other one is refused
             each move of a real arm.
 
@@ -117,9 +117,11 @@ def make_workcell(
         ProfileError: A driver or an option is wrong, or a simulated camera would guide a real arm.
     """
     if clock is None:
-        drivers = {profile.arm_driver, profile.camera_driver}
-        twin = drivers == {"mock"} and not profile.arm_options.get("real_time", False)
-        clock = SimulatedClock(TWIN_START) if twin else MonotonicClock()
+        # A recording that plays by the simulated clock loses no picture to a busy machine.
+        is_played = profile.camera_driver == "mock" or bool(profile.camera_options.get("recording"))
+        is_simulated = profile.arm_driver == "mock" and is_played
+        in_real_time = bool(profile.arm_options.get("real_time", False))
+        clock = SimulatedClock(TWIN_START) if is_simulated and not in_real_time else MonotonicClock()
     checked = CheckedClock(clock)
     context = DriverContext(clock=checked, seed=seed)
     arm = make_arm(profile.arm_driver, profile.arm_options, context)

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from maniskill_tomato.deploy.clock import Clock
 from maniskill_tomato.deploy.deploy_errors import (
     DeployError,
+    DeviceTimeoutError,
     FaultError,
     NotConnectedError,
     ProtocolError,
@@ -17,6 +18,7 @@ from maniskill_tomato.deploy.deploy_errors import (
 )
 from maniskill_tomato.deploy.drivers import DriverContext
 from maniskill_tomato.deploy.interface import Camera, Float64, Frame
+from maniskill_tomato.deploy.realsense.playback_time import PlaybackTime
 from maniskill_tomato.deploy.realsense.realsense_config import RealSenseConfig
 from maniskill_tomato.deploy.realsense.source import FrameSource, load_sdk
 from maniskill_tomato.deploy.toml_tables import parse_table
@@ -29,6 +31,9 @@ MAX_DISTORTION_PX: Final = 1.0
 
 PLAUSIBLE_LAG_S: Final = 2.0
 """A picture whose own time stamp is older than this when it arrives has a clock that means something else, in [s]."""
+
+MAX_SKIP_S: Final = 60.0
+"""So long a recording may take to get to the moment that is asked for, in [s]: its pictures are read one by one."""
 
 
 class RealSenseCamera(Camera):
@@ -57,6 +62,8 @@ class RealSenseCamera(Camera):
         self._align: Any = None
         self._taken_in_view = 0
         self._last_number: int | None = None
+        self._playback_time: PlaybackTime | None = None
+        self._not_due: Any = None
 
     @property
     def is_connected(self) -> bool:
@@ -93,7 +100,8 @@ class RealSenseCamera(Camera):
             self._read_calibration(sdk, source)
             self._align = sdk.align(sdk.stream.color)
             self._filters = DepthFilters(sdk, self._config)
-            self._last_number = None
+            self._last_number, self._not_due = None, None
+            self._playback_time = self._began(sdk, source)
             for _ in range(0 if source.is_recording else self._config.warm_up_frames):
                 source.next(max(2.0, self._config.frame_timeout_s))
         except (DeployError, RuntimeError) as error:
@@ -116,14 +124,14 @@ class RealSenseCamera(Camera):
 
     def read(self, max_age_s: float = 0.5, after: float | None = None) -> Frame:
         source = _connected(self._source)
-        deadline = (
-            time.monotonic()
-            + max(self._config.frame_timeout_s, max_age_s)
-            + (self._config.temporal_frames / self._config.fps if self._config.temporal else 0.0)
-        )
+        allowed = max(self._config.frame_timeout_s, max_age_s)
+        if self._config.temporal:
+            allowed += self._config.temporal_frames / self._config.fps
+        began = time.monotonic()
+        deadline = began + allowed
         why_not = ""
         while time.monotonic() < deadline:
-            frames = source.next(self._config.frame_timeout_s)
+            frames, self._not_due = self._not_due or source.next(self._config.frame_timeout_s), None
             color = frames.get_color_frame()
             if not color or not frames.get_depth_frame():
                 why_not = "only one of colour and depth came"
@@ -131,7 +139,11 @@ class RealSenseCamera(Camera):
             number, stamp = int(color.get_frame_number()), self._stamp(color)
             if after is not None and stamp <= after:
                 why_not = f"frame {number} was taken {after - stamp:.3f} s too early"
+                if source.is_recording:
+                    deadline = min(time.monotonic() + allowed, began + MAX_SKIP_S)
                 continue
+            if source.is_recording:
+                self._wait_for(stamp, frames)
             if self._last_number is not None and number == self._last_number:
                 why_not = f"frame {number} came again"
                 continue
@@ -190,15 +202,38 @@ class RealSenseCamera(Camera):
     def _stamp(self, frame: Any) -> float:
         """When a frame was taken, by our clock."""
         now = self._clock.now()
-        source = _connected(self._source)
-        if source.is_recording:
-            return now
+        if self._playback_time is not None:
+            return self._playback_time.moment(float(frame.get_timestamp()) / 1000.0, now)
         domain = load_sdk().timestamp_domain
         if frame.get_frame_timestamp_domain() in (domain.global_time, domain.system_time):
             lag = time.time() - float(frame.get_timestamp()) / 1000.0
             if -0.005 <= lag <= PLAUSIBLE_LAG_S:
                 return now - max(0.0, lag)
         return now - self._config.latency_s
+
+    def _began(self, sdk: Any, source: FrameSource) -> PlaybackTime | None:
+        """A recording's time, of which nothing has been played yet; None for a camera."""
+        if not source.is_recording:
+            return None
+        rate = float(source.profile.get_stream(sdk.stream.color).fps())
+        if not 1.0 <= rate <= 1000.0:
+            raise FaultError(f"the recording says that it has {rate:g} pictures a second; record it again")
+        return PlaybackTime(1.0 / rate, self._config.repeat)
+
+    def _wait_for(self, stamp: float, frames: Any) -> None:
+        """Until a recording has played to a picture.
+
+        Raises:
+            DeviceTimeoutError: That takes too long; the picture is kept.
+        """
+        wait = stamp - self._clock.now()
+        if wait > self._config.frame_timeout_s:
+            self._not_due = frames
+            self._clock.sleep(self._config.frame_timeout_s)
+            raise DeviceTimeoutError(
+                f"no picture within {self._config.frame_timeout_s:g} s; the recording's next one comes in {wait:.1f} s"
+            )
+        self._clock.sleep(wait)
 
     def _frame(self, frames: Any, number: int, stamp: float) -> Frame:
         aligned = self._align.process(frames)

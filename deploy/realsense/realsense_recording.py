@@ -1,6 +1,6 @@
 """Recordings of the SDK made from given pictures, for tests and rehearsals without a camera."""
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -22,6 +22,7 @@ def write_recording(
     *,
     depth_units: float = 0.001,
     fps: int = 30,
+    stamps_s: Sequence[float] | None = None,
 ) -> int:
     """Writes a recording as a D435 would, through a device in software.
 
@@ -34,6 +35,7 @@ def write_recording(
         T_color_depth: From the depth camera's optical frame to the colour camera's. Shape (4, 4).
         depth_units: Metres that one count of depth stands for.
         fps: Pictures a second.
+        stamps_s: When each picture was taken, in [s]; None for one after the other at that rate.
 
     Returns:
         How many pairs were written.
@@ -84,7 +86,7 @@ def write_recording(
                 frame = sdk.software_video_frame()
                 frame.pixels = np.ascontiguousarray(picture)
                 frame.bpp, frame.stride = size, size * intrinsics.width
-                frame.timestamp = 1000.0 * count / fps
+                frame.timestamp = 1000.0 * (count / fps if stamps_s is None else stamps_s[count - 1])
                 frame.domain = sdk.timestamp_domain.hardware_clock
                 frame.frame_number = count
                 frame.profile = profiles[name].as_video_stream_profile()

@@ -115,7 +115,9 @@ class FrameSource:
             if there:
                 return frames
             if self._playback is not None:
-                if self._playback.current_status() == self._sdk.playback_status.stopped:
+                # One that repeats stops for a moment each time.
+                is_over = self._playback.current_status() == self._sdk.playback_status.stopped
+                if is_over and not self._config.repeat:
                     raise NotConnectedError(
                         "the recording is over; set camera.repeat = true to play it again"
                     )

@@ -2,6 +2,7 @@
 
 import importlib
 import importlib.util
+import math
 import subprocess
 import sys
 import time
@@ -13,17 +14,20 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from maniskill_tomato.deploy.clock import MonotonicClock
+from maniskill_tomato.deploy.clock import MonotonicClock, SimulatedClock
 from maniskill_tomato.deploy.deploy_errors import (
+    DeviceTimeoutError,
     FaultError,
     NotConnectedError,
     ProfileError,
+    ProtocolError,
     RecordingError,
     StaleError,
 )
 from maniskill_tomato.deploy.drivers import DriverContext, make_camera
 from maniskill_tomato.deploy.interface import Camera
 from maniskill_tomato.deploy.realsense import source as sdk_module
+from maniskill_tomato.deploy.realsense.playback_time import PlaybackTime
 from maniskill_tomato.deploy.realsense.realsense_camera import RealSenseCamera
 from maniskill_tomato.deploy.realsense.realsense_config import RealSenseConfig
 from maniskill_tomato.deploy.realsense.realsense_recording import write_recording
@@ -63,9 +67,9 @@ def record(path: Path, pictures: list[Picture], **options: Any) -> Path:
     return path
 
 
-def camera(path: Path | None, **options: Any) -> Camera:
+def camera(path: Path | None, clock: Any = None, **options: Any) -> Camera:
     table = options | ({"recording": str(path)} if path else {})
-    return make_camera("realsense", table, DriverContext(clock=MonotonicClock()))
+    return make_camera("realsense", table, DriverContext(clock=clock or SimulatedClock()))
 
 
 @pytest.fixture(scope="module")
@@ -192,12 +196,66 @@ def test_a_frame_from_before_the_arm_settled_is_not_taken(
     random_recording: tuple[Path, list[Picture]],
 ) -> None:
     path, _ = random_recording
-    with camera(path, temporal=False, frame_timeout_s=5.0, repeat=True) as device:
-        settled = time.monotonic() + 0.1
-        frame = device.read(after=settled)
-        assert frame.stamp > settled
-        with pytest.raises(StaleError, match="too early"):
-            device.read(max_age_s=0.1, after=time.monotonic() + 60.0)
+    clock = SimulatedClock(50.0)
+    with camera(path, clock, temporal=False, repeat=True) as device:
+        frame = device.read(after=50.11)
+        assert frame.number == 4 and frame.stamp == pytest.approx(50.0 + 4 / 30)
+        # The file again and again: its 6 pictures last 0.2 s.
+        clock.sleep(4.9)
+        frame = device.read(after=55.01)
+        assert 55.01 < frame.stamp < 55.06 and frame.stamp == pytest.approx(clock.now())
+
+
+def test_pictures_of_a_recording_are_as_old_as_its_own_stamps_say(
+    random_recording: tuple[Path, list[Picture]], tmp_path: Path
+) -> None:
+    """Not as the moment says at which they happen to be read."""
+    path, pictures = random_recording
+    clock = SimulatedClock(10.0)
+    with camera(path, clock, temporal=False) as device:
+        stamps = [device.read().stamp for _ in range(2)]
+        np.testing.assert_allclose(stamps, [10.0 + 1 / 30, 10.0 + 2 / 30], atol=1e-6)
+        assert clock.now() == pytest.approx(stamps[-1]), "it plays no faster than the clock"
+        clock.sleep(1.0)
+        with pytest.raises(NotConnectedError, match="recording is over"):  # All others are too old by now.
+            device.read(max_age_s=0.5)
+
+    clock = SimulatedClock(10.0)
+    spaced = record(tmp_path / "spaced.db3", pictures[:3], stamps_s=[7.0, 7.5, 12.0])
+    with camera(spaced, clock, temporal=False) as device:
+        assert device.read().stamp == pytest.approx(10.0 + 1 / 30)
+        assert device.read().stamp == pytest.approx(10.5 + 1 / 30)
+        for waited in (1.0, 2.0, 3.0):
+            with pytest.raises(DeviceTimeoutError, match="the recording's next one comes in"):
+                device.read()
+            assert clock.now() == pytest.approx(10.5 + 1 / 30 + waited), (
+                "a camera would be waited for as long"
+            )
+        clock.sleep(1.2)
+        third = device.read()
+        assert (third.number, third.stamp) == (3, pytest.approx(15.0 + 1 / 30)), "it was not lost meanwhile"
+
+
+def test_a_recording_in_real_time_is_waited_for(random_recording: tuple[Path, list[Picture]]) -> None:
+    with camera(random_recording[0], MonotonicClock(), temporal=False) as device:
+        first = device.read()
+        began = time.monotonic()
+        fourth = device.read(after=first.stamp + 0.09)
+        assert fourth.number >= 4 and time.monotonic() - began > 0.05
+
+
+def test_a_recording_whose_time_goes_back_is_refused(
+    random_recording: tuple[Path, list[Picture]], tmp_path: Path
+) -> None:
+    path = record(tmp_path / "back.db3", random_recording[1][:3], stamps_s=[3.0, 3.1, 2.0])
+    with camera(path, temporal=False) as device:
+        for _ in range(2):
+            device.read()
+        with pytest.raises(ProtocolError, match=r"time goes back from 3.100 s to 2.000 s"):
+            device.read()
+    time_of = PlaybackTime(0.1, repeats=False)
+    with pytest.raises(ProtocolError, match="nan"):
+        time_of.moment(math.nan, 0.0)
 
 
 def test_the_end_of_a_recording_is_said_at_once_and_repeating_goes_on(tmp_path: Path) -> None:
