@@ -32,14 +32,12 @@ class RoundsConfig:
 
     rounds: tuple[int, ...]
     """Episodes of each round."""
-    pool: int = 120
-    """Training plants that three quarters of the episodes draw from; the others grow a new one each."""
     block: int = 100
     """Episodes that a process runs and writes at a time; what a stopped training repeats."""
     seed: int = 0
 
     def __post_init__(self) -> None:
-        check_counts(self, "pool", "block")
+        check_counts(self, "block")
         if not self.rounds or min(self.rounds) < 1:
             raise InvalidInputError(f"rounds must list one or more numbers above 0, got {self.rounds}")
         if not 0 <= self.seed < 100:

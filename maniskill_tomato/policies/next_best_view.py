@@ -13,69 +13,13 @@ distance.
 
 import math
 
-import torch
 from torch import Tensor
 
 from maniskill_tomato.errors import InvalidInputError
 from maniskill_tomato.policies.lattice_planner import LatticePlanner, way_to
+from maniskill_tomato.policies.measured_views import most_similar
 from maniskill_tomato.robot.look_at_move import MAX_MOVE
 from maniskill_tomato.sensing.belief import Belief
-
-SIMILAR_ANGLE = math.radians(8.0)
-"""Views within about this angle, seen from the target, show the same, in [rad]."""
-
-SIMILAR_DISTANCE = 0.1
-"""And within about this difference of distance, in [m]."""
-
-
-class MeasuredViews:
-    """V_f as it was measured so far, to correct predictions of similar views."""
-
-    def __init__(self, most: int = 64) -> None:
-        """Keeps up to `most` views per environment."""
-        self._most = most
-        self._offset = torch.zeros(0, most, 3)
-        self._seen = torch.zeros(0, most)
-
-    def begin(self, belief: Belief, rows: Tensor) -> None:
-        """Forgets the views of some environments."""
-        position = belief.camera_position
-        if len(self._offset) != len(position):
-            self._offset = position.new_full((len(position), self._most, 3), math.nan)
-            self._seen = position.new_zeros(len(position), self._most)
-            self._count = torch.zeros(len(position), dtype=torch.int64, device=position.device)
-        self._offset[rows] = math.nan
-        self._count[rows] = 0
-
-    def add(self, belief: Belief) -> None:
-        """Takes in the present views."""
-        rows = torch.arange(len(self._count), device=self._count.device)
-        at = self._count % self._most
-        self._offset[rows, at] = belief.camera_position - belief.target_position
-        self._seen[rows, at] = belief.visible_fraction.to(self._seen)
-        self._count += 1
-
-    def correct(self, predicted: Tensor, offsets: Tensor) -> Tensor:
-        """Predictions moved towards the measurement of the most similar view.
-
-        Args:
-            predicted: Expected V_f. Shape (B, K).
-            offsets: The candidates' positions relative to the target, in [m]. Shape (B, K, 3).
-
-        Returns:
-            Shape (B, K).
-        """
-        most = int(self._count.max())
-        taken, seen = self._offset[:, :most], self._seen[:, :most]
-        distance, taken_distance = offsets.norm(dim=-1), taken.norm(dim=-1)
-        cosine = (offsets @ taken.mT) / (distance[:, :, None] * taken_distance[:, None]).clamp_min(1e-9)
-        angle = torch.acos(cosine.clamp(-1.0, 1.0)) / SIMILAR_ANGLE
-        nearer = (distance[:, :, None] - taken_distance[:, None]) / SIMILAR_DISTANCE
-        similar = torch.exp(-0.5 * (angle.square() + nearer.square())).nan_to_num(0.0)
-        weight, which = similar.max(dim=-1)
-        measured = seen.gather(1, which)
-        corrected: Tensor = predicted + weight * (measured - predicted)
-        return corrected
 
 
 class NextBestView(LatticePlanner):
@@ -96,21 +40,12 @@ class NextBestView(LatticePlanner):
             raise InvalidInputError(f"move_cost must be a finite number, got {move_cost}")
         super().__init__()
         self.move_cost = move_cost
-        self._measured = MeasuredViews()
-
-    def begin(self, belief: Belief, rows: Tensor) -> None:
-        self._measured.begin(belief, rows)
-        super().begin(belief, rows)
-
-    def act(self, belief: Belief) -> Tensor:
-        """Towards the best view."""
-        self._measured.add(belief)
-        return super().act(belief)
 
     def worth(self, belief: Belief, views: Tensor) -> Tensor:
         """Expected V_f less the cost of the way. Shape (B, K)."""
         expected, _ = belief.memory.predict(views).unbind(-1)
-        expected = self._measured.correct(expected, views - belief.target_position[:, None])
+        weight, measured = most_similar(belief, views)
+        expected = expected + weight * (measured - expected)
         worth: Tensor = expected - self.move_cost * (way_to(belief, views) / MAX_MOVE)
         return worth
 

@@ -23,7 +23,7 @@ from maniskill_tomato.policies.quality_network import ViewQualityNetwork
 from maniskill_tomato.sensing.belief import Belief
 from maniskill_tomato.sensing.view_lattice import DISTANCES
 
-FORMAT: Final = "view-quality-1"
+FORMAT: Final = "view-quality-2"
 
 
 @dataclass(frozen=True, kw_only=True)

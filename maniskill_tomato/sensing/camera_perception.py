@@ -320,7 +320,8 @@ class CameraPerception:
                     seen[i] = views[k]
                     poses[i] = torch.as_tensor(views[k].measurement.frame.T_world_camera).to(poses)
             mask = torch.tensor([view is not None for view in seen], device=self._device)
-            observer.memory.integrate(poses, self._rays(seen), mask)
+            fractions = self._fractions([self._fraction_in(i, view) for i, view in enumerate(seen)])
+            observer.memory.integrate(poses, self._rays(seen), mask, visible_fraction=fractions)
 
     # ------------------------------------------------------------------ target
 
@@ -391,17 +392,27 @@ class CameraPerception:
     def _fractions(self, values: Sequence[float]) -> Tensor:
         return torch.tensor(values, dtype=torch.float32, device=self._device)
 
+    def _target_in(self, env_index: int, view: MappedView) -> int | None:
+        """Index of an environment's target among the fruits of any of its views; None if that does not show it."""
+        search = self._searches[env_index]
+        names = [search.map.current(n) for n in view.tracks]
+        return names.index(search.target) if search.target is not None and search.target in names else None
+
+    def _fraction_in(self, env_index: int, view: MappedView | None) -> float:
+        """V_f of an environment's target in one of its views."""
+        if view is None:
+            return 0.0
+        search = self._searches[env_index]
+        index = self._target_in(env_index, view)
+        return search.map.fraction(view.measurement, index, search.target).value
+
     def _rays(self, seen: Sequence[MappedView | None]) -> ViewRays:
         parts = []
         for k, view in enumerate(seen):
             if view is None:
                 parts.append(_NO_RAYS)
                 continue
-            search = self._searches[k]
-            number = search.target
-            names = [search.map.current(n) for n in view.tracks]
-            index = names.index(number) if number is not None and number in names else None
-            parts.append(view.measurement.rays(self.position_w(k), index))
+            parts.append(view.measurement.rays(self.position_w(k), self._target_in(k, view)))
         return ViewRays(
             torch.cat([part.direction_c for part in parts]).to(self._device),
             torch.cat([part.distance for part in parts]).to(self._device),

@@ -52,6 +52,8 @@ class Grid:
     """Camera positions in the world frame, in [m]. Shape (B, 64)."""
     visits: wp.array[wp.int32]
     """How many camera positions there were. Shape (B,)."""
+    fractions: wp.array2d[wp.float32]
+    """V_f that was measured from each of them. Shape (B, 64)."""
 
 
 @wp.struct
@@ -165,6 +167,7 @@ def integrate(
     directions: wp.array2d[wp.vec3],
     distances: wp.array2d[wp.float32],
     labels: wp.array2d[wp.int8],
+    fractions: wp.array[wp.float32],
     active: wp.array[wp.int32],
 ):
     """One ray: the lengths that it went through voxels and, at its end, a hit."""
@@ -174,6 +177,7 @@ def integrate(
     camera_position = translation(camera_poses[env])
     if ray == 0:
         grid.visited[env, grid.visits[env] % MAX_VISITS] = camera_position
+        grid.fractions[env, grid.visits[env] % MAX_VISITS] = fractions[env]
         grid.visits[env] = grid.visits[env] + 1
     label = labels[env, ray]
     if label == OUTSIDE:

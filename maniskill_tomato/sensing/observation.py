@@ -194,7 +194,7 @@ class ViewpointObserver:
         ):
             if tuple(tensor.shape) != shape:
                 raise InvalidInputError(f"{name} must have shape {shape}, got {tuple(tensor.shape)}")
-        self.memory.integrate(T_world_camera, rays, mask)
+        self.memory.integrate(T_world_camera, rays, mask, visible_fraction=visible_fraction)
         self._viewpoints.copy_(viewpoint)
         self._camera_poses.copy_(T_world_camera)
         self._visible_fractions.copy_(visible_fraction)

@@ -76,6 +76,7 @@ class OcclusionMemory:
         self._centres = torch.zeros(num_envs, 3, device=self.device)
         self._visited = torch.full((num_envs, MAX_VISITS, 3), math.nan, device=self.device)
         self._visits = torch.zeros(num_envs, dtype=torch.int32, device=self.device)
+        self._fractions = torch.full((num_envs, MAX_VISITS), math.nan, device=self.device)
         grid: Any = memory_kernels.Grid()
         grid.hits = wp.from_torch(self._hits)
         grid.passes = wp.from_torch(self._passes)
@@ -83,6 +84,7 @@ class OcclusionMemory:
         grid.centres = wp.from_torch(self._centres, dtype=wp.vec3)
         grid.visited = wp.from_torch(self._visited, dtype=wp.vec3)
         grid.visits = wp.from_torch(self._visits)
+        grid.fractions = wp.from_torch(self._fractions)
         foliage: Any = memory_kernels.Foliage()
         foliage.density = -math.log1p(-unknown_probability)
         foliage.voxel_weight = voxel_weight
@@ -131,6 +133,11 @@ class OcclusionMemory:
         """How many views there were. Shape (B,), int32."""
         return self._visits
 
+    @property
+    def fractions(self) -> Tensor:
+        """V_f of the target as it was measured from each of `visited`; NaN where it was not. Shape (B, 64)."""
+        return self._fractions
+
     def begin(self, env_idx: Tensor, target_position: Tensor) -> None:
         """Forgets everything and centres the grid.
 
@@ -148,9 +155,17 @@ class OcclusionMemory:
         self._passes[env_idx] = 0
         self._visited[env_idx] = math.nan
         self._visits[env_idx] = 0
+        self._fractions[env_idx] = math.nan
         self._centres[env_idx] = target_position.to(self._centres)
 
-    def integrate(self, T_world_camera: Tensor, rays: ViewRays, mask: Tensor | None = None) -> None:
+    def integrate(
+        self,
+        T_world_camera: Tensor,
+        rays: ViewRays,
+        mask: Tensor | None = None,
+        *,
+        visible_fraction: Tensor | None = None,
+    ) -> None:
         """Takes in one view.
 
         A ray counts as passing up to its distance; OTHER counts as a hit there, TARGET and FREE do not, OUTSIDE counts
@@ -160,6 +175,7 @@ class OcclusionMemory:
             T_world_camera: Where the views were taken: poses of the optical frames. Shape (B, 4, 4).
             rays: What they told.
             mask: The environments that take theirs in, all if None. Shape (B,), bool.
+            visible_fraction: V_f of the targets as it was measured; None if it was not. Shape (B,).
 
         Raises:
             InvalidInputError: A shape does not fit.
@@ -172,11 +188,15 @@ class OcclusionMemory:
             )
         if mask is not None and mask.shape != (b,):
             raise InvalidInputError(f"mask must have shape ({b},), got {tuple(mask.shape)}")
+        if visible_fraction is not None and visible_fraction.shape != (b,):
+            raise InvalidInputError(
+                f"visible_fraction must have shape ({b},), got {tuple(visible_fraction.shape)}"
+            )
         count = rays.label.shape[1]
         integration = self._integrations.get(count)
         if integration is None:
             integration = self._integrations[count] = _Integration(self, count)
-        integration.run(T_world_camera, rays, mask)
+        integration.run(T_world_camera, rays, mask, visible_fraction)
         self._is_estimated = False
 
     def predict(self, camera_positions: Tensor) -> Tensor:
@@ -245,6 +265,7 @@ class OcclusionMemory:
             "centres": self._centres,
             "visited": self._visited,
             "visits": self._visits,
+            "fractions": self._fractions,
         }
 
 
@@ -257,6 +278,7 @@ class _Integration:
         self._directions = torch.zeros(b, count, 3, device=device)
         self._distances = torch.zeros(b, count, device=device)
         self._labels = torch.zeros(b, count, dtype=torch.int8, device=device)
+        self._fractions = torch.zeros(b, device=device)
         self._active = torch.ones(b, dtype=torch.int32, device=device)
         arguments = [
             memory.grid,
@@ -264,15 +286,22 @@ class _Integration:
             wp.from_torch(self._directions, dtype=wp.vec3),
             wp.from_torch(self._distances),
             wp.from_torch(self._labels),
+            wp.from_torch(self._fractions),
             wp.from_torch(self._active),
         ]
         self._launch = RecordedLaunch(device, (memory_kernels.integrate, (b, count), arguments))
 
-    def run(self, T_world_camera: Tensor, rays: ViewRays, mask: Tensor | None) -> None:
+    def run(
+        self, T_world_camera: Tensor, rays: ViewRays, mask: Tensor | None, visible_fraction: Tensor | None
+    ) -> None:
         self._poses.copy_(T_world_camera)
         self._directions.copy_(rays.direction_c)
         self._distances.copy_(rays.distance)
         self._labels.copy_(rays.label)
+        if visible_fraction is None:
+            self._fractions.fill_(math.nan)
+        else:
+            self._fractions.copy_(visible_fraction)
         if mask is None:
             self._active.fill_(1)
         else:

@@ -85,6 +85,19 @@ def by_distance(belief: Belief) -> list[int]:
 # ---------------------------------------------------------------- features
 
 
+def measured_nearby(belief: Belief, position: Tensor) -> list[float]:
+    """How alike the most similar of two views is, by 8 degrees and 0.1 m, times its V_f, and that itself."""
+    target = belief.target_position[0]
+    alike = []
+    for visit, fraction in zip(belief.memory.visited[0, :2], belief.memory.fractions[0, :2], strict=True):
+        there, taken = position - target, visit - target
+        angle = math.degrees(math.acos(min(float(there @ taken / (there.norm() * taken.norm())), 1.0)))
+        gap = float(there.norm() - taken.norm())
+        alike.append((math.exp(-0.5 * ((angle / 8.0) ** 2 + (gap / 0.1) ** 2)), float(fraction)))
+    weight, fraction = max(alike)
+    return [weight * fraction, weight]
+
+
 def test_features_are_those_of_each_candidate(belief: Belief) -> None:
     maps, scalars = quality_features(belief)
     assert maps.shape == (1, MAP_CHANNELS, AZIMUTHS, ELEVATIONS) and scalars.shape == (1, SCALARS)
@@ -101,6 +114,7 @@ def test_features_are_those_of_each_candidate(belief: Belief) -> None:
             math.exp(-((min(gaps) / 0.06) ** 2)),
             float(belief.reachable[0, k]),
             float((position - camera).norm()) / 1.2,
+            *measured_nearby(belief, position),
         ]
         torch.testing.assert_close(table[:, d, a, e], torch.tensor(wanted), rtol=1e-4, atol=1e-5)
 
@@ -252,11 +266,11 @@ def test_a_training_goes_on_where_it_was(tmp_path: Path) -> None:
     config = QualityTrainConfig(
         rounds=(2, 2),
         block=1,
-        pool=2,
+        episodes_a_plant=1,
         validation_episodes=1,
         fit=FitConfig(steps=3, batch_size=4, width=4, blocks=1),
     )
-    options = {"plant": {"row": False, "pool": 2}}
+    options = {"plant": {"row": False}}
     lines: list[str] = []
     path = train_view_quality(tmp_path / "run", config, env_options=options, report=lines.append)
     assert sum("blocks)" in line for line in lines) == 5
@@ -279,11 +293,11 @@ def test_a_training_begins_with_the_network_that_it_is_given(tmp_path: Path) -> 
     config = QualityTrainConfig(
         rounds=(1,),
         block=1,
-        pool=2,
+        episodes_a_plant=1,
         validation_episodes=1,
         fit=FitConfig(steps=1, batch_size=2, learning_rate=1e-9, weight_decay=0.0, width=8, blocks=2),
     )
-    arguments: dict[str, Any] = {"env_options": {"plant": {"row": False, "pool": 2}}}
+    arguments: dict[str, Any] = {"env_options": {"plant": {"row": False}}}
     path = train_view_quality(tmp_path / "run", config, start_from=tmp_path / "given.pt", **arguments)
     for a, b in zip(given.network.parameters(), load_view_quality(path).network.parameters(), strict=True):
         torch.testing.assert_close(a, b, atol=1e-6, rtol=0.0)

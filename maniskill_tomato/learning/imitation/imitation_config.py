@@ -29,6 +29,8 @@ class ImitationConfig(RoundsConfig):
     rounds: tuple[int, ...] = (1500, 1000, 1000, 1000)
     """Episodes of each round. The teacher leads the first, which alone is behaviour cloning; the student of the round
     before leads `student_share` of the later ones (DAgger)."""
+    pool: int = 120
+    """Training plants that three quarters of the episodes draw from; the others grow a new one each."""
     student_share: float = 0.9
     """Share of the later rounds' episodes that the student leads."""
     fit: ImitationFitConfig = field(default_factory=ImitationFitConfig)
@@ -36,6 +38,7 @@ class ImitationConfig(RoundsConfig):
 
     def __post_init__(self) -> None:
         super().__post_init__()
+        check_counts(self, "pool")
         if not 0.0 <= self.student_share <= 1.0:
             raise InvalidInputError(f"student_share must be from 0 to 1, got {self.student_share}")
 

@@ -4,9 +4,13 @@ from dataclasses import dataclass, field
 
 from maniskill_tomato.errors import InvalidInputError
 from maniskill_tomato.learning.round_config import DescentConfig, RoundsConfig, check_counts
+from maniskill_tomato.plants.seed_splits import SEED_SPLITS
 
 VALIDATION_SEED = 900_000_000
 """Seed of the first validation episode; training episodes stay below."""
+
+SEEDS_A_PLANT = 10
+"""Seeds of episodes that belong to each plant."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -42,6 +46,8 @@ class QualityTrainConfig(RoundsConfig):
     rounds: tuple[int, ...] = (3000, 3000)
     """Episodes of each round. The first is led by the planner on the occupancy map, the later ones mostly by the
     network of the round before."""
+    episodes_a_plant: int = 4
+    """Episodes on each plant, which is grown for them and not met again."""
     validation_episodes: int = 200
     """Episodes on the validation plants, for the losses in the log."""
     fit: FitConfig = field(default_factory=FitConfig)
@@ -49,6 +55,21 @@ class QualityTrainConfig(RoundsConfig):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        check_counts(self, "validation_episodes")
-        if max(self.rounds) * len(self.rounds) > VALIDATION_SEED // 100:
-            raise InvalidInputError(f"the rounds must hold less than 9 million episodes, got {self.rounds}")
+        check_counts(self, "episodes_a_plant", "validation_episodes")
+        if self.episodes_a_plant > SEEDS_A_PLANT:
+            raise InvalidInputError(
+                f"episodes_a_plant must be {SEEDS_A_PLANT} or less, got {self.episodes_a_plant}"
+            )
+        if self.block % self.episodes_a_plant:
+            raise InvalidInputError(
+                f"block must be a multiple of episodes_a_plant, {self.episodes_a_plant}; got {self.block}"
+            )
+        low, high = SEED_SPLITS["train"]
+        if (self.seed + 1) * len(self.rounds) * self.plants(max(self.rounds)) > high - low:
+            raise InvalidInputError(
+                f"rounds and seed ask for more than the {high - low} training plants, got {self.rounds} and {self.seed}"
+            )
+
+    def plants(self, episodes: int) -> int:
+        """Plants that the whole blocks of so many episodes are run on."""
+        return -(-episodes // self.block) * (self.block // self.episodes_a_plant)

@@ -23,7 +23,7 @@ class QualityData:
     """N looks in M episodes or parts of them."""
 
     maps: Tensor
-    """Shape (N, 20, 13, 9), float16."""
+    """Shape (N, 28, 13, 9), float16."""
     scalars: Tensor
     """Shape (N, 9)."""
     episode: Tensor
@@ -93,6 +93,9 @@ def collect_episodes(
         env: A general viewpoint task with one environment.
         seeds: Of the episodes.
         network: Leads three quarters of the episodes; None leaves all to the planner on the occupancy map.
+
+    Raises:
+        InvalidInputError: An episode cannot begin, such as where the arm reaches none of a plant's ripe fruits.
     """
     world: Any = env.unwrapped
     maps: list[Tensor] = []

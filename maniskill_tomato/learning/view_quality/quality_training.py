@@ -11,13 +11,18 @@ from typing import Any
 from torch import Tensor
 
 import maniskill_tomato
-from maniskill_tomato.errors import CheckpointError
+from maniskill_tomato.errors import CheckpointError, InvalidInputError
 from maniskill_tomato.files import write_atomically
 from maniskill_tomato.learning.blocks import Block, begin_training, run_blocks
 from maniskill_tomato.learning.rl.envs import make_env
-from maniskill_tomato.learning.view_quality.quality_config import VALIDATION_SEED, QualityTrainConfig
+from maniskill_tomato.learning.view_quality.quality_config import (
+    SEEDS_A_PLANT,
+    VALIDATION_SEED,
+    QualityTrainConfig,
+)
 from maniskill_tomato.learning.view_quality.quality_episodes import QualityData, collect_episodes
 from maniskill_tomato.learning.view_quality.quality_fit import fit
+from maniskill_tomato.plants.seed_splits import SEED_SPLITS
 from maniskill_tomato.policies.quality_network import ViewQualityNetwork
 from maniskill_tomato.policies.view_quality import ViewQuality, load_view_quality, save_view_quality
 
@@ -58,36 +63,15 @@ def train_view_quality(
     begin_training(out, settings)
     start = time.perf_counter()
     options = env_options or {}
-    count = -(-config.validation_episodes // config.block)
-    validation_plan = [
-        _block(
-            out / f"validation-{b}.pt",
-            VALIDATION_SEED + b * config.block,
-            config.block,
-            "validation",
-            None,
-            options,
-        )
-        for b in range(count)
-    ]
+    validation_plan = _blocks(
+        out / "validation", config, 0, config.validation_episodes, "validation", options
+    )
     plan: list[Block] = []
     for number, episodes in enumerate(config.rounds):
         policy_path = out / f"round-{number}.pt"
         before = start_from if number == 0 else out / f"round-{number - 1}.pt"
-        first = (config.seed * len(config.rounds) + number) * max(config.rounds)
-        plan += [
-            _block(
-                out / f"train-{number}-{b}.pt",
-                first + b * config.block,
-                config.block,
-                "train",
-                # A quarter of the blocks meets new plants only.
-                None if b % 4 == 3 else config.pool,
-                options,
-                before,
-            )
-            for b in range(-(-episodes // config.block))
-        ]
+        first = (config.seed * len(config.rounds) + number) * config.plants(max(config.rounds))
+        plan += _blocks(out / f"train-{number}", config, first, episodes, "train", options, before)
         if policy_path.is_file():
             network = load_view_quality(policy_path).network
             continue
@@ -118,29 +102,54 @@ def train_view_quality(
     return path
 
 
-def _block(
+def _blocks(
     path: Path,
+    config: QualityTrainConfig,
     first: int,
     episodes: int,
     split: str,
-    pool: int | None,
     options: dict[str, Any],
     policy: Path | None = None,
-) -> Block:
-    return Block(path=path, make=_collect, arguments=(first, episodes, split, pool, options, policy))
+) -> list[Block]:
+    """Episodes on the plants of a split from its `first` on, in files that begin with `path`."""
+    plants = config.block // config.episodes_a_plant
+    return [
+        Block(
+            path=path.with_name(f"{path.name}-{b}.pt"),
+            make=_collect,
+            arguments=(first + b * plants, plants, config.episodes_a_plant, split, options, policy),
+        )
+        for b in range(config.plants(episodes) // plants)
+    ]
 
 
 def _collect(
-    first: int, episodes: int, split: str, pool: int | None, options: dict[str, Any], policy: Path | None
+    first: int,
+    plants: int,
+    episodes_a_plant: int,
+    split: str,
+    options: dict[str, Any],
+    policy: Path | None,
 ) -> dict[str, Tensor]:
-    """Episodes of seeds from `first` on, in whatever process this is."""
+    """Episodes on plants from the `first` of their split on, in whatever process this is."""
     network = None if policy is None else load_view_quality(policy).network
-    plant = {"seed": split, "pool": pool, **dict(options.get("plant", {}))}
-    env = make_env(ENV_ID, **{**options, "plant": plant})
-    try:
-        data = collect_episodes(env, range(first, first + episodes), network)
-    finally:
-        env.close()
+    start = VALIDATION_SEED if split == "validation" else 0
+    parts: list[QualityData] = []
+    hopeless: InvalidInputError | None = None
+    for number in range(first, first + plants):
+        plant = {**dict(options.get("plant", {})), "seed": SEED_SPLITS[split][0] + number}
+        env = make_env(ENV_ID, **{**options, "plant": plant})
+        seed = start + SEEDS_A_PLANT * number
+        try:
+            for k in range(seed, seed + episodes_a_plant):
+                parts.append(collect_episodes(env, range(k, k + 1), network))
+        except InvalidInputError as error:
+            hopeless = error  # The arm reaches none of its ripe fruits where it stands.
+        finally:
+            env.close()
+    if hopeless is not None and not parts:
+        raise hopeless
+    data = QualityData.join(parts)
     return {f.name: getattr(data, f.name) for f in fields(QualityData)}
 
 
