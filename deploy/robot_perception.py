@@ -339,6 +339,7 @@ class RobotBelief:
             sighting.rays,
             torch.tensor([sighting.visible_fraction], dtype=torch.float32),
             torch.tensor([moves_left]),
+            qpos=torch.as_tensor(np.array(joint_positions)[None], dtype=torch.float32),
         )
         return self._observer.belief
 

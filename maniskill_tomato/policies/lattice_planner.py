@@ -6,9 +6,10 @@ from abc import abstractmethod
 import torch
 from torch import Tensor
 
-from maniskill_tomato.policies.moves import move_towards
+from maniskill_tomato.policies.followed_ways import moves_along
+from maniskill_tomato.policies.moves import move_towards, moves_needed
 from maniskill_tomato.policies.protocol import Planner
-from maniskill_tomato.robot.look_at_move import MAX_MOVE
+from maniskill_tomato.robot.look_at_move import MAX_MOVE, LookAtMover
 from maniskill_tomato.sensing.belief import Belief
 
 TAKEN = 0.25 * MAX_MOVE
@@ -16,6 +17,9 @@ TAKEN = 0.25 * MAX_MOVE
 
 REFUSED_ANGLE = math.radians(30.0)
 """Moves from one place within this angle of a refused one are taken to be refused too."""
+
+FOLLOWED = 8
+"""Candidates to which it is followed at most."""
 
 
 def distance_to_taken(belief: Belief, positions: Tensor) -> Tensor:
@@ -78,39 +82,51 @@ class Candidates:
         untried: Tensor = allowed & ~self.refused & (distance_to_taken(belief, positions) > TAKEN)
         return untried
 
-    def move_to_best(self, belief: Belief, positions: Tensor, worth: Tensor, allowed: Tensor) -> Tensor:
-        """The moves towards the best candidates that are allowed, were not taken and not refused.
-
-        Args:
-            belief: What is known.
-            positions: Of the candidates, in the world frame, in [m]. Shape (B, K, 3).
-            worth: Shape (B, K).
-            allowed: Shape (B, K), bool.
-
-        Returns:
-            Shape (B, 3).
-        """
-        position = belief.camera_position
-        directions = torch.nn.functional.normalize(positions - position[:, None], dim=-1)
+    def choosable(self, belief: Belief, positions: Tensor, allowed: Tensor) -> Tensor:
+        """`untried` less those in the directions that the arm refused from here. Shape (B, K), bool."""
         allowed = self.untried(belief, positions, allowed)
+        directions = _directions(belief, positions)
         for i, refused in enumerate(self._refused_directions):
             if refused:
                 near = (directions[i] @ torch.stack(refused).mT).amax(dim=-1) > math.cos(REFUSED_ANGLE)
                 # Where all directions were refused, those of the other candidates are tried after all.
                 if bool((allowed[i] & ~near).any()):
                     allowed[i] &= ~near
-        self.chosen = torch.where(allowed, worth, -math.inf).argmax(dim=1)
+        return allowed
+
+    def move_to_best(self, belief: Belief, positions: Tensor, worth: Tensor) -> Tensor:
+        """The moves towards the best candidates.
+
+        Args:
+            belief: What is known.
+            positions: Of the candidates, in the world frame, in [m]. Shape (B, K, 3).
+            worth: Negative infinity where one may not be chosen. Shape (B, K).
+
+        Returns:
+            Shape (B, 3).
+        """
+        position = belief.camera_position
+        self.chosen = worth.argmax(dim=1)
         self._before = position.clone()
         rows = torch.arange(len(position), device=position.device)
-        self._direction = directions[rows, self.chosen]
+        self._direction = _directions(belief, positions)[rows, self.chosen]
         return move_towards(position, belief.target_position, positions[rows, self.chosen])
 
 
+def _directions(belief: Belief, positions: Tensor) -> Tensor:
+    """From the cameras to each candidate. Shapes (B, K, 3)."""
+    return torch.nn.functional.normalize(positions - belief.camera_position[:, None], dim=-1)
+
+
 class LatticePlanner(Planner):
-    """Moves towards the view of the lattice that is worth most, among those worth trying."""
+    """Moves towards the view of the lattice that is worth most, among those worth trying that the arm gets to."""
+
+    move_worth = 1.0
+    """What a move more costs, in the unit of `worth`."""
 
     def __init__(self) -> None:
         self.tried = Candidates()
+        self._mover: LookAtMover | None = None
 
     def begin(self, belief: Belief, rows: Tensor) -> None:
         self.tried.begin(belief, rows)
@@ -119,7 +135,40 @@ class LatticePlanner(Planner):
         """Towards the best view."""
         self.tried.note_refusals(belief)
         views = self.views(belief)
-        return self.tried.move_to_best(belief, views, self.worth(belief, views), self.allowed(belief))
+        allowed = self.tried.choosable(belief, views, self.allowed(belief))
+        worth = torch.where(allowed, self.worth(belief, views), -math.inf)
+        return self.tried.move_to_best(belief, views, self._by_ways(belief, views, worth))
+
+    def _by_ways(self, belief: Belief, views: Tensor, worth: Tensor) -> Tensor:
+        """What views are worth by the moves that the arm really needs, as far as that decides which is best.
+
+        The ways to the best ones are followed, until one of these is worth more than any other could be. Where the arm
+        gets to none, they are worth what they were.
+        """
+        if belief.qpos is None:
+            return worth
+        if self._mover is None:
+            self._mover = LookAtMover(worth.device)
+        straight = moves_needed(way_to(belief, views))
+        followed, rest = torch.full_like(worth, -math.inf), worth.clone()
+        for _ in range(FOLLOWED):
+            hope, best = rest.max(dim=1)
+            rows = (hope > followed.amax(dim=1)).nonzero()[:, 0]
+            if not len(rows):
+                break
+            chosen = best[rows]
+            moves = moves_along(
+                self._mover,
+                belief.qpos[rows],
+                belief.camera_position[rows],
+                belief.target_position[rows],
+                views[rows, chosen],
+            )
+            extra = moves - straight[rows, chosen]
+            followed[rows, chosen] = worth[rows, chosen] - self.move_worth * extra
+            rest[rows, chosen] = -math.inf
+        gets_there = followed.isfinite().any(dim=1, keepdim=True)
+        return torch.where(gets_there, followed, worth)
 
     def ranked(self, belief: Belief) -> list[int]:
         """The candidates of the first environment that are worth trying, the best first."""

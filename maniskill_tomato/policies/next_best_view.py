@@ -39,7 +39,7 @@ class NextBestView(LatticePlanner):
         if not math.isfinite(move_cost):
             raise InvalidInputError(f"move_cost must be a finite number, got {move_cost}")
         super().__init__()
-        self.move_cost = move_cost
+        self.move_cost = self.move_worth = move_cost
 
     def worth(self, belief: Belief, views: Tensor) -> Tensor:
         """Expected V_f less the cost of the way. Shape (B, K)."""

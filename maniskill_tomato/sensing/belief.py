@@ -33,3 +33,5 @@ class Belief:
     """Candidates round the target."""
     reachable: Tensor
     """Which candidates the arm reaches. Shape (B, K), bool."""
+    qpos: Tensor | None = None
+    """Joint positions, in [rad]; None for a camera that no arm holds. Shape (B, 7)."""

@@ -14,6 +14,7 @@ from torch import Tensor
 
 from maniskill_tomato.errors import InvalidInputError
 from maniskill_tomato.raycast.view_rays import RAYS_PER_SIDE, ViewRays
+from maniskill_tomato.robot.iiwa14 import NUM_JOINTS
 from maniskill_tomato.sensing import observation_kernels as kernels
 from maniskill_tomato.sensing.belief import Belief
 from maniskill_tomato.sensing.occlusion_memory import OcclusionMemory
@@ -166,6 +167,7 @@ class ViewpointObserver:
         visible_fraction: Tensor,
         moves_left: Tensor,
         mask: Tensor | None = None,
+        qpos: Tensor | None = None,
     ) -> Tensor:
         """Takes one view into the memory and describes what is known. To be called once for every view.
 
@@ -177,6 +179,7 @@ class ViewpointObserver:
             moves_left: Moves until the episode ends. Shape (B,).
             mask: The environments that looked anew, all if None; the memory of the others stays as it is.
                 Shape (B,), bool.
+            qpos: Joint positions, in [rad]; None if no arm holds the cameras. Shape (B, 7).
 
         Returns:
             The vector that `layout` describes. Shape (B, D), float32.
@@ -194,6 +197,8 @@ class ViewpointObserver:
         ):
             if tuple(tensor.shape) != shape:
                 raise InvalidInputError(f"{name} must have shape {shape}, got {tuple(tensor.shape)}")
+        if qpos is not None and tuple(qpos.shape) != (b, NUM_JOINTS):
+            raise InvalidInputError(f"qpos must have shape {(b, NUM_JOINTS)}, got {tuple(qpos.shape)}")
         self.memory.integrate(T_world_camera, rays, mask, visible_fraction=visible_fraction)
         self._viewpoints.copy_(viewpoint)
         self._camera_poses.copy_(T_world_camera)
@@ -218,6 +223,7 @@ class ViewpointObserver:
             memory=self.memory,
             lattice=self.lattice,
             reachable=self._reachable.bool(),
+            qpos=None if qpos is None else qpos.clone(),
         )
         return observation
 

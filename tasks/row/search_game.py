@@ -329,7 +329,13 @@ class SearchGame:
             # What was seen before stood about the place where the target was thought to be.
             self._senses.revise(self._observer, located)
         self._observer.observe(
-            state.viewpoint, seen_from, measured.rays, measured.told_fraction, self._moves_left(), mask
+            state.viewpoint,
+            seen_from,
+            measured.rays,
+            measured.told_fraction,
+            self._moves_left(),
+            mask,
+            state.qpos,
         )
 
     def recall(self, env_idx: Tensor) -> None:
