@@ -19,7 +19,7 @@ REFUSED_ANGLE = math.radians(30.0)
 """Moves from one place within this angle of a refused one are taken to be refused too."""
 
 FOLLOWED = 8
-"""Candidates to which it is followed at most."""
+"""Candidates to which the way is followed at most."""
 
 
 def distance_to_taken(belief: Belief, positions: Tensor) -> Tensor:

@@ -590,7 +590,8 @@ def test_a_view_that_was_taken_is_not_taken_again(world: FreeWorld) -> None:
         [here + torch.tensor([0.0, 0.02, 0.0]), here + torch.tensor([0.0, 0.05, 0.0])], dim=1
     )
     tried.refused = torch.zeros(1, 2, dtype=torch.bool)
-    tried.move_to_best(belief, positions, torch.tensor([[9.0, 1.0]]), torch.ones(1, 2, dtype=torch.bool))
+    allowed = tried.choosable(belief, positions, torch.ones(1, 2, dtype=torch.bool))
+    tried.move_to_best(belief, positions, torch.tensor([[9.0, 1.0]]).where(allowed, -math.inf))
     assert int(tried.chosen[0]) == 1  # 2 cm away the camera sees what it sees here, 5 cm away it does not.
 
 
@@ -606,7 +607,8 @@ def test_after_a_refusal_the_directions_round_it_wait_until_the_camera_has_moved
     worth, allowed = torch.tensor([[4.0, 3.0, 2.0, 1.0]]), torch.ones(1, 4, dtype=torch.bool)
 
     def choose() -> int:
-        tried.move_to_best(belief, positions, worth, allowed)
+        choosable = tried.choosable(belief, positions, allowed)
+        tried.move_to_best(belief, positions, worth.where(choosable, -math.inf))
         return int(tried.chosen[0])
 
     assert choose() == 0

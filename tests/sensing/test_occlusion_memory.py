@@ -288,6 +288,25 @@ def test_more_views_than_are_remembered_replace_the_first(device: str) -> None:
     assert memory.visited[0, :3, 0].tolist() == [MAX_VISITS, MAX_VISITS + 1, 2.0]
 
 
+def test_the_fraction_of_every_view_is_kept_beside_where_it_was_taken(device: str) -> None:
+    memory = OcclusionMemory(2, device)
+    memory.begin(torch.arange(2, device=device), torch.tensor([[0.7, 0.1, 1.0]] * 2, device=device))
+    points, pose, label = random_view(4, 0)
+    one = rays_to(points, pose, label, device)
+    rays = ViewRays(*(t.repeat_interleave(2, 0) for t in (one.direction_c, one.distance, one.label)))
+    poses = pose.to(device).expand(2, 4, 4)
+    memory.integrate(poses, rays, visible_fraction=torch.tensor([0.25, 0.5], device=device))
+    mask = torch.tensor([False, True], device=device)
+    memory.integrate(poses, rays, mask, visible_fraction=torch.tensor([0.75, 0.125], device=device))
+    memory.integrate(poses, rays)
+    told = [[value for value in row if math.isfinite(value)] for row in memory.fractions.tolist()]
+    assert told == [[0.25], [0.5, 0.125]] and memory.visits.tolist() == [2, 3]
+    with pytest.raises(InvalidInputError, match=r"visible_fraction must have shape \(2,\), got \(1,\)"):
+        memory.integrate(poses, rays, visible_fraction=torch.ones(1, device=device))
+    memory.begin(torch.tensor([1], device=device), torch.zeros(1, 3, device=device))
+    assert bool(memory.fractions[1].isnan().all()) and float(memory.fractions[0, 0]) == 0.25
+
+
 def test_what_is_predicted_agrees_with_what_is_seen_the_better_the_more_views() -> None:
     correlations: dict[int, list[float]] = {1: [], 6: []}
     rng = np.random.default_rng(0)

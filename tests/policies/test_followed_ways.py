@@ -1,0 +1,83 @@
+"""Ways that planners follow by kinematics, against the moves that a world's arm really makes."""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+
+from maniskill_tomato.policies.followed_ways import SAME_PLACE, moves_along
+from maniskill_tomato.policies.lattice_planner import LatticePlanner, way_to
+from maniskill_tomato.policies.moves import move_towards, moves_needed
+from maniskill_tomato.robot.inverse_kinematics import Reach
+from maniskill_tomato.robot.look_at_move import MAX_MOVE, LookAtMover
+from maniskill_tomato.sensing.belief import Belief
+from maniskill_tomato.tasks.making import make_world
+from maniskill_tomato.tasks.world import World
+
+ONE = torch.tensor([0])
+
+
+@pytest.fixture(scope="module")
+def world() -> World:
+    return make_world("TomatoViewpoint-v1", plant={"seed": 1})
+
+
+def really_made(world: World, seed: int, goal: torch.Tensor) -> float:
+    """Moves of the world's own arm straight to a goal; infinite if it refuses one."""
+    world.reset(seed)
+    for count in range(1, 11):
+        before = world.belief.camera_position
+        world.step(move_towards(before, world.belief.target_position, goal[None]))
+        after = world.belief.camera_position
+        if int(world.state.reach[0]) == Reach.UNREACHABLE or float((after - before).norm()) < 0.1 * MAX_MOVE:
+            return math.inf
+        if float((goal - after[0]).norm()) < SAME_PLACE:
+            return float(count)
+    return math.nan
+
+
+@pytest.mark.parametrize("seed", [3, 5])
+def test_ways_are_those_that_the_arm_makes(world: World, seed: int) -> None:
+    world.reset(seed)
+    belief = world.belief
+    qpos, position, target = world.state.qpos, belief.camera_position, belief.target_position
+    near = (way_to(belief, belief.lattice.positions(target))[0] < 8 * MAX_MOVE).nonzero()[:, 0]
+    picked = near[torch.as_tensor(np.random.default_rng(seed).permutation(len(near))[:14])]
+    goals = belief.lattice.positions(target)[0, picked]
+    rows = [tensor.expand(len(goals), -1) for tensor in (qpos, position, target)]
+    moves = moves_along(LookAtMover(), *rows, goals).tolist()
+    assert moves == [really_made(world, seed, goal) for goal in goals]
+    assert any(math.isinf(count) for count in moves) and any(math.isfinite(count) for count in moves)
+
+
+class OneWish(LatticePlanner):
+    """Wants one candidate much and the others by their nearness."""
+
+    name = "one_wish"
+
+    def __init__(self, wish: int) -> None:
+        super().__init__()
+        self._wish = wish
+
+    def worth(self, belief: Belief, views: torch.Tensor) -> torch.Tensor:
+        worth = -moves_needed(way_to(belief, views))
+        worth[:, self._wish] = 100.0
+        return worth
+
+
+def test_a_planner_spends_no_move_on_a_way_that_the_arm_cannot_go(world: World) -> None:
+    world.reset(3)
+    belief = world.belief
+    views = belief.lattice.positions(belief.target_position)
+    count = belief.lattice.size
+    rows = [t.expand(count, -1) for t in (world.state.qpos, belief.camera_position, belief.target_position)]
+    moves = moves_along(LookAtMover(), *rows, views[0])
+    blocked = (belief.reachable[0] & moves.isinf() & (way_to(belief, views)[0] > 0.06)).nonzero()[:, 0]
+    free = (belief.reachable[0] & moves.isfinite() & (way_to(belief, views)[0] > 0.06)).nonzero()[:, 0]
+    for wish, is_taken in ((int(blocked[0]), False), (int(free[0]), True)):
+        planner = OneWish(wish)
+        planner.begin(belief, ONE)
+        planner.act(belief)
+        assert (int(planner.tried.chosen[0]) == wish) is is_taken
+        assert math.isfinite(float(moves[planner.tried.chosen[0]]))
