@@ -14,7 +14,7 @@ logger = logging.getLogger(__name__)
 
 @contextlib.contextmanager
 def only_writer(folder: Path, does: str = "writes") -> Iterator[None]:
-    """Holds a folder, which is made if it is missing.
+    """Holds a folder, which is made if it is missing; one that was made and stays empty goes again after an error.
 
     Args:
         folder: Which.
@@ -23,6 +23,7 @@ def only_writer(folder: Path, does: str = "writes") -> Iterator[None]:
     Raises:
         CheckpointError: Another process holds it, or it cannot be made.
     """
+    is_new = not folder.exists()
     try:
         folder.mkdir(parents=True, exist_ok=True)
         descriptor = os.open(folder, os.O_RDONLY)
@@ -40,5 +41,10 @@ def only_writer(folder: Path, does: str = "writes") -> Iterator[None]:
         except OSError as error:  # Some network file systems have no locks.
             logger.warning("%s cannot be locked (%s); take care that only one process uses it", folder, error)
         yield
+    except BaseException:
+        if is_new:
+            with contextlib.suppress(OSError):
+                folder.rmdir()
+        raise
     finally:
         os.close(descriptor)

@@ -411,6 +411,7 @@ print(json.dumps([actions.tolist(), sorted(loaded)]))
         "maniskill_tomato.policies.layout",
         "maniskill_tomato.policies.onnx_policy",
         "maniskill_tomato.tasks",
+        "maniskill_tomato.text_files",
     ]
 
 
