@@ -20,7 +20,8 @@ from maniskill_tomato.learning.view_quality.quality_episodes import QualityData,
 from maniskill_tomato.learning.view_quality.quality_fit import fit, judge, mirrored
 from maniskill_tomato.learning.view_quality.quality_training import train_view_quality
 from maniskill_tomato.policies.adapters import as_state_policy
-from maniskill_tomato.policies.moves import move_towards
+from maniskill_tomato.policies.followed_ways import moves_along
+from maniskill_tomato.policies.moves import move_towards, moves_needed
 from maniskill_tomato.policies.next_best_view import NextBestView
 from maniskill_tomato.policies.opening import open_policy
 from maniskill_tomato.policies.quality_features import FEATURES, MAP_CHANNELS, SCALARS, quality_features
@@ -33,6 +34,7 @@ from maniskill_tomato.policies.view_quality import (
     save_view_quality,
 )
 from maniskill_tomato.robot.look_at import look_at_pose
+from maniskill_tomato.robot.look_at_move import LookAtMover
 from maniskill_tomato.sensing.belief import Belief
 from maniskill_tomato.sensing.view_lattice import AZIMUTHS, DISTANCES, ELEVATIONS
 
@@ -76,10 +78,14 @@ def told(belief: Belief, probability: dict[int, float], **settings: float) -> Vi
 
 
 def by_distance(belief: Belief) -> list[int]:
-    """The reachable candidates that a move does not reach, nearest first."""
-    away = (belief.lattice.positions(belief.target_position) - belief.camera_position[:, None])[0]
-    way = away.norm(dim=-1)
-    return [k for k in way.argsort().tolist() if bool(belief.reachable[0, k]) and float(way[k]) > 0.13]
+    """The candidates that the arm gets to, but not in one move, nearest first."""
+    assert belief.qpos is not None
+    goals = belief.lattice.positions(belief.target_position)[0]
+    rows = (belief.qpos, belief.camera_position, belief.target_position)
+    moves = moves_along(LookAtMover(), *(row.expand(len(goals), -1) for row in rows), goals)
+    way = (goals - belief.camera_position).norm(dim=-1)
+    gets_there = belief.reachable[0] & (moves == moves_needed(way))
+    return [k for k in way.argsort().tolist() if bool(gets_there[k]) and float(way[k]) > 0.13]
 
 
 # ---------------------------------------------------------------- features
