@@ -30,7 +30,7 @@ FORMAT: Final = "view-quality-2"
 class ViewQualityConfig:
     """How the policy weighs."""
 
-    patience: float = 8.0
+    patience: float = 16.0
     """Moves that are worth a certain full view."""
 
     def __post_init__(self) -> None:

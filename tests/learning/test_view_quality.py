@@ -81,8 +81,9 @@ def by_distance(belief: Belief) -> list[int]:
     """The candidates that the arm gets to, but not in one move, nearest first."""
     assert belief.qpos is not None
     goals = belief.lattice.positions(belief.target_position)[0]
-    rows = (belief.qpos, belief.camera_position, belief.target_position)
-    moves = moves_along(LookAtMover(), *(row.expand(len(goals), -1) for row in rows), goals)
+    now = (belief.qpos, belief.camera_position, belief.target_position)
+    qpos, position, target = (row.expand(len(goals), -1) for row in now)
+    moves = moves_along(LookAtMover(), qpos, position, target, goals)
     way = (goals - belief.camera_position).norm(dim=-1)
     gets_there = belief.reachable[0] & (moves == moves_needed(way))
     return [k for k in way.argsort().tolist() if bool(gets_there[k]) and float(way[k]) > 0.13]

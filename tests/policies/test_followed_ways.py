@@ -45,8 +45,8 @@ def test_ways_are_those_that_the_arm_makes(world: World, seed: int) -> None:
     near = (way_to(belief, belief.lattice.positions(target))[0] < 8 * MAX_MOVE).nonzero()[:, 0]
     picked = near[torch.as_tensor(np.random.default_rng(seed).permutation(len(near))[:14])]
     goals = belief.lattice.positions(target)[0, picked]
-    rows = [tensor.expand(len(goals), -1) for tensor in (qpos, position, target)]
-    moves = moves_along(LookAtMover(), *rows, goals).tolist()
+    qpos, position, target = (tensor.expand(len(goals), -1) for tensor in (qpos, position, target))
+    moves = moves_along(LookAtMover(), qpos, position, target, goals).tolist()
     assert moves == [really_made(world, seed, goal) for goal in goals]
     assert any(math.isinf(count) for count in moves) and any(math.isfinite(count) for count in moves)
 
@@ -71,8 +71,9 @@ def test_a_planner_spends_no_move_on_a_way_that_the_arm_cannot_go(world: World) 
     belief = world.belief
     views = belief.lattice.positions(belief.target_position)
     count = belief.lattice.size
-    rows = [t.expand(count, -1) for t in (world.state.qpos, belief.camera_position, belief.target_position)]
-    moves = moves_along(LookAtMover(), *rows, views[0])
+    now = (world.state.qpos, belief.camera_position, belief.target_position)
+    qpos, position, target = (tensor.expand(count, -1) for tensor in now)
+    moves = moves_along(LookAtMover(), qpos, position, target, views[0])
     blocked = (belief.reachable[0] & moves.isinf() & (way_to(belief, views)[0] > 0.06)).nonzero()[:, 0]
     free = (belief.reachable[0] & moves.isfinite() & (way_to(belief, views)[0] > 0.06)).nonzero()[:, 0]
     for wish, is_taken in ((int(blocked[0]), False), (int(free[0]), True)):
