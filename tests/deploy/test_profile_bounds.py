@@ -43,6 +43,7 @@ def test_every_number_of_these_tables_has_a_bound_around_its_default() -> None:
         assert {f.name for f in numbers} == set(BOUNDS[name])
         for field in numbers:
             bound = BOUNDS[name][field.name]
+            assert isinstance(field.default, int | float)
             assert bound.low <= field.default <= bound.high
             assert math.isfinite(bound.low) and math.isfinite(bound.high)
 
