@@ -339,7 +339,10 @@ def test_a_move_whose_flag_comes_late_is_not_taken_for_one_that_has_ended() -> N
 
 def test_a_contact_ends_the_move_by_the_condition_that_was_set_and_is_a_fault() -> None:
     faults = [Fault(kind="contact", command="102", seconds=0.2)]
-    with met(robot={"faults": faults}, torque_margin=[400.0] * 7) as (robot, arm):
+    with met(robot={"faults": faults}, torque_margin=[160.0, 160.0, 88.0, 88.0, 55.0, 20.0, 20.0]) as (
+        robot,
+        arm,
+    ):
         begin(arm, robot)
         with pytest.raises(
             FaultError, match=r"touched something: the torque at joint 2 changed by 60\.0 N m"

@@ -309,7 +309,7 @@ def test_devices_want_to_be_connected_and_options_to_be_known() -> None:
         make_arm("mock", {"widht": 3}, context)
     with pytest.raises(ProfileError, match=r"twin\.depth_noise must be a finite number"):
         make_arm("mock", {"depth_noise": "much"}, context)
-    with pytest.raises(ProfileError, match=r"arm\.driver must be one of mock, sunrise"):
+    with pytest.raises(ProfileError, match=r"arm\.driver must be one of libiiwa, mock, sunrise"):
         make_arm("mok", {}, context)
 
 

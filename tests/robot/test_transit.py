@@ -134,7 +134,7 @@ def test_the_arm_does_not_meet_itself_on_a_transit(planner: TransitPlanner) -> N
 
 def test_a_refused_move_of_a_row_becomes_a_transit_that_is_counted(row: Any) -> None:
     base = row.unwrapped
-    policy = BeliefFollower(open_policy("nbv"), row)
+    policy = BeliefFollower(open_policy("random_viewpoint"), row)
     met = 0
     for seed in (4, 6):
         obs, info = row.reset(seed=seed)

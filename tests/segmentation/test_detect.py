@@ -1,6 +1,7 @@
 """`maniskill-tomato detect`: the list that it writes, and what it does with files that are no images."""
 
 import json
+import zlib
 from pathlib import Path
 from typing import Any
 
@@ -155,8 +156,12 @@ def test_pictures_that_are_cut_off_or_too_large_are_said_to_be(
     write_image(photos / "good.jpg", (20, 30, 60, 70))
     whole = (photos / "good.jpg").read_bytes()
     (photos / "cut.jpg").write_bytes(whole[: len(whole) // 2])
-    head = b"\x89PNG\r\n\x1a\n\x00\x00\x00\rIHDR" + (40_000).to_bytes(4, "big") * 2
-    (photos / "large.png").write_bytes(head + bytes(50))
+    size = (40_000).to_bytes(4, "big") * 2 + bytes([8, 2, 0, 0, 0])
+    chunks = [
+        len(data).to_bytes(4, "big") + kind + data + zlib.crc32(kind + data).to_bytes(4, "big")
+        for kind, data in ((b"IHDR", size), (b"IDAT", bytes(50)))
+    ]
+    (photos / "large.png").write_bytes(b"\x89PNG\r\n\x1a\n" + b"".join(chunks))
     assert len(run(photos, tmp_path / "list.json")) == 1
     printed = capsys.readouterr().out
     assert "cut.jpg is a JPEG that ends too early" in printed
