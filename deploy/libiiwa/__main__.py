@@ -4,9 +4,7 @@ Example:
     python -m maniskill_tomato.deploy.libiiwa --port 12225 --fault contact@102#3
 """
 
-import logging
 import math
-import sys
 from dataclasses import dataclass
 from typing import Annotated, Final
 
@@ -14,7 +12,7 @@ import tyro
 
 from maniskill_tomato.deploy.libiiwa.loopback import LoopbackRobot
 from maniskill_tomato.deploy.loopback_faults import Fault
-from maniskill_tomato.errors import TomatoError
+from maniskill_tomato.deploy.rehearsal_command import run_rehearsal
 
 TRIES_FOR_S: Final = 3600.0
 """It tries to connect for so long, in [s]."""
@@ -62,14 +60,7 @@ class Rehearse:
 
 def main() -> None:
     """Runs the command; errors made on purpose end with one line and exit status 2."""
-    logging.basicConfig(level=logging.INFO, format="%(message)s", stream=sys.stderr)
-    try:
-        tyro.cli(Rehearse, prog="python -m maniskill_tomato.deploy.libiiwa").run()
-    except (TomatoError, OSError) as error:
-        print(f"error: {error}", file=sys.stderr)
-        raise SystemExit(2) from None
-    except KeyboardInterrupt:
-        raise SystemExit(0) from None
+    run_rehearsal(Rehearse, "libiiwa")
 
 
 if __name__ == "__main__":

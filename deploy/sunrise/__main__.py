@@ -4,17 +4,15 @@ Example:
     python -m maniskill_tomato.deploy.sunrise --port 30001 --fault nak@doPTP#3
 """
 
-import logging
 import math
-import sys
 from dataclasses import dataclass
 from typing import Annotated
 
 import tyro
 
 from maniskill_tomato.deploy.loopback_faults import Fault
+from maniskill_tomato.deploy.rehearsal_command import run_rehearsal
 from maniskill_tomato.deploy.sunrise.loopback import LoopbackController
-from maniskill_tomato.errors import TomatoError
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -54,14 +52,7 @@ class Rehearse:
 
 def main() -> None:
     """Runs the command; errors made on purpose end with one line and exit status 2."""
-    logging.basicConfig(level=logging.INFO, format="%(message)s", stream=sys.stderr)
-    try:
-        tyro.cli(Rehearse, prog="python -m maniskill_tomato.deploy.sunrise").run()
-    except (TomatoError, OSError) as error:
-        print(f"error: {error}", file=sys.stderr)
-        raise SystemExit(2) from None
-    except KeyboardInterrupt:
-        raise SystemExit(0) from None
+    run_rehearsal(Rehearse, "sunrise")
 
 
 if __name__ == "__main__":

@@ -10,15 +10,12 @@ from typing import Final
 import torch
 from torch import Tensor
 
-from maniskill_tomato.policies.moves import move_towards, moves_needed
+from maniskill_tomato.policies.moves import LEAST_MOVE, move_towards, moves_needed
 from maniskill_tomato.robot.inverse_kinematics import Reach
 from maniskill_tomato.robot.look_at_move import MAX_MOVE, LookAtMover
 
 SAME_PLACE: Final = 0.25 * MAX_MOVE
-"""A way ends this near to its goal, in [m]."""
-
-LEAST_MOVE: Final = 0.1 * MAX_MOVE
-"""A move that brings the camera less far counts as refused, in [m]."""
+"""Cameras this near to each other have the same view, in [m]: a way ends this near to its goal."""
 
 MOST_MOVES: Final = 10
 """Of longer ways the rest is taken to be free."""

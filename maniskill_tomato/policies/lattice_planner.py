@@ -6,14 +6,11 @@ from abc import abstractmethod
 import torch
 from torch import Tensor
 
-from maniskill_tomato.policies.followed_ways import moves_along
-from maniskill_tomato.policies.moves import move_towards, moves_needed
+from maniskill_tomato.policies.followed_ways import SAME_PLACE, moves_along
+from maniskill_tomato.policies.moves import LEAST_MOVE, move_towards, moves_needed
 from maniskill_tomato.policies.protocol import Planner
-from maniskill_tomato.robot.look_at_move import MAX_MOVE, LookAtMover
+from maniskill_tomato.robot.look_at_move import LookAtMover
 from maniskill_tomato.sensing.belief import Belief
-
-TAKEN = 0.25 * MAX_MOVE
-"""Cameras this near to each other, in [m], have the same view."""
 
 REFUSED_ANGLE = math.radians(30.0)
 """Moves from one place within this angle of a refused one are taken to be refused too."""
@@ -40,9 +37,10 @@ def distance_to_taken(belief: Belief, positions: Tensor) -> Tensor:
 class Candidates:
     """Which candidate of the lattice each environment goes to, and which ones are not tried any more.
 
-    A view that was taken, or one within `TAKEN` of it, is not taken again: it was not enough. A candidate towards which
-    the camera moved less than a tenth of a move is not tried again in the episode. Nor is, until the camera has moved,
-    any other one that lies within `REFUSED_ANGLE` of that direction: the arm would refuse nearly the same move.
+    A view that was taken, or one within `SAME_PLACE` of it, is not taken again: it was not enough. A candidate
+    towards which the camera moved less than a tenth of a move is not tried again in the episode. Nor is, until the
+    camera has moved, any other one that lies within `REFUSED_ANGLE` of that direction: the arm would refuse nearly
+    the same move.
     """
 
     def __init__(self) -> None:
@@ -69,7 +67,7 @@ class Candidates:
 
     def note_refusals(self, belief: Belief) -> None:
         """Looks whether the last moves were made; to be called before the next choice."""
-        stuck = (belief.camera_position - self._before).norm(dim=-1) < 0.1 * MAX_MOVE
+        stuck = (belief.camera_position - self._before).norm(dim=-1) < LEAST_MOVE
         for i, stayed in enumerate(stuck.tolist()):
             if stayed:
                 self.refused[i, self.chosen[i]] = True
@@ -79,7 +77,7 @@ class Candidates:
 
     def untried(self, belief: Belief, positions: Tensor, allowed: Tensor) -> Tensor:
         """Which candidates are allowed, show another view than those taken and were not refused. Shape (B, K), bool."""
-        untried: Tensor = allowed & ~self.refused & (distance_to_taken(belief, positions) > TAKEN)
+        untried: Tensor = allowed & ~self.refused & (distance_to_taken(belief, positions) > SAME_PLACE)
         return untried
 
     def choosable(self, belief: Belief, positions: Tensor, allowed: Tensor) -> Tensor:

@@ -12,6 +12,9 @@ from maniskill_tomato.sensing.belief import Belief
 NEAR_ENOUGH = 0.01
 """A goal within this distance is reached, in [m]."""
 
+LEAST_MOVE = 0.1 * MAX_MOVE
+"""A move that brings the camera less far counts as refused, in [m]."""
+
 
 def move_towards(position: Tensor, target: Tensor, goal: Tensor) -> Tensor:
     """The action that moves the camera straight to a goal, or a full move of the way there.
@@ -76,7 +79,7 @@ class Goals:
         """Which environments need a new goal. Shape (B,), bool."""
         left = (self._goal - belief.camera_position).norm(dim=-1)
         # A missing goal is NaN, which compares false.
-        ended: Tensor = ~((left > NEAR_ENOUGH) & (left < self._before - 0.1 * MAX_MOVE))
+        ended: Tensor = ~((left > NEAR_ENOUGH) & (left < self._before - LEAST_MOVE))
         return ended
 
     def set(self, goal: Tensor, mask: Tensor) -> None:

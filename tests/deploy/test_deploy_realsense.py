@@ -204,6 +204,8 @@ def test_a_frame_from_before_the_arm_settled_is_not_taken(
         clock.sleep(4.9)
         frame = device.read(after=55.01)
         assert 55.01 < frame.stamp < 55.06 and frame.stamp == pytest.approx(clock.now())
+        with pytest.raises(DeviceTimeoutError, match="the recording's next one comes in 60"):
+            device.read(max_age_s=0.1, after=clock.now() + 60.0)
 
 
 def test_pictures_of_a_recording_are_as_old_as_its_own_stamps_say(
