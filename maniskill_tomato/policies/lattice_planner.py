@@ -146,7 +146,7 @@ class LatticePlanner(Planner):
         if belief.qpos is None:
             return worth
         if self._mover is None:
-            self._mover = LookAtMover(worth.device)
+            self._mover = LookAtMover(worth.device, model=belief.lattice.model)
         straight = moves_needed(way_to(belief, views))
         followed, rest = torch.full_like(worth, -math.inf), worth.clone()
         for _ in range(FOLLOWED):

@@ -3,31 +3,25 @@
 # pyright: reportGeneralTypeIssues=false, reportIndexIssue=false, reportInvalidTypeForm=false
 # pyright: reportOperatorIssue=false, reportReturnType=false
 # The type checkers are silent here: Warp's stubs describe calls from outside, not the inside of a kernel.
-"""The iiwa 14's chain inside Warp kernels: double-precision types, constants, poses."""
+"""An arm's chain inside Warp kernels: double-precision types, its lengths and limits, poses.
+
+The kernels turn joints 1, 3, 5 and 7 about z, 2, 4 and 6 about y, joint 4 backwards (`CHAIN_SIGNS`).
+"""
 
 import math
+from functools import cache
+from typing import Any
 
 import warp as wp
 
-from maniskill_tomato.robot import iiwa14
+from maniskill_tomato.robot.arm_model import CHAIN_SIGNS, ArmModel
 
 wp.set_module_options({"enable_backward": False})
 
 vec7d = wp.types.vector(length=7, dtype=wp.float64)
 mat73d = wp.types.matrix(shape=(7, 3), dtype=wp.float64)
 
-ORIGINS = wp.constant(mat73d(*iiwa14.JOINT_ORIGINS.ravel()))
-AXIS_SIGNS = wp.constant(vec7d(*iiwa14.JOINT_AXES.sum(axis=1)))
-"""Joints 1, 3, 5 and 7 turn about z, joints 2, 4 and 6 about y, joint 4 backwards."""
-EE_HEIGHT = wp.constant(wp.float64(iiwa14.EE_ORIGIN[2]))
-
-LIMITS = wp.constant(vec7d(*iiwa14.JOINT_UPPER))
-"""The joint limits are symmetric about zero, in [rad]."""
-
-SHOULDER_HEIGHT = wp.constant(wp.float64(iiwa14.BASE_TO_SHOULDER))
-UPPER_ARM = wp.constant(wp.float64(iiwa14.SHOULDER_TO_ELBOW))
-FOREARM = wp.constant(wp.float64(iiwa14.ELBOW_TO_WRIST))
-HAND = wp.constant(wp.float64(iiwa14.WRIST_TO_EE))
+AXIS_SIGNS = wp.constant(vec7d(*CHAIN_SIGNS))
 
 ZERO = wp.constant(wp.float64(0.0))
 HALF = wp.constant(wp.float64(0.5))
@@ -35,6 +29,46 @@ ONE = wp.constant(wp.float64(1.0))
 TWO = wp.constant(wp.float64(2.0))
 PI = wp.constant(wp.float64(math.pi))
 TWO_PI = wp.constant(wp.float64(2.0 * math.pi))
+
+
+@wp.struct
+class Chain:
+    origins: mat73d
+    """Origin of each joint in the link before it, all links as the base stands when the joints are 0, in [m]."""
+    axis_signs: vec7d
+    """Which way each joint turns."""
+    ee_height: wp.float64
+    """From joint 7 to the flange, in [m]; likewise below."""
+    limits: vec7d
+    """Joints turn so far to either side, in [rad]."""
+    shoulder_height: wp.float64
+    upper_arm: wp.float64
+    forearm: wp.float64
+    hand: wp.float64
+    smallest_reach: wp.float64
+    """Distance of the wrist from the shoulder with the elbow at its limit, in [m]; for the iiwa 14 0.4104."""
+    largest_reach: wp.float64
+    """Distance of the wrist from the shoulder with the arm stretched, in [m]."""
+    cos_limit_2: wp.float64
+    cos_limit_6: wp.float64
+
+
+@cache
+def chain_of(model: ArmModel) -> Any:
+    """The chain of a model, for launching kernels."""
+    chain: Any = Chain()
+    chain.origins = mat73d(*model.joint_origins.ravel())
+    chain.axis_signs = vec7d(*model.axis_signs)
+    chain.ee_height = model.flange_height
+    chain.limits = vec7d(*model.symmetric_limits)
+    upper, lower = model.shoulder_to_elbow, model.elbow_to_wrist
+    chain.shoulder_height, chain.upper_arm, chain.forearm = model.base_to_shoulder, upper, lower
+    chain.hand = model.wrist_to_flange
+    cos_limit_4 = math.cos(model.symmetric_limits[3])
+    chain.smallest_reach = math.sqrt(upper**2 + lower**2 + 2.0 * upper * lower * cos_limit_4)
+    chain.largest_reach = upper + lower
+    chain.cos_limit_2, chain.cos_limit_6 = (math.cos(model.symmetric_limits[j]) for j in (1, 5))
+    return chain
 
 
 @wp.func
@@ -51,7 +85,7 @@ def column(m: wp.mat33d, k: int) -> wp.vec3d:
 
 
 @wp.kernel
-def link_transforms_kernel(qpos: wp.array2d[wp.float64], transforms: wp.array2d[wp.mat44d]):
+def link_transforms_kernel(qpos: wp.array2d[wp.float64], chain: Chain, transforms: wp.array2d[wp.mat44d]):
     i = wp.tid()
     x = wp.vec3d(ONE, ZERO, ZERO)
     y = wp.vec3d(ZERO, ONE, ZERO)
@@ -59,8 +93,8 @@ def link_transforms_kernel(qpos: wp.array2d[wp.float64], transforms: wp.array2d[
     p = wp.vec3d(ZERO, ZERO, ZERO)
     transforms[i, 0] = homogeneous(x, y, z, p)
     for j in range(7):
-        p += ORIGINS[j, 0] * x + ORIGINS[j, 1] * y + ORIGINS[j, 2] * z
-        angle = AXIS_SIGNS[j] * qpos[i, j]
+        p += chain.origins[j, 0] * x + chain.origins[j, 1] * y + chain.origins[j, 2] * z
+        angle = chain.axis_signs[j] * qpos[i, j]
         c = wp.cos(angle)
         s = wp.sin(angle)
         if j % 2 == 1:
@@ -72,7 +106,7 @@ def link_transforms_kernel(qpos: wp.array2d[wp.float64], transforms: wp.array2d[
             y = c * y - s * x
             x = turned
         transforms[i, j + 1] = homogeneous(x, y, z, p)
-    p += EE_HEIGHT * z
+    p += chain.ee_height * z
     transforms[i, 8] = homogeneous(x, y, z, p)
 
 

@@ -27,23 +27,16 @@ turns q3 and q5, of q6 turns q5 and q7. A configuration is an integer of three b
 (1: q2, 2: q4, 4: q6); a set of configurations is an integer of eight bits.
 """
 
-import math
-
 import warp as wp
 
-from maniskill_tomato.robot import iiwa14
 from maniskill_tomato.robot.ik_chain import (
-    FOREARM,
     HALF,
-    HAND,
-    LIMITS,
     ONE,
     PI,
-    SHOULDER_HEIGHT,
     TWO,
     TWO_PI,
-    UPPER_ARM,
     ZERO,
+    Chain,
     column,
     vec7d,
 )
@@ -58,22 +51,6 @@ Q3_Y, Q3_X = wp.constant(2), wp.constant(3)
 Q5_Y, Q5_X = wp.constant(4), wp.constant(5)
 Q7_Y, Q7_X = wp.constant(6), wp.constant(7)
 Q2_COS, Q6_COS = wp.constant(8), wp.constant(9)
-
-SMALLEST_REACH = wp.constant(
-    wp.float64(
-        math.sqrt(
-            iiwa14.SHOULDER_TO_ELBOW**2
-            + iiwa14.ELBOW_TO_WRIST**2
-            + 2.0 * iiwa14.SHOULDER_TO_ELBOW * iiwa14.ELBOW_TO_WRIST * math.cos(iiwa14.JOINT_UPPER[3])
-        )
-    )
-)
-"""Distance of the wrist from the shoulder with the elbow at its limit, in [m]: 0.4104."""
-LARGEST_REACH = wp.constant(wp.float64(iiwa14.SHOULDER_TO_ELBOW + iiwa14.ELBOW_TO_WRIST))
-"""Distance of the wrist from the shoulder with the arm stretched, in [m]."""
-
-COS_LIMIT_26 = wp.constant(wp.float64(math.cos(iiwa14.JOINT_UPPER[1])))
-"""Cosine of the limit that joints 2 and 6 share."""
 
 FLIPPED_1 = wp.constant(0b10101010)
 """Configurations in which q1 is turned by pi; likewise below."""
@@ -126,11 +103,17 @@ def term(first: wp.vec3d, second: wp.vec3d, constant: wp.vec3d, k: wp.vec3d) -> 
 
 @wp.func
 def elbow_circle(
-    p: wp.vec3d, rotation: wp.mat33d, q_ref: vec7d, tolerance: wp.float64, stretch: wp.float64
+    chain: Chain,
+    p: wp.vec3d,
+    rotation: wp.mat33d,
+    q_ref: vec7d,
+    tolerance: wp.float64,
+    stretch: wp.float64,
 ) -> ElbowCircle:
     """The circle for a pose of the hand, with psi = 0 where the elbow of the reference stands.
 
     Args:
+        chain: The arm's.
         p: Position of the end effector, in [m].
         rotation: Its axes in the base frame as columns.
         q_ref: The reference, in [rad].
@@ -139,26 +122,28 @@ def elbow_circle(
             of the distance grows to its square root in q4, and from there in q2 and q6, which may be at limits.
     """
     circle = ElbowCircle()
+    upper_arm = chain.upper_arm
+    forearm = chain.forearm
     x = column(rotation, 0)
     y = column(rotation, 1)
     z = column(rotation, 2)
-    to_wrist = p - HAND * z - wp.vec3d(ZERO, ZERO, SHOULDER_HEIGHT)
+    to_wrist = p - chain.hand * z - wp.vec3d(ZERO, ZERO, chain.shoulder_height)
     distance = wp.length(to_wrist)
-    if distance > LARGEST_REACH + tolerance or distance < SMALLEST_REACH - tolerance:
+    if distance > chain.largest_reach + tolerance or distance < chain.smallest_reach - tolerance:
         return circle
     circle.reachable = 1
     # The half-angle form keeps its digits near the stretched arm, where acos loses half of them.
     far = wp.float64(0.0)
-    if distance < LARGEST_REACH - stretch:
-        far = LARGEST_REACH * LARGEST_REACH - distance * distance
-    near = distance * distance - (UPPER_ARM - FOREARM) * (UPPER_ARM - FOREARM)
-    q4 = wp.min(TWO * wp.atan2(wp.sqrt(far), wp.sqrt(near)), LIMITS[3])
+    if distance < chain.largest_reach - stretch:
+        far = chain.largest_reach * chain.largest_reach - distance * distance
+    near = distance * distance - (upper_arm - forearm) * (upper_arm - forearm)
+    q4 = wp.min(TWO * wp.atan2(wp.sqrt(far), wp.sqrt(near)), chain.limits[3])
     circle.q4 = q4
-    span = wp.sqrt(UPPER_ARM * UPPER_ARM + FOREARM * FOREARM + TWO * UPPER_ARM * FOREARM * wp.cos(q4))
-    sg = FOREARM * wp.sin(q4) / span
-    cg = (UPPER_ARM + FOREARM * wp.cos(q4)) / span
-    sd = UPPER_ARM * wp.sin(q4) / span
-    cd = (FOREARM + UPPER_ARM * wp.cos(q4)) / span
+    span = wp.sqrt(upper_arm * upper_arm + forearm * forearm + TWO * upper_arm * forearm * wp.cos(q4))
+    sg = forearm * wp.sin(q4) / span
+    cg = (upper_arm + forearm * wp.cos(q4)) / span
+    sd = upper_arm * wp.sin(q4) / span
+    cd = (forearm + upper_arm * wp.cos(q4)) / span
 
     e = to_wrist / distance
     axis = elbow_axis(q_ref)
@@ -223,15 +208,15 @@ def within_limit(y: wp.float64, x: wp.float64, limit: wp.float64, flipped: int, 
 
 
 @wp.func
-def feasible_configurations(values: values_type, tolerance: wp.float64) -> int:
+def feasible_configurations(chain: Chain, values: values_type, tolerance: wp.float64) -> int:
     """The set of configurations that keep all joint limits."""
-    if values[Q2_COS] < COS_LIMIT_26 - tolerance or values[Q6_COS] < COS_LIMIT_26 - tolerance:
+    if values[Q2_COS] < chain.cos_limit_2 - tolerance or values[Q6_COS] < chain.cos_limit_6 - tolerance:
         return 0
     return (
-        within_limit(values[Q1_Y], values[Q1_X], LIMITS[0], FLIPPED_1, tolerance)
-        & within_limit(values[Q3_Y], values[Q3_X], LIMITS[2], FLIPPED_3, tolerance)
-        & within_limit(values[Q5_Y], values[Q5_X], LIMITS[4], FLIPPED_5, tolerance)
-        & within_limit(values[Q7_Y], values[Q7_X], LIMITS[6], FLIPPED_7, tolerance)
+        within_limit(values[Q1_Y], values[Q1_X], chain.limits[0], FLIPPED_1, tolerance)
+        & within_limit(values[Q3_Y], values[Q3_X], chain.limits[2], FLIPPED_3, tolerance)
+        & within_limit(values[Q5_Y], values[Q5_X], chain.limits[4], FLIPPED_5, tolerance)
+        & within_limit(values[Q7_Y], values[Q7_X], chain.limits[6], FLIPPED_7, tolerance)
     )
 
 
@@ -296,6 +281,7 @@ def unlimited_angles(
 
 @wp.func
 def joint_angles(
+    chain: Chain,
     circle: ElbowCircle,
     values: values_type,
     c: wp.float64,
@@ -310,13 +296,13 @@ def joint_angles(
     reference as the limits allow.
     """
     q = unlimited_angles(circle, values, c, s, configuration)
-    shoulder = limited_pair(q[0], q[2], LIMITS[0], LIMITS[2])
+    shoulder = limited_pair(q[0], q[2], chain.limits[0], chain.limits[2])
     if wp.abs(values[Q1_Y]) + wp.abs(values[Q1_X]) <= tolerance:
-        shoulder = shared_sum(wrap(q[0] + q[2]), q_ref[0], q_ref[2], LIMITS[0], LIMITS[2])
-    wrist = limited_pair(q[4], q[6], LIMITS[4], LIMITS[6])
+        shoulder = shared_sum(wrap(q[0] + q[2]), q_ref[0], q_ref[2], chain.limits[0], chain.limits[2])
+    wrist = limited_pair(q[4], q[6], chain.limits[4], chain.limits[6])
     if wp.abs(values[Q5_Y]) + wp.abs(values[Q5_X]) <= tolerance:
-        wrist = shared_sum(wrap(q[4] + q[6]), q_ref[4], q_ref[6], LIMITS[4], LIMITS[6])
+        wrist = shared_sum(wrap(q[4] + q[6]), q_ref[4], q_ref[6], chain.limits[4], chain.limits[6])
     q = vec7d(shoulder[0], q[1], shoulder[1], q[3], wrist[0], q[5], wrist[1])
     for j in range(7):
-        q[j] = wp.clamp(q[j], -LIMITS[j], LIMITS[j])
+        q[j] = wp.clamp(q[j], -chain.limits[j], chain.limits[j])
     return q

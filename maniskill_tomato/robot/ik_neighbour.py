@@ -18,14 +18,10 @@ import warp as wp
 
 from maniskill_tomato.robot.ik_chain import (
     AXIS_SIGNS,
-    FOREARM,
     HALF,
-    HAND,
-    LIMITS,
     ONE,
-    SHOULDER_HEIGHT,
-    UPPER_ARM,
     ZERO,
+    Chain,
     mat73d,
     vec7d,
 )
@@ -66,12 +62,12 @@ class Hand:
 
 
 @wp.func
-def hand_of(q: vec7d) -> Hand:
+def hand_of(chain: Chain, q: vec7d) -> Hand:
     hand = Hand()
     x = wp.vec3d(ONE, ZERO, ZERO)
     y = wp.vec3d(ZERO, ONE, ZERO)
     z = wp.vec3d(ZERO, ZERO, ONE)
-    p = wp.vec3d(ZERO, ZERO, SHOULDER_HEIGHT)
+    p = wp.vec3d(ZERO, ZERO, chain.shoulder_height)
     for j in range(7):
         hand.origins[j] = p
         angle = AXIS_SIGNS[j] * q[j]
@@ -88,10 +84,10 @@ def hand_of(q: vec7d) -> Hand:
             y = c * y - s * x
             x = turned
         if j == 2:
-            p += UPPER_ARM * z
+            p += chain.upper_arm * z
         if j == 4:
-            p += FOREARM * z
-    hand.position = p + HAND * z
+            p += chain.forearm * z
+    hand.position = p + chain.hand * z
     hand.rotation = wp.matrix_from_cols(x, y, z)
     return hand
 
@@ -170,7 +166,13 @@ def curvature(part: wp.vec3d, radius: wp.float64) -> wp.mat33d:
 
 @wp.func
 def descended(
-    q: vec7d, position: wp.vec3d, rotation: wp.mat33d, allowed: Allowed, radius: wp.float64, iterations: int
+    chain: Chain,
+    q: vec7d,
+    position: wp.vec3d,
+    rotation: wp.mat33d,
+    allowed: Allowed,
+    radius: wp.float64,
+    iterations: int,
 ) -> vec7d:
     """Joint angles within their limits that locally minimise how far the two ratios exceed a radius.
 
@@ -178,7 +180,7 @@ def descended(
     """
     scale_p = ONE / allowed.distance
     scale_r = ONE / allowed.angle
-    hand = hand_of(q)
+    hand = hand_of(chain, q)
     error_p = beyond(scale_p * (position - hand.position), radius)
     error_r = beyond(scale_r * rotation_vector(rotation * wp.transpose(hand.rotation)), radius)
     cost = wp.length_sq(error_p) + wp.length_sq(error_r)
@@ -200,7 +202,9 @@ def descended(
                 jacobian_p[j] = root_p * jacobian_p[j]
                 jacobian_r[j] = root_r * jacobian_r[j]
                 free[j] = ONE
-                if (q[j] >= LIMITS[j] and gradient[j] > ZERO) or (q[j] <= -LIMITS[j] and gradient[j] < ZERO):
+                if (q[j] >= chain.limits[j] and gradient[j] > ZERO) or (
+                    q[j] <= -chain.limits[j] and gradient[j] < ZERO
+                ):
                     free[j] = ZERO
                 gradient[j] = free[j] * gradient[j]
             normal = jacobian_p * wp.transpose(jacobian_p) + jacobian_r * wp.transpose(jacobian_r)
@@ -210,8 +214,8 @@ def descended(
                 normal[i, i] = normal[i, i] + damping + (ONE - free[i])
             moved = q + solved(normal, gradient)
             for j in range(7):
-                moved[j] = wp.clamp(moved[j], -LIMITS[j], LIMITS[j])
-            hand_moved = hand_of(moved)
+                moved[j] = wp.clamp(moved[j], -chain.limits[j], chain.limits[j])
+            hand_moved = hand_of(chain, moved)
             moved_p = beyond(scale_p * (position - hand_moved.position), radius)
             moved_r = beyond(scale_r * rotation_vector(rotation * wp.transpose(hand_moved.rotation)), radius)
             cost_moved = wp.length_sq(moved_p) + wp.length_sq(moved_r)
@@ -237,7 +241,7 @@ class Neighbour:
 
 
 @wp.func
-def least_violating(circle: ElbowCircle, configuration: int) -> vec7d:
+def least_violating(chain: Chain, circle: ElbowCircle, configuration: int) -> vec7d:
     """The angles of a configuration on the circle that break the limits least, put on the limits."""
     best = vec7d()
     best_violation = wp.float64(1.0e30)
@@ -248,7 +252,7 @@ def least_violating(circle: ElbowCircle, configuration: int) -> vec7d:
         q = unlimited_angles(circle, evaluate(circle, c, s), c, s, configuration)
         violation = wp.float64(0.0)
         for j in range(7):
-            within = wp.clamp(q[j], -LIMITS[j], LIMITS[j])
+            within = wp.clamp(q[j], -chain.limits[j], chain.limits[j])
             violation += (q[j] - within) * (q[j] - within)
             q[j] = within
         if violation < best_violation:
@@ -259,17 +263,25 @@ def least_violating(circle: ElbowCircle, configuration: int) -> vec7d:
 
 @wp.func
 def nearest_neighbour(
-    circle: ElbowCircle, position: wp.vec3d, rotation: wp.mat33d, allowed: Allowed
+    chain: Chain, circle: ElbowCircle, position: wp.vec3d, rotation: wp.mat33d, allowed: Allowed
 ) -> Neighbour:
     """The nearest pose within the allowed distance and angle, and joint angles that reach it."""
     best = Neighbour()
     best.distance = wp.float64(1.0e30)
     for configuration in range(8):
-        q = descended(least_violating(circle, configuration), position, rotation, allowed, ZERO, ITERATIONS)
-        ratios = pose_ratios(hand_of(q), position, rotation, allowed)
+        q = descended(
+            chain,
+            least_violating(chain, circle, configuration),
+            position,
+            rotation,
+            allowed,
+            ZERO,
+            ITERATIONS,
+        )
+        ratios = pose_ratios(hand_of(chain, q), position, rotation, allowed)
         if wp.max(ratios[0], ratios[1]) > ONE and wp.length(ratios) < HOPELESS:
-            q = descended(q, position, rotation, allowed, JUST_INSIDE, BOX_ITERATIONS)
-            ratios = pose_ratios(hand_of(q), position, rotation, allowed)
+            q = descended(chain, q, position, rotation, allowed, JUST_INSIDE, BOX_ITERATIONS)
+            ratios = pose_ratios(hand_of(chain, q), position, rotation, allowed)
         if wp.max(ratios[0], ratios[1]) <= ONE and wp.length(ratios) < best.distance:
             best.distance = wp.length(ratios)
             best.q = q

@@ -22,9 +22,8 @@ import math
 
 import warp as wp
 
-from maniskill_tomato.robot.ik_chain import HALF, LIMITS, ONE, PI, TWO, TWO_PI, ZERO, vec7d
+from maniskill_tomato.robot.ik_chain import HALF, ONE, PI, TWO, TWO_PI, ZERO, Chain, vec7d
 from maniskill_tomato.robot.ik_circle import (
-    COS_LIMIT_26,
     Q1_X,
     Q1_Y,
     Q2_COS,
@@ -74,31 +73,34 @@ class ArmAngle:
 
 
 @wp.func
-def joint_cost(j: int, q: wp.float64, ref: wp.float64, weights: Weights) -> wp.float64:
-    excess = wp.max(wp.abs(q) - LIMITS[j] + weights.margin, ZERO) / weights.margin
+def joint_cost(chain: Chain, j: int, q: wp.float64, ref: wp.float64, weights: Weights) -> wp.float64:
+    excess = wp.max(wp.abs(q) - chain.limits[j] + weights.margin, ZERO) / weights.margin
     return (q - ref) * (q - ref) + weights.limit_weight * excess * excess
 
 
 @wp.func
-def cost_of(q: vec7d, q_ref: vec7d, weights: Weights) -> wp.float64:
+def cost_of(chain: Chain, q: vec7d, q_ref: vec7d, weights: Weights) -> wp.float64:
     total = wp.float64(0.0)
     for j in range(7):
-        total += joint_cost(j, q[j], q_ref[j], weights)
+        total += joint_cost(chain, j, q[j], q_ref[j], weights)
     return total
 
 
 @wp.func
-def two_costs(j: int, y: wp.float64, x: wp.float64, ref: wp.float64, weights: Weights) -> wp.vec2d:
+def two_costs(
+    chain: Chain, j: int, y: wp.float64, x: wp.float64, ref: wp.float64, weights: Weights
+) -> wp.vec2d:
     """The costs of a joint at atan2(y, x) and turned by pi from there."""
     angle = wp.atan2(y, x)
     turned = angle + PI
     if angle > ZERO:
         turned = angle - PI
-    return wp.vec2d(joint_cost(j, angle, ref, weights), joint_cost(j, turned, ref, weights))
+    return wp.vec2d(joint_cost(chain, j, angle, ref, weights), joint_cost(chain, j, turned, ref, weights))
 
 
 @wp.func
 def cheapest_configuration(
+    chain: Chain,
     circle: ElbowCircle,
     c: wp.float64,
     s: wp.float64,
@@ -116,15 +118,20 @@ def cheapest_configuration(
     singular = r2 <= tolerance or r6 <= tolerance
     q2 = wp.atan2(r2, values[Q2_COS])
     q6 = wp.atan2(r6, values[Q6_COS])
-    cost_1 = two_costs(0, values[Q1_Y], values[Q1_X], q_ref[0], weights)
-    cost_3 = two_costs(2, values[Q3_Y], values[Q3_X], q_ref[2], weights)
-    cost_5 = two_costs(4, values[Q5_Y], values[Q5_X], q_ref[4], weights)
-    cost_7 = two_costs(6, values[Q7_Y], values[Q7_X], q_ref[6], weights)
-    cost_2 = wp.vec2d(joint_cost(1, q2, q_ref[1], weights), joint_cost(1, -q2, q_ref[1], weights))
-    cost_4 = wp.vec2d(
-        joint_cost(3, circle.q4, q_ref[3], weights), joint_cost(3, -circle.q4, q_ref[3], weights)
+    cost_1 = two_costs(chain, 0, values[Q1_Y], values[Q1_X], q_ref[0], weights)
+    cost_3 = two_costs(chain, 2, values[Q3_Y], values[Q3_X], q_ref[2], weights)
+    cost_5 = two_costs(chain, 4, values[Q5_Y], values[Q5_X], q_ref[4], weights)
+    cost_7 = two_costs(chain, 6, values[Q7_Y], values[Q7_X], q_ref[6], weights)
+    cost_2 = wp.vec2d(
+        joint_cost(chain, 1, q2, q_ref[1], weights), joint_cost(chain, 1, -q2, q_ref[1], weights)
     )
-    cost_6 = wp.vec2d(joint_cost(5, q6, q_ref[5], weights), joint_cost(5, -q6, q_ref[5], weights))
+    cost_4 = wp.vec2d(
+        joint_cost(chain, 3, circle.q4, q_ref[3], weights),
+        joint_cost(chain, 3, -circle.q4, q_ref[3], weights),
+    )
+    cost_6 = wp.vec2d(
+        joint_cost(chain, 5, q6, q_ref[5], weights), joint_cost(chain, 5, -q6, q_ref[5], weights)
+    )
     for k in range(8):
         if (feasible >> k) & 1 == 1:
             f2 = k & 1
@@ -133,7 +140,9 @@ def cheapest_configuration(
             cost = cost_1[f2] + cost_2[f2] + cost_3[f2 ^ f4] + cost_4[f4]
             cost += cost_5[f4 ^ f6] + cost_6[f6] + cost_7[f6]
             if singular:
-                cost = cost_of(joint_angles(circle, values, c, s, k, q_ref, tolerance), q_ref, weights)
+                cost = cost_of(
+                    chain, joint_angles(chain, circle, values, c, s, k, q_ref, tolerance), q_ref, weights
+                )
             if cost < best.cost:
                 best.cost = cost
                 best.configuration = k
@@ -181,16 +190,18 @@ def sorted_breaks(breaks: breaks_type) -> breaks_type:
 
 
 @wp.func
-def sampled_choice(circle: ElbowCircle, q_ref: vec7d, weights: Weights, tolerance: wp.float64) -> ArmAngle:
+def sampled_choice(
+    chain: Chain, circle: ElbowCircle, q_ref: vec7d, weights: Weights, tolerance: wp.float64
+) -> ArmAngle:
     """The best feasible point of the grid, with the range around it that belongs to the same interval."""
     terms = circle.terms
     breaks = breaks_type()
-    breaks = add_limit_roots(breaks, 0, terms[Q1_Y], terms[Q1_X], LIMITS[0])
-    breaks = add_limit_roots(breaks, 4, terms[Q3_Y], terms[Q3_X], LIMITS[2])
-    breaks = add_limit_roots(breaks, 8, terms[Q5_Y], terms[Q5_X], LIMITS[4])
-    breaks = add_limit_roots(breaks, 12, terms[Q7_Y], terms[Q7_X], LIMITS[6])
-    breaks = add_roots(breaks, 16, terms[Q2_COS, 0], terms[Q2_COS, 1], terms[Q2_COS, 2] - COS_LIMIT_26)
-    breaks = add_roots(breaks, 18, terms[Q6_COS, 0], terms[Q6_COS, 1], terms[Q6_COS, 2] - COS_LIMIT_26)
+    breaks = add_limit_roots(breaks, 0, terms[Q1_Y], terms[Q1_X], chain.limits[0])
+    breaks = add_limit_roots(breaks, 4, terms[Q3_Y], terms[Q3_X], chain.limits[2])
+    breaks = add_limit_roots(breaks, 8, terms[Q5_Y], terms[Q5_X], chain.limits[4])
+    breaks = add_limit_roots(breaks, 12, terms[Q7_Y], terms[Q7_X], chain.limits[6])
+    breaks = add_roots(breaks, 16, terms[Q2_COS, 0], terms[Q2_COS, 1], terms[Q2_COS, 2] - chain.cos_limit_2)
+    breaks = add_roots(breaks, 18, terms[Q6_COS, 0], terms[Q6_COS, 1], terms[Q6_COS, 2] - chain.cos_limit_6)
     straight_2 = wp.atan2(terms[Q2_COS, 1], terms[Q2_COS, 0])
     straight_6 = wp.atan2(terms[Q6_COS, 1], terms[Q6_COS, 0])
     breaks[20] = straight_2
@@ -202,7 +213,9 @@ def sampled_choice(circle: ElbowCircle, q_ref: vec7d, weights: Weights, toleranc
     best.cost = NO_COST
     width_before = breaks[0] + TWO_PI - breaks[BREAKS - 1]
     middle = HALF * (breaks[0] + TWO_PI + breaks[BREAKS - 1])
-    feasible_before = feasible_configurations(evaluate(circle, wp.cos(middle), wp.sin(middle)), tolerance)
+    feasible_before = feasible_configurations(
+        chain, evaluate(circle, wp.cos(middle), wp.sin(middle)), tolerance
+    )
     for i in range(BREAKS):
         low = breaks[i]
         high = breaks[0] + TWO_PI
@@ -210,18 +223,18 @@ def sampled_choice(circle: ElbowCircle, q_ref: vec7d, weights: Weights, toleranc
             high = breaks[i + 1]
         width = high - low
         middle = HALF * (low + high)
-        feasible = feasible_configurations(evaluate(circle, wp.cos(middle), wp.sin(middle)), tolerance)
+        feasible = feasible_configurations(chain, evaluate(circle, wp.cos(middle), wp.sin(middle)), tolerance)
 
         # The root itself is only of interest if it is feasible alone, singular or where the reference stands.
         if i == 0 or width_before > ZERO:
             c = wp.cos(low)
             s = wp.sin(low)
             values = evaluate(circle, c, s)
-            here = feasible_configurations(values, tolerance)
+            here = feasible_configurations(chain, values, tolerance)
             if low != ZERO and low != straight_2 and low != straight_6:
                 here = here & (255 - (feasible | feasible_before))
             if here != 0:
-                point = cheapest_configuration(circle, c, s, values, here, q_ref, weights, tolerance)
+                point = cheapest_configuration(chain, circle, c, s, values, here, q_ref, weights, tolerance)
                 if point.cost < best.cost:
                     point.psi = low
                     point.low = low
@@ -239,7 +252,9 @@ def sampled_choice(circle: ElbowCircle, q_ref: vec7d, weights: Weights, toleranc
                 c = wp.cos(psi)
                 s = wp.sin(psi)
                 values = evaluate(circle, c, s)
-                point = cheapest_configuration(circle, c, s, values, feasible, q_ref, weights, tolerance)
+                point = cheapest_configuration(
+                    chain, circle, c, s, values, feasible, q_ref, weights, tolerance
+                )
                 if point.cost < best.cost:
                     point.psi = psi
                     point.low = wp.max(psi - step, low)
@@ -252,16 +267,26 @@ def sampled_choice(circle: ElbowCircle, q_ref: vec7d, weights: Weights, toleranc
 
 @wp.func
 def angles_at(
-    circle: ElbowCircle, psi: wp.float64, configuration: int, q_ref: vec7d, tolerance: wp.float64
+    chain: Chain,
+    circle: ElbowCircle,
+    psi: wp.float64,
+    configuration: int,
+    q_ref: vec7d,
+    tolerance: wp.float64,
 ) -> vec7d:
     c = wp.cos(psi)
     s = wp.sin(psi)
-    return joint_angles(circle, evaluate(circle, c, s), c, s, configuration, q_ref, tolerance)
+    return joint_angles(chain, circle, evaluate(circle, c, s), c, s, configuration, q_ref, tolerance)
 
 
 @wp.func
 def refined_psi(
-    circle: ElbowCircle, start: ArmAngle, q_ref: vec7d, weights: Weights, tolerance: wp.float64
+    chain: Chain,
+    circle: ElbowCircle,
+    start: ArmAngle,
+    q_ref: vec7d,
+    weights: Weights,
+    tolerance: wp.float64,
 ) -> wp.float64:
     """The arm angle of least cost near a choice with its configuration: Brent's method, 20 steps at most."""
     a = start.low
@@ -299,7 +324,9 @@ def refined_psi(
             if wp.abs(step) < precision:
                 step = wp.sign(step) * precision
             u = x + step
-            fu = cost_of(angles_at(circle, u, start.configuration, q_ref, tolerance), q_ref, weights)
+            fu = cost_of(
+                chain, angles_at(chain, circle, u, start.configuration, q_ref, tolerance), q_ref, weights
+            )
             if fu <= fx:
                 if u < x:
                     b = x

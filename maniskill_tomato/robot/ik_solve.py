@@ -7,7 +7,7 @@
 
 import warp as wp
 
-from maniskill_tomato.robot.ik_chain import HALF, HAND, ONE, TWO, ZERO, column, homogeneous, vec7d
+from maniskill_tomato.robot.ik_chain import HALF, ONE, TWO, ZERO, Chain, column, homogeneous, vec7d
 from maniskill_tomato.robot.ik_circle import elbow_circle
 from maniskill_tomato.robot.ik_neighbour import Allowed, hand_of, nearest_neighbour, pose_ratios
 from maniskill_tomato.robot.ik_select import NO_COST, Weights, angles_at, refined_psi, sampled_choice
@@ -38,6 +38,7 @@ class ExactSolution:
 
 @wp.func
 def exact_solution(
+    chain: Chain,
     position: wp.vec3d,
     rotation: wp.mat33d,
     q_ref: vec7d,
@@ -47,18 +48,18 @@ def exact_solution(
 ) -> ExactSolution:
     """The cheapest joint angles that reach a pose to within a few tolerances."""
     solution = ExactSolution()
-    circle = elbow_circle(position, rotation, q_ref, tolerance, stretch)
+    circle = elbow_circle(chain, position, rotation, q_ref, tolerance, stretch)
     if circle.reachable == 1:
         if stretch > ZERO and circle.q4 == ZERO:
             solution.stretched = 1
-        choice = sampled_choice(circle, q_ref, weights, tolerance)
+        choice = sampled_choice(chain, circle, q_ref, weights, tolerance)
         if choice.cost < NO_COST:
-            psi = refined_psi(circle, choice, q_ref, weights, tolerance)
-            q = angles_at(circle, psi, choice.configuration, q_ref, tolerance)
+            psi = refined_psi(chain, circle, choice, q_ref, weights, tolerance)
+            q = angles_at(chain, circle, psi, choice.configuration, q_ref, tolerance)
             unit = Allowed()
             unit.distance = ONE
             unit.angle = ONE
-            off = pose_ratios(hand_of(q), position, rotation, unit)
+            off = pose_ratios(hand_of(chain, q), position, rotation, unit)
             if wp.max(off[0], off[1]) < wp.float64(50.0) * tolerance:
                 solution.found = 1
                 solution.q = q
@@ -91,6 +92,7 @@ def is_rigid(m: wp.mat33d, bottom: wp.vec4d) -> wp.bool:
 def solve_kernel(
     poses: wp.array[wp.mat44d],
     references: wp.array[vec7d],
+    chain: Chain,
     weights: Weights,
     tolerance: wp.float64,
     neighbours: wp.int32,
@@ -115,33 +117,35 @@ def solve_kernel(
         outcome = INVALID
     else:
         rotation = nearest_rotation(rotation)
-        solution = exact_solution(position, rotation, q_ref, weights, STRICT, ROUNDING)
+        solution = exact_solution(chain, position, rotation, q_ref, weights, STRICT, ROUNDING)
         if solution.found == 0 and solution.stretched == 1:
-            solution = exact_solution(position, rotation, q_ref, weights, STRICT, ZERO)
+            solution = exact_solution(chain, position, rotation, q_ref, weights, STRICT, ZERO)
         if solution.found == 0:
-            solution = exact_solution(position, rotation, q_ref, weights, tolerance, tolerance)
+            solution = exact_solution(chain, position, rotation, q_ref, weights, tolerance, tolerance)
         if solution.found == 0 and solution.stretched == 1:
-            solution = exact_solution(position, rotation, q_ref, weights, tolerance, ZERO)
+            solution = exact_solution(chain, position, rotation, q_ref, weights, tolerance, ZERO)
         if solution.found == 1:
             outcome = REACHABLE
             q = solution.q
         elif neighbours == 1:
             # The wrist of a neighbour pose is at most this far away.
-            wrist_shift = allowed.distance + TWO * HAND * wp.sin(HALF * allowed.angle)
-            circle = elbow_circle(position, rotation, q_ref, wrist_shift, ZERO)
+            wrist_shift = allowed.distance + TWO * chain.hand * wp.sin(HALF * allowed.angle)
+            circle = elbow_circle(chain, position, rotation, q_ref, wrist_shift, ZERO)
             if circle.reachable == 1:
-                neighbour = nearest_neighbour(circle, position, rotation, allowed)
+                neighbour = nearest_neighbour(chain, circle, position, rotation, allowed)
                 if neighbour.distance < NO_COST:
                     outcome = NEIGHBOUR
                     q = neighbour.q
-                    near = hand_of(q)
+                    near = hand_of(chain, q)
                     # The pose found is reachable, maybe also nearer to the reference.
-                    solution = exact_solution(near.position, near.rotation, q_ref, weights, STRICT, ZERO)
+                    solution = exact_solution(
+                        chain, near.position, near.rotation, q_ref, weights, STRICT, ZERO
+                    )
                     if solution.found == 1:
                         q = solution.q
     qpos[i] = q
     reach[i] = outcome
-    hand = hand_of(q)
+    hand = hand_of(chain, q)
     reached[i] = homogeneous(
         column(hand.rotation, 0), column(hand.rotation, 1), column(hand.rotation, 2), hand.position
     )

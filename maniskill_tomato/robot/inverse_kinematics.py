@@ -1,9 +1,9 @@
-"""Inverse kinematics of the iiwa 14, closed form and batched: reachable, neighbour or unreachable.
+"""Inverse kinematics of an arm, closed form and batched: reachable, neighbour or unreachable.
 
-The arm is spherical-rotational-spherical, so that its joint angles follow from a pose and one arm angle, and
-the arm angles that keep the joint limits form intervals whose ends are known in closed form: a pose is
-reachable or not, and nothing can fail to converge. `ik_circle` has the geometry, `ik_select` the choice among
-the feasible arm angles, `ik_neighbour` the nearest reachable pose.
+The arm (`arm_model`; the iiwa 14 unless another is named) is spherical-rotational-spherical, so that its joint
+angles follow from a pose and one arm angle, and the arm angles that keep the joint limits form intervals whose ends
+are known in closed form: a pose is reachable or not, and nothing can fail to converge. `ik_circle` has the geometry,
+`ik_select` the choice among the feasible arm angles, `ik_neighbour` the nearest reachable pose.
 
 It runs as one Warp kernel in double precision, on the CPU and on CUDA, with torch tensors in and out. Written
 in torch operations it would need some hundreds of them, so that starting them alone would take milliseconds
@@ -20,8 +20,9 @@ import warp as wp
 
 from maniskill_tomato.errors import InvalidInputError, check_ranges
 from maniskill_tomato.robot import ik_neighbour, ik_select, ik_solve
-from maniskill_tomato.robot.iiwa14 import NUM_JOINTS
-from maniskill_tomato.robot.ik_chain import vec7d
+from maniskill_tomato.robot.arm_model import NUM_JOINTS, ArmModel
+from maniskill_tomato.robot.iiwa14 import IIWA14
+from maniskill_tomato.robot.ik_chain import chain_of, vec7d
 from maniskill_tomato.warp_runtime import BatchKernel, start_warp
 
 
@@ -81,18 +82,26 @@ class IkSolution:
 class InverseKinematics:
     """Solves for joint angles on one device; not for use from several threads at once."""
 
-    def __init__(self, device: str | torch.device = "cpu", config: IkConfig | None = None):
+    def __init__(
+        self,
+        device: str | torch.device = "cpu",
+        config: IkConfig | None = None,
+        model: ArmModel = IIWA14,
+    ) -> None:
         """Keeps the options; the kernel is compiled at the first solve on a machine.
 
         Args:
             device: The torch device of the inputs and results.
             config: Options, the defaults if None.
+            model: Of the arm. Joints are kept within its `symmetric_limits`.
         """
         start_warp()
         self.device = torch.device(device)
         if self.device.type == "cuda" and self.device.index is None:
             self.device = torch.device("cuda", torch.cuda.current_device())
         self.config = config or IkConfig()
+        flips = model.flips
+        self._flips = None if flips is None else torch.tensor(flips, device=self.device)
         weights: Any = ik_select.Weights()
         weights.margin = self.config.limit_margin
         weights.limit_weight = self.config.limit_weight
@@ -104,7 +113,7 @@ class InverseKinematics:
             neighbour: BatchKernel(
                 ik_solve.solve_kernel,
                 inputs=[pose, joints],
-                constants=[weights, self.config.tolerance, int(neighbour), allowed],
+                constants=[chain_of(model), weights, self.config.tolerance, int(neighbour), allowed],
                 outputs=[joints, ((), torch.int64, wp.int64), pose],
             )
             for neighbour in (False, True)
@@ -149,7 +158,8 @@ class InverseKinematics:
         if batch == 0:
             reach = torch.zeros(0, dtype=torch.int64, device=self.device)
             return IkSolution(qpos_ref.double(), reach, T_base_ee.double())
-        qpos, reach, reached = self._kernels[neighbour](T_base_ee, qpos_ref)
+        given = qpos_ref if self._flips is None else qpos_ref * self._flips
+        qpos, reach, reached = self._kernels[neighbour](T_base_ee, given)
         if int(reach.min()) < 0:
             row = int(reach.argmin())
             raise InvalidInputError(
@@ -157,4 +167,5 @@ class InverseKinematics:
                 f"qpos_ref finite angles; row {row} has T_base_ee = {T_base_ee[row].tolist()}, "
                 f"qpos_ref = {qpos_ref[row].tolist()}"
             )
-        return IkSolution(qpos.clone(), reach.clone(), reached.clone())
+        solved = qpos.clone() if self._flips is None else qpos * self._flips
+        return IkSolution(solved, reach.clone(), reached.clone())

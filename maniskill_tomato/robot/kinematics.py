@@ -1,24 +1,21 @@
-"""Forward kinematics of the iiwa 14, joint angles to the poses of its links, and viewpoints to poses, batched.
+"""Forward kinematics of an arm, joint angles to the poses of its links, and viewpoints to poses, batched.
 
 One Warp kernel walks the chain in double precision, on the CPU and on CUDA; results come back in the
 type of the input. Not for use from several threads at once, and the results carry no gradient.
 """
 
+from functools import cache
+
 import torch
 import warp as wp
 
 from maniskill_tomato.errors import InvalidInputError
-from maniskill_tomato.robot.iiwa14 import LINK_NAMES, NUM_JOINTS
-from maniskill_tomato.robot.ik_chain import link_transforms_kernel, viewpoint_transform_kernel
+from maniskill_tomato.robot.arm_model import NUM_JOINTS, ArmModel
+from maniskill_tomato.robot.iiwa14 import IIWA14
+from maniskill_tomato.robot.ik_chain import chain_of, link_transforms_kernel, viewpoint_transform_kernel
 from maniskill_tomato.robot.rotations import require_trailing
 from maniskill_tomato.warp_runtime import BatchKernel
 
-_link_transforms = BatchKernel(
-    link_transforms_kernel,
-    inputs=[((NUM_JOINTS,), torch.float64, wp.float64)],
-    constants=[],
-    outputs=[((len(LINK_NAMES), 4, 4), torch.float64, wp.mat44d)],
-)
 _viewpoint_transform = BatchKernel(
     viewpoint_transform_kernel,
     inputs=[((6,), torch.float64, wp.float64)],
@@ -27,29 +24,45 @@ _viewpoint_transform = BatchKernel(
 )
 
 
-def link_transforms(qpos: torch.Tensor) -> torch.Tensor:
+@cache
+def _link_transforms(model: ArmModel) -> BatchKernel:
+    return BatchKernel(
+        link_transforms_kernel,
+        inputs=[((NUM_JOINTS,), torch.float64, wp.float64)],
+        constants=[chain_of(model)],
+        outputs=[((len(model.link_names), 4, 4), torch.float64, wp.mat44d)],
+    )
+
+
+def link_transforms(qpos: torch.Tensor, model: ArmModel = IIWA14) -> torch.Tensor:
     """Poses of all links in the base frame.
 
     Args:
         qpos: Joint angles, in [rad], of any floating-point type. Shape (B, 7).
+        model: Of the arm.
 
     Returns:
-        Transforms T_base_link in the order of `LINK_NAMES`, of the type of `qpos`. Shape (B, 9, 4, 4).
+        Transforms T_base_link in the order of its `link_names`, of the type of `qpos`. Shape (B, 9, 4, 4).
 
     Raises:
         InvalidInputError: `qpos` is not a floating-point tensor of shape (B, 7).
     """
     _require_rows("qpos", qpos, NUM_JOINTS)
     if not len(qpos):
-        return qpos.new_zeros(0, len(LINK_NAMES), 4, 4)
-    return _link_transforms(qpos)[0].to(qpos.dtype, copy=True)
+        return qpos.new_zeros(0, len(model.link_names), 4, 4)
+    poses = _link_transforms(model)(qpos)[0]
+    if model.link_turns is not None:
+        poses = poses.clone()
+        poses[..., :3, :3] = poses[..., :3, :3] @ torch.tensor(model.link_turns, device=poses.device)
+    return poses.to(qpos.dtype, copy=True)
 
 
-def forward_kinematics(qpos: torch.Tensor) -> torch.Tensor:
-    """Pose of the end effector `link_ee` in the base frame.
+def forward_kinematics(qpos: torch.Tensor, model: ArmModel = IIWA14) -> torch.Tensor:
+    """Pose of the end effector, the model's flange link, in the base frame.
 
     Args:
         qpos: Joint angles, in [rad], of any floating-point type. Shape (..., 7).
+        model: Of the arm.
 
     Returns:
         Transforms T_base_ee of the type of `qpos`. Shape (..., 4, 4).
@@ -58,7 +71,7 @@ def forward_kinematics(qpos: torch.Tensor) -> torch.Tensor:
         InvalidInputError: `qpos` is not a floating-point tensor of shape (..., 7).
     """
     require_trailing("qpos", qpos, (NUM_JOINTS,))
-    return link_transforms(qpos.reshape(-1, NUM_JOINTS))[:, -1].reshape(*qpos.shape[:-1], 4, 4)
+    return link_transforms(qpos.reshape(-1, NUM_JOINTS), model)[:, -1].reshape(*qpos.shape[:-1], 4, 4)
 
 
 def viewpoint_transform(viewpoint: torch.Tensor) -> torch.Tensor:

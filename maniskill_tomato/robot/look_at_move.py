@@ -20,8 +20,9 @@ from torch import Tensor
 
 from maniskill_tomato.errors import InvalidInputError
 from maniskill_tomato.robot import look_at_kernels
+from maniskill_tomato.robot.arm_model import NUM_JOINTS, ArmModel
 from maniskill_tomato.robot.d435 import T_flange_camera_color_optical
-from maniskill_tomato.robot.iiwa14 import NUM_JOINTS
+from maniskill_tomato.robot.iiwa14 import IIWA14
 from maniskill_tomato.robot.inverse_kinematics import InverseKinematics, Reach
 from maniskill_tomato.robot.look_at import CAMERA_ROLLS, look_at_pose, look_frame
 from maniskill_tomato.warp_runtime import BatchKernel
@@ -92,14 +93,16 @@ class LookAtMover:
         self,
         device: str | torch.device = "cpu",
         T_flange_camera: npt.NDArray[np.float64] = T_flange_camera_color_optical,
+        model: ArmModel = IIWA14,
     ) -> None:
         """Prepares the inverse kinematics.
 
         Args:
             device: Where tensors live.
             T_flange_camera: The camera's optical frame in `link_ee`, such as a calibration found it. Shape (4, 4).
+            model: Of the arm.
         """
-        self._inverse_kinematics = InverseKinematics(device=device)
+        self._inverse_kinematics = InverseKinematics(device=device, model=model)
         device = self._inverse_kinematics.device
         inverse = np.asarray(np.linalg.inv(T_flange_camera), dtype=np.float64)
         self._T_camera_flange = torch.as_tensor(inverse, dtype=torch.float64, device=device)

@@ -12,9 +12,6 @@ import numpy.typing as npt
 from maniskill_tomato.assets import asset_path
 from maniskill_tomato.robot import d435, iiwa14
 
-URDF_NAME: Final = "iiwa14/iiwa14.urdf"
-"""The URDF, relative to the package's assets."""
-
 VISIBLE_LINK_NAMES: Final = (*iiwa14.LINK_NAMES, d435.CAMERA_LINK_NAME)
 """The links that have a mesh."""
 
@@ -27,7 +24,7 @@ def urdf_path() -> str:
     Raises:
         FileNotFoundError: The package was installed without its assets.
     """
-    return str(asset_path(URDF_NAME))
+    return str(asset_path(iiwa14.URDF_NAME))
 
 
 def _load(name: str) -> LinkMesh:

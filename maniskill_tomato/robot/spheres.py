@@ -11,10 +11,9 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
+from maniskill_tomato.robot.arm_model import ArmModel, Sphere
 from maniskill_tomato.robot.d435 import T_flange_camera_color_optical
-from maniskill_tomato.robot.iiwa14 import LINK_NAMES
-
-Sphere = tuple[float, float, float, float]
+from maniskill_tomato.robot.iiwa14 import IIWA14
 
 CAMERA_SPHERES: Final[tuple[Sphere, ...]] = (
     (0.0, -0.0345, 0.0385, 0.0195),
@@ -24,45 +23,25 @@ CAMERA_SPHERES: Final[tuple[Sphere, ...]] = (
     (0.0, 0.0207, 0.0385, 0.0195),
     (0.0, 0.0345, 0.0385, 0.0195),
 )
-"""The camera's bar in `link_ee` where the drawings have it; the last spheres of `LINK_SPHERES`."""
-
-LINK_SPHERES: Final[dict[str, tuple[Sphere, ...]]] = {
-    "link_5": (
-        (0.0, 0.0, 0.012, 0.0689),
-        (0.0, -0.004, 0.045, 0.0688),
-        (0.0, -0.016, 0.075, 0.0664),
-        (0.0, -0.032, 0.103, 0.0639),
-        (0.0, -0.05, 0.13, 0.0631),
-        (0.0, -0.07, 0.157, 0.0661),
-        (0.0, -0.076, 0.183, 0.07),
-        (0.0, -0.078, 0.205, 0.0701),
-    ),
-    "link_6": (
-        (0.0, 0.022, 0.0, 0.0672),
-        (0.0, 0.05, 0.0, 0.066),
-        (0.0, 0.078, 0.0, 0.0686),
-        (0.0, 0.06, 0.035, 0.076),
-        (0.0, 0.08, 0.03, 0.0759),
-    ),
-    "link_7": ((0.0, 0.0, 0.012, 0.0514),),
-    "link_ee": ((0.0, 0.0, 0.008, 0.038), *CAMERA_SPHERES),
-}
-"""Centre x, y, z in the link's frame and radius of each sphere, in [m]; `link_ee` carries bracket and camera."""
+"""The camera's bar in the flange link where the drawings have it."""
 
 
 def sphere_table(
-    T_flange_camera: npt.NDArray[np.float64] = T_flange_camera_color_optical,
+    T_flange_camera: npt.NDArray[np.float64] = T_flange_camera_color_optical, model: ArmModel = IIWA14
 ) -> tuple[npt.NDArray[np.int32], npt.NDArray[np.float32]]:
-    """All spheres in one table.
+    """All spheres of an arm and its camera in one table, the camera's last.
 
     Args:
-        T_flange_camera: The colour camera's optical frame in `link_ee`, which its bar goes with. Shape (4, 4).
+        T_flange_camera: The colour camera's optical frame in the flange link, which its bar goes with. Shape (4, 4).
+        model: Of the arm.
 
     Returns:
-        Index of each sphere's link in `LINK_NAMES`, shape (S,), and centre and radius in [m], shape (S, 4).
+        Index of each sphere's link in its `link_names`, shape (S,), and centre and radius in [m], shape (S, 4).
     """
-    links = [LINK_NAMES.index(name) for name, spheres in LINK_SPHERES.items() for _ in spheres]
-    rows = np.array([sphere for spheres in LINK_SPHERES.values() for sphere in spheres])
+    every = [(name, sphere) for name, spheres in model.spheres.items() for sphere in spheres]
+    every += [(model.flange_link, sphere) for sphere in CAMERA_SPHERES]
+    links = [model.link_names.index(name) for name, _ in every]
+    rows = np.array([sphere for _, sphere in every])
     if T_flange_camera is not T_flange_camera_color_optical:
         moved = T_flange_camera @ np.linalg.inv(T_flange_camera_color_optical)
         camera = slice(-len(CAMERA_SPHERES), None)

@@ -16,7 +16,8 @@ import torch
 from torch import Tensor
 
 from maniskill_tomato.errors import InvalidInputError
-from maniskill_tomato.robot.iiwa14 import LINK_NAMES, NUM_JOINTS, READY_QPOS
+from maniskill_tomato.robot.arm_model import NUM_JOINTS, ArmModel
+from maniskill_tomato.robot.iiwa14 import IIWA14, LINK_NAMES
 from maniskill_tomato.robot.inverse_kinematics import InverseKinematics, Reach
 from maniskill_tomato.robot.kinematics import forward_kinematics, link_transforms
 from maniskill_tomato.robot.look_at import camera_to_flange, flange_to_camera
@@ -58,6 +59,8 @@ class Transit:
     """Where the optical frame is then. Shape (4, 4), float64."""
     place: int
     """Which of the wanted places it is."""
+    model: ArmModel = IIWA14
+    """Of the arm."""
 
     @property
     def passed(self) -> Tensor:
@@ -67,7 +70,7 @@ class Transit:
     @property
     def camera_path_m(self) -> float:
         """Length of the camera's way, in [m]."""
-        camera = flange_to_camera(forward_kinematics(self.passed))[:, :3, 3]
+        camera = flange_to_camera(forward_kinematics(self.passed, self.model))[:, :3, 3]
         return float(camera.diff(dim=0).norm(dim=-1).sum())
 
     @property
@@ -79,15 +82,17 @@ class Transit:
 class TransitPlanner:
     """Plans for one arm; not for use from several threads at once."""
 
-    def __init__(self, device: str | torch.device = "cpu") -> None:
+    def __init__(self, device: str | torch.device = "cpu", model: ArmModel = IIWA14) -> None:
         """Prepares the inverse kinematics.
 
         Args:
             device: Where tensors live.
+            model: Of the arm.
         """
-        self._mover = LookAtMover(device)
-        self._kinematics = InverseKinematics(device)
-        self._ready = torch.tensor(READY_QPOS, dtype=torch.float64, device=self._kinematics.device)
+        self._model = model
+        self._mover = LookAtMover(device, model=model)
+        self._kinematics = InverseKinematics(device, model=model)
+        self._ready = torch.tensor(model.ready_qpos, dtype=torch.float64, device=self._kinematics.device)
 
     def can_turn(self, qpos: Tensor, target: Tensor) -> bool:
         """Whether the camera can look at a target from where it is without a transit.
@@ -97,7 +102,7 @@ class TransitPlanner:
             target: In the base frame, in [m]. Shape (3,).
         """
         qpos = qpos.double()[None]
-        position = flange_to_camera(forward_kinematics(qpos))[:, :3, 3]
+        position = flange_to_camera(forward_kinematics(qpos, self._model))[:, :3, 3]
         return int(self._mover.look_from(qpos, position, target.double()[None]).reach[0]) == Reach.REACHABLE
 
     def to_first_view(
@@ -146,7 +151,9 @@ class TransitPlanner:
             back = [self._ready, *reversed(self.backed_away(goal))]
             if self._is_clear(back, LOWEST_LINK):
                 waypoints = torch.stack([*out, *back[1:]])
-                return Transit(waypoints=waypoints, T_world_camera=T_world_camera, place=place)
+                return Transit(
+                    waypoints=waypoints, T_world_camera=T_world_camera, place=place, model=self._model
+                )
         return None
 
     def _looks(self, places: Tensor, target: Tensor) -> Iterator[tuple[int, Tensor, Tensor]]:
@@ -174,7 +181,7 @@ class TransitPlanner:
             In [rad]. Each of shape (7,).
         """
         joints = [qpos]
-        pose = flange_to_camera(forward_kinematics(qpos[None]))
+        pose = flange_to_camera(forward_kinematics(qpos[None], self._model))
         way = max(float(pose[0, 0, 3]) - CLEAR_X, 0.0)
         steps = math.ceil(way / RETREAT_STEP)
         for k in range(1, steps + 1):
@@ -191,7 +198,7 @@ class TransitPlanner:
 
     def _is_clear(self, waypoints: list[Tensor], lowest_link: float = -math.inf) -> bool:
         """Whether the flange keeps off the floor and the base behind the way's start, and the elbow off the floor."""
-        links = link_transforms(_passed(torch.stack(waypoints))[1:])
+        links = link_transforms(_passed(torch.stack(waypoints))[1:], self._model)
         high = (links[:, LOW_LINKS, 2, 3] >= lowest_link).all()
         return bool(high) and bool(keeps_clear(links[:, -1]).all())
 

@@ -14,7 +14,8 @@ from torch import Tensor
 
 from maniskill_tomato.errors import InvalidInputError
 from maniskill_tomato.raycast.view_rays import RAYS_PER_SIDE, ViewRays
-from maniskill_tomato.robot.iiwa14 import NUM_JOINTS
+from maniskill_tomato.robot.arm_model import NUM_JOINTS, ArmModel
+from maniskill_tomato.robot.iiwa14 import IIWA14
 from maniskill_tomato.sensing import observation_kernels as kernels
 from maniskill_tomato.sensing.belief import Belief
 from maniskill_tomato.sensing.occlusion_memory import OcclusionMemory
@@ -113,6 +114,7 @@ class ViewpointObserver:
         layout: ObservationLayout | None = None,
         max_moves: int = 20,
         memory: OcclusionMemory | None = None,
+        model: ArmModel = IIWA14,
     ) -> None:
         """Begins with all targets at the origin.
 
@@ -122,6 +124,7 @@ class ViewpointObserver:
             layout: What the vector holds, the defaults if None.
             max_moves: Moves of an episode, which `time` counts by.
             memory: To be filled, a new one with its defaults if None.
+            model: Of the arm that carries the camera.
 
         Raises:
             InvalidInputError: A number is out of range.
@@ -133,7 +136,7 @@ class ViewpointObserver:
         self.layout = layout or ObservationLayout()
         self.max_moves = max_moves
         self.memory = memory or OcclusionMemory(num_envs, self.device)
-        self.lattice = ViewLattice(self.device)
+        self.lattice = ViewLattice(self.device, model)
         self._needs_memory = bool({"map", "near_map"} & set(self.layout.parts))
         self._belief: Belief | None = None
         self._allocate()

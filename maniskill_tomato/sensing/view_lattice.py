@@ -11,7 +11,8 @@ from typing import Final
 import torch
 from torch import Tensor
 
-from maniskill_tomato.robot.iiwa14 import NUM_JOINTS
+from maniskill_tomato.robot.arm_model import NUM_JOINTS, ArmModel
+from maniskill_tomato.robot.iiwa14 import IIWA14
 from maniskill_tomato.robot.inverse_kinematics import InverseKinematics, Reach
 from maniskill_tomato.robot.look_at import CAMERA_ROLLS, camera_to_flange, look_at_pose
 
@@ -41,12 +42,14 @@ class ViewLattice:
     shape: Final = (AZIMUTHS, ELEVATIONS, DISTANCES)
     size: Final = AZIMUTHS * ELEVATIONS * DISTANCES
 
-    def __init__(self, device: str | torch.device = "cpu") -> None:
+    def __init__(self, device: str | torch.device = "cpu", model: ArmModel = IIWA14) -> None:
         """Works out the candidates.
 
         Args:
             device: Where all tensors live.
+            model: Of the arm that shall reach them.
         """
+        self.model = model
         self.device = torch.device(device)
         self.azimuths = (torch.arange(AZIMUTHS, device=self.device) - AZIMUTHS // 2) * ANGLE_STEP
         """In [rad]. Shape (13,)."""
@@ -69,7 +72,7 @@ class ViewLattice:
         """From the target to each candidate, in the world frame, in [m]. Shape (K, 3)."""
         self.neighbours = self._neighbours()
         """One step down and up in azimuth, elevation and distance; -1 where the lattice ends. Shape (K, 6)."""
-        self._inverse_kinematics = InverseKinematics(self.device)
+        self._inverse_kinematics = InverseKinematics(self.device, model=model)
         turns = torch.eye(4, dtype=torch.float64, device=self.device).repeat(len(CAMERA_ROLLS), 1, 1)
         rolls = torch.tensor(CAMERA_ROLLS, dtype=torch.float64, device=self.device)
         turns[:, 0, 0] = turns[:, 1, 1] = torch.cos(rolls)

@@ -12,10 +12,10 @@ from maniskill_tomato.plants.generator import generate_plant
 from maniskill_tomato.plants.organs import Plant
 from maniskill_tomato.raycast.scene import CLEARANCE_RANGE, PATH_SAMPLES, RayScene
 from maniskill_tomato.robot.d435 import color_intrinsics
-from maniskill_tomato.robot.iiwa14 import LINK_NAMES
+from maniskill_tomato.robot.iiwa14 import EE_LINK_NAME, LINK_NAMES, LINK_SPHERES
 from maniskill_tomato.robot.kinematics import link_transforms
 from maniskill_tomato.robot.robot_description import link_meshes
-from maniskill_tomato.robot.spheres import LINK_SPHERES, sphere_table
+from maniskill_tomato.robot.spheres import CAMERA_SPHERES, sphere_table
 from maniskill_tomato.tasks.maniskill.iiwa14_agent import READY_QPOS
 
 PLANT_POSES = ((0.3, 0.1, 0.3), (0.4, -0.1, 0.0))
@@ -107,7 +107,7 @@ def test_spheres_cover_their_link(name: str) -> None:
     mesh = trimesh.Trimesh(vertices, faces, process=False)
     samples = trimesh.sample.sample_surface(mesh, 4000, seed=0)[0]
     points = np.concatenate([vertices, samples])
-    spheres = np.array(LINK_SPHERES[name])
+    spheres = np.array([*LINK_SPHERES[name], *(CAMERA_SPHERES if name == EE_LINK_NAME else ())])
     outside = np.linalg.norm(points[:, None] - spheres[:, :3], axis=2) - spheres[:, 3]
     assert outside.min(axis=1).max() < 5e-4
 
