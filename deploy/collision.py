@@ -5,6 +5,7 @@ from typing import Any, Final
 
 import mujoco
 import numpy as np
+from numpy.typing import NDArray
 
 from maniskill_tomato.deploy.interface import Float64
 from maniskill_tomato.errors import InvalidInputError
@@ -16,6 +17,14 @@ mj: Any = mujoco
 TABLE: Final = "table"
 OBSTACLE: Final = "obstacle"
 
+LOOK_AHEAD: Final = 0.05
+"""Distances are known up to this far beyond the clearances, in [m]; from there a path is followed in long steps."""
+
+PATH_ERROR: Final = 5e-4
+"""Between the postures that are looked at, shapes get nearer than their clearance by less than this, in [m]."""
+
+LEAVING_SLACK: Final = 1e-3
+"""What is too near already gets nearer by less than this before it must be clear, in [m]."""
 
 Corner = tuple[float, float, float]
 
@@ -46,8 +55,10 @@ class Contact:
     """A link, `table`, or `obstacle N`."""
     distance: float
     """Between their collision shapes, in [m], negative if they overlap."""
-    sample: int
-    """At which of the joint positions."""
+    clearance: float
+    """How far they must stay from each other, in [m]."""
+    share: float = 1.0
+    """After so much of the move."""
 
 
 def arm_spec(table_height: float, obstacles: tuple[Box, ...], T_flange_camera: Float64) -> Any:
@@ -104,18 +115,46 @@ class CollisionChecker:
         spec = arm_spec(table_height, obstacles, T_flange_camera)
         self._model: Any = spec.compile()
         self._data: Any = mj.MjData(self._model)
-        self._model.geom_margin[:] = max(table_clearance, self_clearance, obstacle_clearance)
-        self._clearances = {TABLE: table_clearance, OBSTACLE: obstacle_clearance, "link": self_clearance}
-        self._names = [self._name(g) for g in range(self._model.ngeom)]
+        model = self._model
+        model.geom_margin[:] = max(table_clearance, self_clearance, obstacle_clearance) + LOOK_AHEAD
+        names = [self._name(g) for g in range(model.ngeom)]
+        self._names = names
         # Links that are welded together count as one; the base is welded to the world.
-        weld = self._model.body_weldid[self._model.geom_bodyid]
-        parent = self._model.body_weldid[self._model.body_parentid[weld]]
-        self._weld, self._parent_weld = weld, parent
+        weld = model.body_weldid[model.geom_bodyid]
+        parent = model.body_weldid[model.body_parentid[weld]]
+        in_world = model.geom_bodyid == 0
+        is_table = np.array([name.startswith(TABLE) for name in names])
+        is_obstacle = np.array([name.startswith(OBSTACLE) for name in names])
+        # By pair of shapes. Neighbours have at most one joint between them.
+        neighbours = (weld[:, None] == weld) | (parent[:, None] == weld) | (weld[:, None] == parent)
+        self._ignored = neighbours & ~(in_world[:, None] | in_world)
+        self._needed = np.full((model.ngeom, model.ngeom), self_clearance)
+        self._needed[is_obstacle[:, None] | is_obstacle] = obstacle_clearance
+        self._needed[is_table[:, None] | is_table] = table_clearance
+        levers = np.stack([self._levers(g) for g in range(model.ngeom)])
+        # A joint that moves both shapes moves neither about the other.
+        moves = levers > 0.0
+        self._pair_levers = np.where(moves[:, None] ^ moves, levers[:, None] + levers, 0.0)
+        self._pair_levers[self._ignored] = 0.0
 
     def _name(self, geom: int) -> str:
         body = self._model.geom_bodyid[geom]
         model = self._model
         return str(model.geom(geom).name if body == 0 else model.body(body).name)
+
+    def _levers(self, geom: int) -> Float64:
+        """Farthest that a point of a shape is from each joint's axis, in [m]; 0 for joints that do not move it."""
+        model = self._model
+        levers = np.zeros(model.nv)
+        away = float(np.linalg.norm(model.geom_pos[geom]) + model.geom_rbound[geom])
+        body = int(model.geom_bodyid[geom])
+        while body != 0:
+            first = int(model.body_jntadr[body])
+            for joint in range(first, first + int(model.body_jntnum[body])):
+                levers[model.jnt_dofadr[joint]] = away + float(np.linalg.norm(model.jnt_pos[joint]))
+            away += float(np.linalg.norm(model.body_pos[body]))
+            body = int(model.body_parentid[body])
+        return levers
 
     def nearest(self, joint_positions: Float64) -> Contact | None:
         """The first joint position with anything too near, and its deepest contact there.
@@ -126,37 +165,84 @@ class CollisionChecker:
         Returns:
             None if all are clear.
         """
-        model, data = self._model, self._data
-        for k, joints in enumerate(joint_positions):
-            data.qpos[:] = joints
-            mj.mj_kinematics(model, data)
-            mj.mj_collision(model, data)
-            worst: Contact | None = None
-            for contact in data.contact[: data.ncon] if data.ncon else ():
-                a, b = int(contact.geom[0]), int(contact.geom[1])
-                if self._are_neighbours(a, b) or not contact.dist < self._needed(a, b):
-                    continue
-                if worst is None or contact.dist < worst.distance:
-                    names = sorted(
-                        (self._names[a], self._names[b]), key=lambda name: name.startswith((TABLE, OBSTACLE))
-                    )
-                    worst = Contact(first=names[0], second=names[1], distance=float(contact.dist), sample=k)
-            if worst is not None:
-                return worst
+        for joints in joint_positions:
+            near = self._near(joints)
+            contact = self._deepest(near, near.needed, 1.0)
+            if contact is not None:
+                return contact
         return None
 
-    def _are_neighbours(self, a: int, b: int) -> bool:
-        """Whether two shapes belong to links with at most one joint between them."""
-        if 0 in (self._model.geom_bodyid[a], self._model.geom_bodyid[b]):
-            return False
-        return bool(
-            self._weld[a] == self._weld[b]
-            or self._parent_weld[a] == self._weld[b]
-            or self._parent_weld[b] == self._weld[a]
-        )
+    def along(self, start: Float64, goal: Float64, leaving: float) -> Contact | None:
+        """The first contact on the straight line in joint space, and the deepest one there.
 
-    def _needed(self, a: int, b: int) -> float:
-        for kind in (TABLE, OBSTACLE):
-            if self._names[a].startswith(kind) or self._names[b].startswith(kind):
-                return self._clearances[kind]
-        return self._clearances["link"]
+        Between the postures that are looked at, too, nothing gets nearer than its clearance by `PATH_ERROR` or more:
+        the next one is so near that no pair of shapes can have used up its room by then.
+
+        Args:
+            start: Where the arm stands, in [rad]. Shape (7,).
+            goal: Where it would go, in [rad]. Shape (7,).
+            leaving: What is too near at the start must be clear after this much turn of the fastest joint, in [rad],
+                and get no nearer until then.
+
+        Returns:
+            None if the line is clear.
+        """
+        turn = np.abs(goal - start)
+        speeds: Float64 = self._pair_levers @ turn
+        fastest, most = float(speeds.max()), float(turn.max())
+        leaves = min(1.0, leaving / most) if most > 0.0 else 1.0
+        standing = self._near(start)
+        share = 0.0
+        while True:
+            near = self._near(start + share * (goal - start))
+            allowed = near.needed
+            if share < leaves:
+                stood = standing.distance_of(near.pairs)
+                allowed = np.where(stood < allowed, stood - LEAVING_SLACK, allowed)
+            contact = self._deepest(near, allowed, share)
+            if contact is not None or share == 1.0:
+                return contact
+            rooms = near.distances - allowed + 2.0 * PATH_ERROR
+            pair_speeds = speeds[near.pairs[:, 0], near.pairs[:, 1]]
+            moving = pair_speeds > 0.0
+            ahead = min(
+                (rooms[moving] / pair_speeds[moving]).min(initial=np.inf), LOOK_AHEAD / max(fastest, 1e-12)
+            )
+            following = min(share + ahead, 1.0)
+            share = leaves if share < leaves < following else following
+
+    def _near(self, joints: Float64) -> "_Near":
+        """The pairs of shapes that are not far from each other."""
+        data = self._data
+        data.qpos[:] = joints
+        mj.mj_kinematics(self._model, data)
+        mj.mj_collision(self._model, data)
+        pairs = np.array(data.contact.geom, dtype=np.int64).reshape(-1, 2)
+        counts = ~self._ignored[pairs[:, 0], pairs[:, 1]]
+        pairs = pairs[counts]
+        return _Near(pairs, np.array(data.contact.dist)[counts], self._needed[pairs[:, 0], pairs[:, 1]])
+
+    def _deepest(self, near: "_Near", allowed: Float64, share: float) -> Contact | None:
+        deep = near.distances < allowed
+        if not deep.any():
+            return None
+        k = int(np.where(deep, near.distances, np.inf).argmin())
+        a, b = (self._names[g] for g in near.pairs[k])
+        first, second = sorted((a, b), key=lambda name: name.startswith((TABLE, OBSTACLE)))
+        distance, clearance = float(near.distances[k]), float(near.needed[k])
+        return Contact(first=first, second=second, distance=distance, clearance=clearance, share=share)
+
+
+class _Near:
+    """Pairs of shapes near to each other at one posture."""
+
+    def __init__(self, pairs: NDArray[np.int64], distances: Float64, needed: Float64) -> None:
+        self.pairs, self.distances, self.needed = pairs, distances, needed
+
+    def distance_of(self, pairs: NDArray[np.int64]) -> Float64:
+        """Smallest distance of each of other pairs here, infinite where they are far apart. Shape (N,)."""
+        if not len(pairs):
+            return np.zeros(0)
+        same = (pairs[:, None] == self.pairs).all(-1)
+        distances: Float64 = np.where(same, self.distances, np.inf).min(axis=1, initial=np.inf)
+        return distances

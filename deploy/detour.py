@@ -17,8 +17,9 @@ import torch
 
 from maniskill_tomato.deploy.collision import OBSTACLE, TABLE, arm_spec
 from maniskill_tomato.deploy.interface import ArmState, Float64, JointMove
+from maniskill_tomato.deploy.motion_bounds import joint_path
 from maniskill_tomato.deploy.plant_points import sphere_distances
-from maniskill_tomato.deploy.safety import Safety, joint_path
+from maniskill_tomato.deploy.safety import Safety
 from maniskill_tomato.robot.iiwa14 import EE_LINK_NAME, LINK_NAMES
 from maniskill_tomato.robot.kinematics import forward_kinematics
 from maniskill_tomato.robot.spheres import sphere_table

@@ -1,12 +1,15 @@
 """The plant's surface as the camera saw it: a point cloud that the arm keeps clear of."""
 
+import math
 from typing import Final
 
 import numpy as np
 import torch
 
 from maniskill_tomato.deploy.interface import Float64, Frame
+from maniskill_tomato.deploy.motion_bounds import chord_error, lever_arms, motion, straight_line
 from maniskill_tomato.robot.d435 import T_flange_camera_color_optical
+from maniskill_tomato.robot.iiwa14 import EE_ORIGIN, JOINT_ORIGINS
 from maniskill_tomato.robot.kinematics import link_transforms
 from maniskill_tomato.robot.spheres import sphere_table
 
@@ -27,6 +30,12 @@ SELF_MARGIN: Final = 0.03
 
 JUMP_SHARE: Final = 0.03
 """Where neighbouring depths differ by more than this share, the pixels between them are of neither surface."""
+
+COARSE_STEP: Final = 0.1
+"""Spheres move less than this between two postures at which a move is first looked at, in [m]."""
+
+FINE_STEP: Final = 0.01
+"""The same near points, in [m]: what a sphere touches in between is less than 1 mm inside it."""
 
 
 class PlantPoints:
@@ -111,13 +120,59 @@ def sphere_distances(
     Returns:
         In [m], negative inside a sphere. Shape (N, P).
     """
+    radii = sphere_table(T_flange_camera)[1][:, 3].astype(np.float64)
+    return _distances(_centres(joint_positions, T_flange_camera), radii, points_w)
+
+
+def swept_distances(
+    start: Float64, goal: Float64, points_w: Float64, limit: float, T_flange_camera: Float64
+) -> Float64:
+    """The same at the nearest posture of a straight line in joint space.
+
+    Args:
+        start: Where the line begins, in [rad]. Shape (7,).
+        goal: Where it ends, in [rad]. Shape (7,).
+        points_w: In the base frame, in [m]. Shape (P, 3).
+        limit: What is farther away need not be known exactly, in [m].
+        T_flange_camera: The camera's optical frame in `link_ee`. Shape (4, 4).
+
+    Returns:
+        In [m], below the limit wherever the true one is 1 mm below it, and never too small. Shape (P,).
+    """
+    links, spheres = sphere_table(T_flange_camera)
+    radii = spheres[:, 3].astype(np.float64)
+    last = spheres[links == links.max(), :3].astype(np.float64)
+    turn = goal - start
+    levers = lever_arms(JOINT_ORIGINS, float(np.linalg.norm(EE_ORIGIN) + np.linalg.norm(last, axis=1).max()))
+    pieces = max(1, math.ceil(motion(turn, levers) / COARSE_STEP))
+    line = straight_line(start, goal, pieces)
+    centres = _centres(line, T_flange_camera)
+    coarse = _distances(centres, radii, points_w)
+    nearest: Float64 = coarse.min(axis=0)
+    error = chord_error(turn, levers, pieces)
+    chords = np.linalg.norm(np.diff(centres, axis=0), axis=-1).max(axis=-1)
+    within = np.minimum(coarse[:-1], coarse[1:]) < limit + error + chords[:, None] / 2.0
+    for k in np.flatnonzero(within.any(axis=1)):
+        # A smooth curve is at most four errors of its chord faster than the chord.
+        fine = straight_line(line[k], line[k + 1], math.ceil((chords[k] + 4.0 * error) / FINE_STEP) or 1)
+        found = sphere_distances(fine, points_w[within[k]], T_flange_camera).min(axis=0)
+        nearest[within[k]] = np.minimum(nearest[within[k]], found)
+    return nearest
+
+
+def _centres(joint_positions: Float64, T_flange_camera: Float64) -> Float64:
+    """Of the spheres, base frame, in [m]. Shape (N, S, 3)."""
     links, spheres = sphere_table(T_flange_camera)
     T = link_transforms(torch.as_tensor(np.array(joint_positions), dtype=torch.float64)).numpy()
     centres_l = np.concatenate([spheres[:, :3], np.ones((len(spheres), 1))], axis=1).astype(np.float64)
-    centres = np.einsum("nsij,sj->nsi", T[:, links], centres_l)[..., :3]
-    distances = np.full((len(joint_positions), len(points_w)), np.inf)
+    centres: Float64 = np.einsum("nsij,sj->nsi", T[:, links], centres_l)[..., :3]
+    return centres
+
+
+def _distances(centres: Float64, radii: Float64, points_w: Float64) -> Float64:
+    distances = np.full((len(centres), len(points_w)), np.inf)
     squares = (points_w**2).sum(-1)
-    for k, radius in enumerate(spheres[:, 3].astype(np.float64)):
+    for k, radius in enumerate(radii):
         c = centres[:, k]
         square = (c**2).sum(-1)[:, None] + squares[None] - 2.0 * c @ points_w.T
         np.minimum(distances, np.sqrt(np.maximum(square, 0.0)) - radius, out=distances)

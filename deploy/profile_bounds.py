@@ -41,9 +41,7 @@ BOUNDS: Final[dict[str, dict[str, Bound]]] = {
         "obstacle_clearance": Bound(0.01, 0.5, "less", "places of things are measured to a few millimetres"),
         "plant_clearance": Bound(-0.025, 0.3, "less", "the spheres are up to 25 mm larger than the links"),
         "plant_points_needed": Bound(1, 50, "more", "50 points are about 0.01 m^2 of leaf"),
-        "path_step": Bound(
-            0.005, 0.05, "more", "0.05 rad are 40 mm at the hand; finer steps cost seconds a check"
-        ),
+        "leave_within": Bound(0.005, 0.05, "more", "0.05 rad are 40 mm at the hand"),
         "max_state_age": Bound(0.02, 2.0, "more", "at 0.3 of its speed a joint turns 1.4 rad in 2 s"),
         "max_frame_age": Bound(0.1, 60.0, "more", "plants and people move"),
         "arrival_tolerance": Bound(0.001, 0.05, "more", "0.05 rad are 40 mm at the hand"),

@@ -18,15 +18,24 @@ from numpy.typing import NDArray
 
 from maniskill_tomato.deploy.collision import Box, CollisionChecker
 from maniskill_tomato.deploy.interface import ArmState, Float64, JointMove
-from maniskill_tomato.deploy.plant_points import sphere_distances
+from maniskill_tomato.deploy.motion_bounds import (
+    chord_error,
+    chords_meet,
+    lever_arms,
+    pieces_for,
+    straight_line,
+)
+from maniskill_tomato.deploy.plant_points import sphere_distances, swept_distances
 from maniskill_tomato.errors import InvalidInputError, check_positive, check_ranges
 from maniskill_tomato.robot.d435 import T_flange_camera_color_optical
-from maniskill_tomato.robot.iiwa14 import JOINT_LOWER, JOINT_NAMES, JOINT_UPPER
+from maniskill_tomato.robot.iiwa14 import EE_ORIGIN, JOINT_LOWER, JOINT_NAMES, JOINT_ORIGINS, JOINT_UPPER
 from maniskill_tomato.robot.kinematics import forward_kinematics
 
 LARGEST_SPEED_FRACTION: Final = 0.3
 """No profile may allow more than this share of the joints' largest speeds."""
 
+CHORD_ERROR: Final = 1e-4
+"""Flange and camera leave the chords between the postures that are looked at by less than this, in [m]."""
 
 DEGREES = 180.0 / math.pi
 
@@ -84,8 +93,9 @@ class SafetyConfig:
     are 6 to 25 mm larger than the links. None for no check: leaves may be touched."""
     plant_points_needed: int = 6
     """So many points must be nearer than that before a move is refused: a few are noise."""
-    path_step: float = 0.02
-    """Joint positions along a move are looked at this close together, in [rad] of the joint that turns most."""
+    leave_within: float = 0.02
+    """An arm that stands where it must not, or too near to something, is out of that after so much turn of its fastest
+    joint, in [rad]."""
     max_state_age: float = 0.5
     """Oldest arm state that a command may rest on, in [s]."""
     max_frame_age: float = 10.0
@@ -100,7 +110,7 @@ class SafetyConfig:
             "max_speed_fraction",
             "max_joint_step",
             "max_flange_step",
-            "path_step",
+            "leave_within",
             "max_state_age",
             "max_frame_age",
             "arrival_tolerance",
@@ -112,7 +122,7 @@ class SafetyConfig:
             self_clearance=(0.0, 0.5),
             obstacle_clearance=(0.0, 0.5),
             max_speed_fraction=(0.0, LARGEST_SPEED_FRACTION),
-            path_step=(0.0, 0.1),
+            leave_within=(0.0, 0.1),
             plant_points_needed=(1, math.inf),
         )
         if self.speed_fraction > self.max_speed_fraction:
@@ -154,6 +164,8 @@ class Safety:
         """
         self.config = config or SafetyConfig()
         self._T_flange_camera = T_flange_camera
+        beyond = np.linalg.norm(EE_ORIGIN) + np.linalg.norm(T_flange_camera[:3, 3])
+        self._levers = lever_arms(JOINT_ORIGINS, float(beyond))
         c = self.config
         self._collisions = CollisionChecker(
             table_height=c.table_height,
@@ -192,8 +204,8 @@ class Safety:
         )
         if refusal is not None:
             return refusal
-        path = joint_path(state.joint_positions, move.joint_positions, self.config.path_step)
-        return self._way(path) or self._contacts(path) or self._plant(path, points_w)
+        start, goal = state.joint_positions, move.joint_positions
+        return self._way(start, goal) or self._contacts(start, goal) or self._plant(start, goal, points_w)
 
     def stands_in_collision(self, joint_positions: Float64, points_w: Float64 | None) -> bool:
         """Whether a posture touches something wherever the arm comes from.
@@ -269,38 +281,45 @@ class Safety:
             return Refusal(reason="stale_frame", detail=detail)
         return None
 
-    def _way(self, path: Float64) -> Refusal | None:
-        c = self.config
+    def _way(self, start: Float64, goal: Float64) -> Refusal | None:
+        c, turn = self.config, goal - start
+        pieces = pieces_for(turn, self._levers, CHORD_ERROR)
+        path = straight_line(start, goal, pieces)
         T_w_flange = forward_kinematics(torch.as_tensor(path)).numpy()
         flange = T_w_flange[:, :3, 3]
         camera = flange + T_w_flange[:, :3, :3] @ self._T_flange_camera[:3, 3]
+        error = chord_error(turn, self._levers, pieces)
         # The start is where the arm is already: a move may lead out of a wrong place, not into it.
-        outside = ~_within(flange[1:], c.workspace)
+        leaving = int(np.ceil(pieces * min(1.0, c.leave_within / max(float(np.abs(turn).max()), 1e-12))))
+        outside = ~_within(flange, c.workspace, -error)
+        outside[: 1 if _within(flange[0], c.workspace) else leaving] = False
         if outside.any():
             k = int(outside.argmax())
             return Refusal(
                 reason="workspace",
-                detail=f"the flange would be at {_metres(flange[1 + k])}, outside {c.workspace}",
+                detail=f"the flange would be at {_metres(flange[k])}, outside {c.workspace}",
             )
         for name, positions in (("flange", flange), ("camera", camera)):
             for box in c.forbidden:
-                inside = _within(positions[1:], box)
-                if inside.any():
-                    k = int(inside.argmax())
+                meets = chords_meet(positions, np.array(box.low) - error, np.array(box.high) + error)
+                if _within(positions[0], box):
+                    meets[:leaving] = False
+                if meets.any():
+                    k = int(meets.argmax()) + 1
                     return Refusal(
                         reason="forbidden_zone",
-                        detail=f"the {name} would be at {_metres(positions[1 + k])}, inside {box}",
+                        detail=f"the {name} would be at {_metres(positions[k])}, inside {box}",
                     )
         away = np.linalg.norm(flange - flange[0], axis=-1)
-        if (away > c.max_flange_step).any():
+        if (away + error > c.max_flange_step).any():
             return Refusal(
                 reason="flange_step",
                 detail=f"the flange would get {away.max():.3f} m away in one move, allowed are {c.max_flange_step} m",
             )
         return None
 
-    def _contacts(self, path: Float64) -> Refusal | None:
-        contact = self._collisions.nearest(path[1:])
+    def _contacts(self, start: Float64, goal: Float64) -> Refusal | None:
+        contact = self._collisions.along(start, goal, self.config.leave_within)
         if contact is None:
             return None
         reason: Reason = "self_collision"
@@ -308,43 +327,31 @@ class Safety:
             reason = "table"
         elif contact.second.startswith("obstacle"):
             reason = "obstacle"
-        share = (contact.sample + 1) / (len(path) - 1)
         return Refusal(
             reason=reason,
             detail=f"{contact.first} would come within {contact.distance * 1e3:.0f} mm of {contact.second} after "
-            f"{share:.0%} of the move",
+            f"{contact.share:.0%} of the move",
         )
 
-    def _plant(self, path: Float64, points_w: Float64 | None) -> Refusal | None:
+    def _plant(self, start: Float64, goal: Float64, points_w: Float64 | None) -> Refusal | None:
         c = self.config
         if c.plant_clearance is None or points_w is None or len(points_w) < c.plant_points_needed:
             return None
-        distances = sphere_distances(path, points_w, self._T_flange_camera)
+        nearest = swept_distances(start, goal, points_w, c.plant_clearance, self._T_flange_camera)
+        standing = sphere_distances(start[None], points_w, self._T_flange_camera)[0]
         # Where the arm is near a leaf already, it may go away from it but not nearer.
-        near = (distances[1:] < c.plant_clearance) & (distances[1:] < distances[0] - 1e-3)
-        touched = near.any(axis=0)
+        touched = (nearest < c.plant_clearance) & (nearest < standing - 1e-3)
         if int(touched.sum()) < c.plant_points_needed:
             return None
         return Refusal(
             reason="plant",
             detail=f"{int(touched.sum())} points of the plant would be nearer than {c.plant_clearance * 1e3:.0f} mm to "
-            f"the arm's spheres, the nearest {distances[1:][near].min() * 1e3:.0f} mm",
+            f"the arm's spheres, the nearest {nearest[touched].min() * 1e3:.0f} mm",
         )
 
 
-def joint_path(start: Float64, end: Float64, step: float) -> Float64:
-    """Joint positions on the straight line from `start` to `end`, both included, at most `step` [rad] apart.
-
-    Shape (N, 7), N at least 2.
-    """
-    count = max(1, int(np.ceil(np.abs(end - start).max() / step)))
-    shares = np.linspace(0.0, 1.0, count + 1)[:, None]
-    path: Float64 = start + shares * (end - start)
-    return path
-
-
-def _within(positions: Float64, box: Box) -> NDArray[np.bool_]:
-    inside = (positions >= np.array(box.low)) & (positions <= np.array(box.high))
+def _within(positions: Float64, box: Box, margin: float = 0.0) -> NDArray[np.bool_]:
+    inside = (positions >= np.array(box.low) - margin) & (positions <= np.array(box.high) + margin)
     return np.asarray(inside.all(-1))
 
 

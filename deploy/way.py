@@ -16,8 +16,9 @@ import torch
 
 from maniskill_tomato.deploy.detour import DetourPlanner
 from maniskill_tomato.deploy.interface import ArmState, Float64, JointMove
+from maniskill_tomato.deploy.motion_bounds import joint_path
 from maniskill_tomato.deploy.move_choice import Postures
-from maniskill_tomato.deploy.safety import Safety, joint_path
+from maniskill_tomato.deploy.safety import Safety
 from maniskill_tomato.robot.iiwa14 import READY_QPOS
 from maniskill_tomato.robot.kinematics import forward_kinematics
 from maniskill_tomato.robot.transit import TransitPlanner

@@ -67,9 +67,9 @@ def test_what_lies_outside_its_bounds_is_refused_with_key_value_and_range(name: 
 
 def test_the_error_names_the_key_the_value_and_what_is_allowed() -> None:
     with pytest.raises(
-        ProfileError, match=r"lab.toml: safety.path_step must be from 0.005 to 0.05, got 1e-12"
+        ProfileError, match=r"lab.toml: safety.leave_within must be from 0.005 to 0.05, got 1e-12"
     ):
-        table("safety", "path_step = 1e-12")
+        table("safety", "leave_within = 1e-12")
     with pytest.raises(
         ProfileError, match=r"safety.arrival_tolerance must be from 0.001 to 0.05, got 1e\+09"
     ):
