@@ -10,7 +10,7 @@ from maniskill_tomato.deploy.interface import Float64
 from maniskill_tomato.deploy.mock.twin_world import TwinWorld
 from maniskill_tomato.plants.organs import Plant
 from maniskill_tomato.sensing.inspection import InspectedFruit
-from maniskill_tomato.sensing.inspection_judge import NO_FRUIT, JudgedFruit, judge_fruits
+from maniskill_tomato.sensing.inspection_judge import NO_FRUIT, JudgedFruit, judge_fruits, score_lists
 from maniskill_tomato.sensing.view_lattice import ViewLattice
 
 
@@ -27,10 +27,8 @@ def judge(
 
     Returns:
         For each fruit `true_fruit` (its index in `Plant.fruits`, None for no fruit), `true_ripeness`,
-        `true_visible_fraction` in the view that showed most of it and `true_position_error_m`. And for the whole list:
-        `true_recall`, the share of the ripe fruits in reach that are listed as ripe and fully seen and truly were;
-        `true_precision`, the share of the fruits listed as ripe that are ripe and listed once; the median error of
-        their places, in [m].
+        `true_visible_fraction` in the view that showed most of it and `true_position_error_m`. And for the whole list
+        recall of the ripe fruits in reach, precision, and the median error of the places, as `ListScore` has them.
     """
     plant = world.episode.plant
     T_world_plant = world.episode.T_world_plant.double().numpy()
@@ -44,20 +42,14 @@ def judge(
     ripe = [j for j, fruit in enumerate(plant.fruits) if fruit.ripeness == "ripe"]
     reached = ViewLattice().in_reach(torch.as_tensor(centres[ripe], dtype=torch.float32)).tolist()
     in_reach = {j for j, fits in zip(ripe, reached, strict=True) if fits}
-    seen: set[int] = set()
-    right: dict[int, float] = {}
-    for fruit in judged:
-        if fruit.is_ripe and fruit.is_truly_ripe:
-            right.setdefault(fruit.fruit, fruit.position_error_m)
-            if fruit.is_fully_seen and fruit.true_fraction > threshold:
-                seen.add(fruit.fruit)
-    wanted, listed = in_reach | seen, sum(fruit.is_ripe for fruit in fruits)
+    score = score_lists([(judged, in_reach)], threshold)
+    recall, precision, error = score.recall, score.precision, score.position_error_median_m
     totals = {
-        "true_ripe_in_reach": len(wanted),
-        "true_fully_seen": len(seen),
-        "true_recall": round(len(seen) / len(wanted), 4) if wanted else None,
-        "true_precision": round(len(right) / listed, 4) if listed else None,
-        "true_position_error_median_m": round(float(np.median(list(right.values()))), 5) if right else None,
+        "true_ripe_in_reach": score.wanted,
+        "true_fully_seen": score.seen,
+        "true_recall": None if recall is None else round(recall, 4),
+        "true_precision": None if precision is None else round(precision, 4),
+        "true_position_error_median_m": None if error is None else round(error, 5),
     }
     return [_entry(fruit, plant) for fruit in judged], totals
 

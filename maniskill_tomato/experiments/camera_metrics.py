@@ -7,6 +7,7 @@ import numpy as np
 
 from maniskill_tomato.experiments.episode_record import EpisodeRecord
 from maniskill_tomato.experiments.statistics import wilson_interval
+from maniskill_tomato.sensing.inspection_judge import JudgedFruit, score_lists
 
 Cause = Literal["never_detected", "wrong_fruit", "overestimated", "underestimated", "place", "moves_ran_out"]
 """Why an episode through a camera failed.
@@ -59,47 +60,30 @@ def summarise_inspections(
         threshold: V_f above which a fruit is fully visible.
 
     Returns:
-        `recall`: the share of the seeable fruits that are listed as fully seen and truly were. `precision`: the share
-        of the fruits listed as ripe that are ripe and listed once. `full_precision`: the share of the fruits listed as
-        ripe and fully seen that are ripe and were fully seen. Errors of place and radius are medians over the
-        fruits that are right, in [m].
+        `recall` of the seeable fruits, `precision`, `full_precision` and the medians of the errors as `ListScore` has
+        them; moves, the camera's way in [m], and the share of the rows that were finished.
     """
     rows = [e.row for e in episodes if e.row is not None and e.row.listed is not None]
     if not rows or len(rows) < len(episodes):
         return {}
-    wanted = found = claimed = full = 0
-    right: list[dict[str, Any]] = []
-    for episode, row in zip(episodes, rows, strict=True):
-        assert row.listed is not None
-        possible = set(seeable[episode.seed]) | set(row.seen)
-        wanted, found = wanted + len(possible), found + len(row.seen)
-        ripe = [entry for entry in row.listed if entry["is_ripe"]]
-        claimed += sum(entry["is_fully_seen"] for entry in ripe)
-        full += sum(
-            entry["is_fully_seen"] and entry["is_truly_ripe"] and entry["true_fraction"] > threshold
-            for entry in ripe
-        )
-        numbers = [entry["fruit"] for entry in ripe]
-        right += [
-            entry
-            for k, entry in enumerate(ripe)
-            if entry["is_truly_ripe"] and entry["fruit"] not in numbers[:k]
-        ]
-    listed = sum(sum(entry["is_ripe"] for entry in row.listed or ()) for row in rows)
+    score = score_lists(
+        [
+            # What was seen can be seen, even where the samples missed the view.
+            ([JudgedFruit(**entry) for entry in row.listed or ()], set(seeable[episode.seed]) | set(row.seen))
+            for episode, row in zip(episodes, rows, strict=True)
+        ],
+        threshold,
+    )
     return {
-        "recall": found / wanted if wanted else None,
-        "precision": len(right) / listed if listed else None,
-        "full_precision": full / claimed if claimed else None,
-        "position_error_median_m": _median([entry["position_error_m"] for entry in right]),
-        "radius_error_median_m": _median([abs(entry["radius_error_m"]) for entry in right]),
+        "recall": score.recall,
+        "precision": score.precision,
+        "full_precision": score.full_precision,
+        "position_error_median_m": score.position_error_median_m,
+        "radius_error_median_m": score.radius_error_median_m,
         "mean_moves": sum(row.moves for row in rows) / len(rows),
         "mean_camera_path_m": sum(row.path_m for row in rows) / len(rows),
         "finished_share": sum(e.success for e in episodes) / len(episodes),
     }
-
-
-def _median(values: Sequence[float]) -> float | None:
-    return float(np.median(values)) if values else None
 
 
 def failure_cause(episode: EpisodeRecord, threshold: float) -> Cause | None:

@@ -16,6 +16,7 @@ from maniskill_tomato.experiments.episode_record import EpisodeRecord, Float64, 
 from maniskill_tomato.policies.adapters import as_state_policy
 from maniskill_tomato.policies.opening import RANDOM
 from maniskill_tomato.policies.protocol import Policy, RandomPlanner, StatePolicy, reseed
+from maniskill_tomato.sensing.inspection_judge import JudgedFruit, truly_seen
 
 
 class Watcher(Protocol):
@@ -273,7 +274,7 @@ def _row_search(
     seen = {int(fruit) for fruit in view["target_fruit"][:-1][step["target_done"].astype(np.bool_)]}
     if listed is not None:
         # What the robot believes is not what it saw.
-        seen = truly_seen(listed, threshold) & set(targets)
+        seen = truly_seen([JudgedFruit(**entry) for entry in listed], threshold) & set(targets)
     return RowSearch(
         targets=tuple(int(fruit) for fruit in targets),
         seen=tuple(sorted(seen)),
@@ -283,15 +284,6 @@ def _row_search(
         joint_path_rad=float(step["joint_path_length"][-1]),
         listed=listed,
     )
-
-
-def truly_seen(listed: Sequence[dict[str, Any]], threshold: float) -> set[int]:
-    """The ripe fruits that an inspection list calls fully seen and that truly were, as indices in `Plant.fruits`."""
-    return {
-        int(entry["fruit"])
-        for entry in listed
-        if entry["is_fully_seen"] and entry["is_truly_ripe"] and entry["true_fraction"] > threshold
-    }
 
 
 def _stacked(parts: Sequence[dict[str, Float64]]) -> dict[str, Float64]:

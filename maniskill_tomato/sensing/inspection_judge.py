@@ -1,6 +1,6 @@
 """An inspection list beside the truth that a simulator knows."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass
 from typing import Final
 
@@ -71,3 +71,89 @@ def judge_fruits(
             )
         )
     return judged
+
+
+@dataclass(frozen=True, kw_only=True)
+class ListScore:
+    """What inspection lists are worth."""
+
+    wanted: int
+    """Ripe fruits that were to be seen fully."""
+    seen: int
+    """Those of them that are listed as fully seen and truly were."""
+    listed: int
+    """Fruits listed as ripe."""
+    claimed: int
+    """Those of them that are listed as fully seen."""
+    truly_full: int
+    """Those of these that are ripe and were fully seen."""
+    right: tuple[JudgedFruit, ...]
+    """Of the fruits listed as ripe those that are, each once."""
+
+    @property
+    def recall(self) -> float | None:
+        """The share of the fruits to be seen that are listed as fully seen and truly were; None without any."""
+        return self.seen / self.wanted if self.wanted else None
+
+    @property
+    def precision(self) -> float | None:
+        """The share of the fruits listed as ripe that are ripe and listed once; None without any."""
+        return len(self.right) / self.listed if self.listed else None
+
+    @property
+    def full_precision(self) -> float | None:
+        """The share of the fruits listed as ripe and fully seen that are ripe and were; None without any."""
+        return self.truly_full / self.claimed if self.claimed else None
+
+    @property
+    def position_error_median_m(self) -> float | None:
+        """Of the fruits that are right, in [m]; None without any."""
+        return _median([fruit.position_error_m for fruit in self.right])
+
+    @property
+    def radius_error_median_m(self) -> float | None:
+        """Of their absolute errors, in [m]; None without any."""
+        return _median([abs(fruit.radius_error_m) for fruit in self.right])
+
+
+def truly_seen(fruits: Sequence[JudgedFruit], threshold: float) -> set[int]:
+    """The ripe fruits that a list calls fully seen and that truly were, as indices in `Plant.fruits`.
+
+    Args:
+        fruits: The list.
+        threshold: V_f above which a fruit is fully visible.
+    """
+    return {
+        fruit.fruit
+        for fruit in fruits
+        if fruit.is_fully_seen and fruit.is_truly_ripe and fruit.true_fraction > threshold
+    }
+
+
+def score_lists(
+    lists: Sequence[tuple[Sequence[JudgedFruit], Collection[int]]], threshold: float
+) -> ListScore:
+    """Counts what the lists of some rows are worth together.
+
+    Args:
+        lists: Of each row its list, and the ripe fruits that are to be seen fully, as indices in `Plant.fruits`. What
+            was seen beside these does not count.
+        threshold: V_f above which a fruit is fully visible.
+    """
+    ripe = [[fruit for fruit in fruits if fruit.is_ripe] for fruits, _ in lists]
+    claimed = [fruit for own in ripe for fruit in own if fruit.is_fully_seen]
+    right = [
+        fruit for own in ripe for fruit in {f.fruit: f for f in reversed(own) if f.is_truly_ripe}.values()
+    ]
+    return ListScore(
+        wanted=sum(len(set(wanted)) for _, wanted in lists),
+        seen=sum(len(truly_seen(fruits, threshold) & set(wanted)) for fruits, wanted in lists),
+        listed=sum(len(own) for own in ripe),
+        claimed=len(claimed),
+        truly_full=sum(f.is_truly_ripe and f.true_fraction > threshold for f in claimed),
+        right=tuple(right),
+    )
+
+
+def _median(values: Sequence[float]) -> float | None:
+    return float(np.median(values)) if values else None

@@ -11,6 +11,7 @@ import cv2
 import numpy as np
 import pytest
 import torch
+from numpy.typing import NDArray
 
 from maniskill_tomato.cli import main
 from maniskill_tomato.errors import CheckpointError
@@ -18,9 +19,10 @@ from maniskill_tomato.segmentation.datasets.annotations import AnnotatedImage, A
 from maniskill_tomato.segmentation.datasets.coco import write_coco
 from maniskill_tomato.segmentation.detector_configs import MASK_RCNN_PRESETS
 from maniskill_tomato.segmentation.efficientnet_lite import EfficientNetLite0
-from maniskill_tomato.segmentation.instances import box_ellipse, mask_box
+from maniskill_tomato.segmentation.instances import Instances, box_ellipse, mask_box
 from maniskill_tomato.segmentation.mask_rcnn import Lite0Pyramid
 from maniskill_tomato.segmentation.masks import EncodedMask
+from maniskill_tomato.segmentation.metrics.detector_evaluation import coco_table, evaluate_segmenter
 from maniskill_tomato.segmentation.segmenter import make_segmenter
 from maniskill_tomato.segmentation.training.mask_rcnn_training import MaskRcnnTraining, mask_rcnn_target
 from maniskill_tomato.segmentation.training.training_pictures import TrainingImages, training_picture
@@ -254,3 +256,38 @@ def test_judging_finds_a_perfect_segmenter_perfect(
     header, *rows = out[out.index("COCO ") :].splitlines()[:3]
     assert re.split(r"  +", header)[1:5] == ["AP50", "AP50-95", "AP75", "AR"]
     assert [row.split()[:5] for row in rows] == [[kind, *["1.000"] * 4] for kind in ("box", "mask")]
+
+
+def test_of_the_row_in_front_ap_over_all_overlaps_and_ar_are_told_too(tmp_path: Path) -> None:
+    def right_one_behind(image: AnnotatedImage) -> AnnotatedImage:
+        left, right = image.instances
+        return replace(image, instances=(left, replace(right, name="behind_1_0/fruit")))
+
+    class FindsTheLeftHalf:
+        """Of the three images the first two, and of these the left fruit."""
+
+        def __init__(self) -> None:
+            self.images = 0
+
+        def __call__(self, image: NDArray[np.uint8], depth_m: NDArray[np.float32] | None = None) -> Instances:
+            self.images += 1
+            mask = image[..., 0] > 180
+            mask[:, 64:] = False
+            if self.images > 2:
+                return Instances.empty(*mask.shape)
+            return Instances(
+                boxes=np.array([mask_box(mask)], np.float32),
+                scores=np.array([0.9], np.float32),
+                categories=("tomato_ripe",),
+                masks=mask[None],
+            )
+
+    images = [right_one_behind(image) for image in drawn_set(tmp_path / "set")]
+    metrics = evaluate_segmenter(FindsTheLeftHalf(), images, tmp_path / "out")
+    # Two of the three in front, two of all six, each with an overlap of 1.
+    assert metrics["front_fruits"] == 3
+    assert metrics["coco_front_box_AR100"] == metrics["coco_front_mask_AR100"] == pytest.approx(2 / 3)
+    assert metrics["coco_front_box_AP"] == pytest.approx(2 / 3, abs=0.01)
+    assert metrics["coco_box_AR100"] == pytest.approx(1 / 3)
+    kinds = [row.split("  ")[0] for row in coco_table(metrics).splitlines()[1:]]
+    assert kinds == ["box", "mask", "front box", "front mask"]

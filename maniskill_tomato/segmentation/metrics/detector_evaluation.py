@@ -52,7 +52,7 @@ def evaluate_segmenter(
     Returns:
         `box_AP50` and `mask_AP50` (Eq. 4-3 at an overlap of 0.5), precision and recall at `WORKING_SCORE`, COCO's
         metrics as `coco_box_...` and `coco_mask_...` (`COCO_NAMES`), counts, seconds an image; in rendered images with
-        rows behind also `front_box_AP50` and `front_mask_AP50`, of the fruits of the row in front alone.
+        rows behind also `front_box_AP50`, `coco_front_box_...` and so on, of the fruits of the row in front alone.
 
     Raises:
         InvalidInputError: There is no image, or one cannot be read.
@@ -102,6 +102,7 @@ def evaluate_segmenter(
             "front_fruits": score.fruits,
             f"front_{overlap}_AP50": score.precision_recall().average_precision,
         }
+        metrics |= {f"coco_front_{overlap}_{k}": v for k, v in score.coco_metrics().items()}
     metrics["median_seconds"] = float(np.median(seconds))
     plot_precision_recall(curves, out / "precision_recall.png")
     plot_overlaps({k: score.precision_by_overlap() for k, score in scores.items()}, out / "overlaps.png")
@@ -110,14 +111,15 @@ def evaluate_segmenter(
 
 
 def coco_table(metrics: Mapping[str, float]) -> str:
-    """COCO's metrics among those of `evaluate_segmenter` as a table: one line for boxes, one for masks."""
+    """COCO's metrics among those of `evaluate_segmenter` as a table: a line each for boxes, masks, and those of
+    the row in front."""
     columns = {"AP50": "AP50", "AP50-95": "AP", "AP75": "AP75", "AR": "AR100"}
     columns |= {f"{kind} {size}": f"{kind}_{size}" for size in COCO_SIZES for kind in ("AP", "AR")}
-    lines = [f"{'COCO':6}" + "".join(f"{name:>11}" for name in columns)]
-    for overlap in ("box", "mask"):
+    lines = [f"{'COCO':10}" + "".join(f"{name:>11}" for name in columns)]
+    for overlap in ("box", "mask", "front_box", "front_mask"):
         values = [metrics.get(f"coco_{overlap}_{key}") for key in columns.values()]
         if None not in values:
             # COCO gives -1 where there is no fruit of a size.
             shown = ["-" if value is None or value < 0 else f"{value:.3f}" for value in values]
-            lines.append(f"{overlap:6}" + "".join(f"{text:>11}" for text in shown))
+            lines.append(f"{overlap.replace('_', ' '):10}" + "".join(f"{text:>11}" for text in shown))
     return "\n".join(lines)
