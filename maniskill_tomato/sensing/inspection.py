@@ -1,8 +1,9 @@
 """The inspection of a row through a camera: which fruit to look at next, and what was found out of each.
 
 A simulated row and a robot share it. All it knows is the `FruitMap`. The next fruit is the nearest ripe one in reach
-that no view has shown fully yet. When there is none, the robot looks at a part of the row that it has not looked at.
-When there is no such part either, the inspection is over.
+that no view has shown fully yet. When there is none, the robot looks at a part of the row that it has not looked at,
+then where it has detected fruits without knowing how far away they are, and once more at fruits that were given up.
+When nothing of this is left, the inspection is over.
 """
 
 from collections.abc import Sequence
@@ -38,6 +39,15 @@ STALE_AFTER: Final = 6
 
 LITTLE: Final = 0.15
 """One of which no view has shown more than this V_f is given up after half as many views: it may be none."""
+
+GLIMPSED_EXISTENCE: Final = 1.0
+"""A fruit whose distance nobody knows is worth one move when its log-odds of existence are above this."""
+
+GLIMPSED_WITHIN: Final = 0.12
+"""The move is for all such fruits that are nearer to each other than this, in [m]."""
+
+EXPLAINED: Final = 2.0
+"""It is a piece of a known fruit when it is nearer to that than so many standard deviations."""
 
 CHANCES: Final = 2
 """A fruit whose place is sure is looked for again when nothing else is left, until it was given up so often."""
@@ -106,7 +116,7 @@ class InspectedFruit:
     fraction_error: float
     """Its standard error."""
     is_fully_seen: bool
-    """Whether the lower bound of V_f is above the threshold."""
+    """Whether the lower bound of V_f is above the threshold, or V_f of a fruit that was given up."""
     approach_w: Position | None
     """Unit vector from the fruit to the camera that saw it fully: a direction in which nothing hides it. None for a
     fruit that no view showed fully. Shape (3,)."""
@@ -145,6 +155,7 @@ class Inspection:
 
     def __post_init__(self) -> None:
         self._best: dict[int, SeenView] = {}
+        self._glimpsed: list[Position] = []
         self._unscanned = set(range(len(self.scan_places)))
         self._views = self._lost = self._stale = 0
         self._most = 0.0
@@ -205,8 +216,11 @@ class Inspection:
         self._most = max(self._most, shown)
 
     def is_full(self, number: int) -> bool:
-        """Whether a view has shown a track fully."""
-        return number in self._best and self._best[number].sure_fraction > self.threshold
+        """Whether a view has shown a track fully: by the lower bound of V_f, or by V_f if more views did not help."""
+        best = self._best.get(number)
+        if best is None:
+            return False
+        return (best.fraction if number in self.given_up else best.sure_fraction) > self.threshold
 
     def is_done(self, fruits: FruitMap, moves: int, max_moves: int) -> bool:
         """Whether the robot is done with what it looks at: seen, scanned, gone, lost, or not worth another move.
@@ -221,7 +235,8 @@ class Inspection:
         number = self.aim.track
         if number is None:
             # A fruit that turned up is worth more than the rest of the scan.
-            return moves > 0 or not self._is_unscanned(self.aim)
+            is_place = self._is_scan_place(self.aim)
+            return moves > 0 or (is_place is not None and is_place not in self._unscanned)
         track = fruits.tracks.get(number)
         if track is None or not track.is_ripe or self.is_full(number) or self._is_known(track, fruits):
             return True
@@ -253,19 +268,42 @@ class Inspection:
         near = self._open(fruits, lattice)
         sure = [t for t in near if _position_error(t) < SURE_ERROR and t.number not in self.given_up]
         new = [t for t in near if t.number not in self.given_up]
-        if sure or (near and not self._unscanned):
-            track = min(
-                sure or new or near, key=lambda t: float(np.linalg.norm(t.position_w - camera_position))
-            )
-            self.aim = Aim(track.position_w.copy(), track.number)
-            self._lost = self._stale = 0
-            self._most = self._best[track.number].fraction if track.number in self._best else 0.0
+        if sure or (new and not self._unscanned):
+            self._turn_to(_nearest(sure or new, camera_position))
         elif self._unscanned:
             places = [np.array(self.scan_places[k]) for k in sorted(self._unscanned)]
             self.aim = Aim(min(places, key=lambda p: float(np.linalg.norm(p - camera_position))), None)
+        elif glimpsed := self._glimpses(fruits, lattice):
+            track = _nearest(glimpsed, camera_position)
+            self._glimpsed.append(track.position_w.copy())
+            self.aim = Aim(track.position_w.copy(), None)
+        elif near:
+            self._turn_to(_nearest(near, camera_position))
         else:
             self.aim, self.is_over = None, True
         return self.aim
+
+    def _turn_to(self, track: Track) -> None:
+        self.aim = Aim(track.position_w.copy(), track.number)
+        self._lost = self._stale = 0
+        self._most = self._best[track.number].fraction if track.number in self._best else 0.0
+
+    def _glimpses(self, fruits: FruitMap, lattice: ViewLattice) -> list[Track]:
+        """Ripe fruits in reach whose distance nobody knows, and that are no pieces of known ones."""
+        known = [t for t in fruits.tracks.values() if t.is_ripe and _position_error(t) < SURE_ERROR]
+        return _in_reach(
+            [
+                t
+                for t in fruits.tracks.values()
+                if t.is_ripe
+                and t.existence_log_odds > GLIMPSED_EXISTENCE
+                and _position_error(t) >= SURE_ERROR
+                and not self.is_full(t.number)
+                and all(np.linalg.norm(t.position_w - p) >= GLIMPSED_WITHIN for p in self._glimpsed)
+                and not any(_explains(other, t) for other in known)
+            ],
+            lattice,
+        )
 
     def _open(self, fruits: FruitMap, lattice: ViewLattice) -> list[Track]:
         """The fruits in reach that are worth a look."""
@@ -274,9 +312,7 @@ class Inspection:
             for track in fruits.tracks.values()
             if self._is_open(track) and not self._is_known(track, fruits)
         ]
-        positions = np.array([track.position_w for track in tracks]).reshape(-1, 3)
-        fits = lattice.in_reach(torch.as_tensor(positions, dtype=torch.float32, device=lattice.device))
-        return [track for track, fit in zip(tracks, fits.tolist(), strict=True) if fit]
+        return _in_reach(tracks, lattice)
 
     def fruits(self, fruits: FruitMap) -> list[InspectedFruit]:
         """The inspection list: every fruit that there more likely is than not, those that were fully seen
@@ -335,8 +371,9 @@ class Inspection:
             if other is not track and other.is_ripe and other.existence_log_odds > 0.0
         )
 
-    def _is_unscanned(self, aim: Aim) -> bool:
-        return any(np.allclose(self.scan_places[k], aim.position_w) for k in self._unscanned)
+    def _is_scan_place(self, aim: Aim) -> int | None:
+        """The index of a place of the scan."""
+        return next((k for k, p in enumerate(self.scan_places) if np.allclose(p, aim.position_w)), None)
 
     def _shows(self, frame: PosedFrame, place: int) -> bool:
         """Whether a view holds a part of the row, not hidden by what stands far in front of it."""
@@ -367,6 +404,23 @@ class Inspection:
             now = fruits.current(self.aim.track)
             if now is not None:
                 self.aim = Aim(fruits.tracks[now].position_w.copy(), now)
+
+
+def _nearest(tracks: Sequence[Track], position: Position) -> Track:
+    return min(tracks, key=lambda t: float(np.linalg.norm(t.position_w - position)))
+
+
+def _in_reach(tracks: Sequence[Track], lattice: ViewLattice) -> list[Track]:
+    positions = np.array([track.position_w for track in tracks]).reshape(-1, 3)
+    fits = lattice.in_reach(torch.as_tensor(positions, dtype=torch.float32, device=lattice.device))
+    return [track for track, fit in zip(tracks, fits.tolist(), strict=True) if fit]
+
+
+def _explains(known: Track, unsure: Track) -> bool:
+    """Whether a fruit whose distance nobody knows may be a piece of a known one."""
+    away = known.position_w - unsure.position_w
+    spread = unsure.covariance[:3, :3] + known.radius_m**2 / 4.0 * np.eye(3)
+    return bool(away @ np.linalg.solve(spread, away) < EXPLAINED**2)
 
 
 def _are_one(a: Track, b: Track) -> bool:

@@ -46,7 +46,8 @@ class InspectingSenses(CameraSenses):
             InvalidInputError: Always.
         """
         raise InvalidInputError(
-            "a row that is inspected with a camera cannot be taken up from a saved state; reset it with its seed"
+            "a row that is inspected with a camera cannot be taken up from a saved state, which lacks the pictures "
+            "that its map was made of; reset it with its seed"
         )
 
     def look(self, view: ViewPoses) -> tuple[ViewMeasurement, Tensor | None]:

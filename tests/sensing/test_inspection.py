@@ -211,3 +211,42 @@ def test_knowledge_of_a_track_goes_over_to_the_one_that_takes_it_in() -> None:
     row.given_up[7] = 1
     row.take_in(fruits, fruits.update(view_of(None)))
     assert fruits.current(7) == number and row.is_full(number) and row.given_up == {number: 1}
+
+
+def test_a_fruit_of_which_nobody_knows_how_far_away_it_is_is_worth_one_move_at_last(
+    lattice: ViewLattice,
+) -> None:
+    unsure, beside = track(5, (0.8, 0.0, 0.5), deviation=0.05), track(6, (0.8, 0.05, 0.5), deviation=0.05)
+    row, fruits = inspection(), map_of(unsure, beside, track(0, (0.8, 0.5, 0.5)))
+    aim = row.next(fruits, HERE, lattice)
+    assert aim is not None and aim.track == 0, "first those whose place is known"
+    del fruits.tracks[0]
+    aim = row.next(fruits, HERE, lattice)
+    assert aim is not None and aim.track is None
+    np.testing.assert_array_equal(aim.position_w, unsure.position_w)
+    assert not row.is_done(fruits, 0, 20) and row.is_done(fruits, 1, 20)
+    assert row.next(fruits, HERE, lattice) is None, "the same move was for the one beside it"
+
+
+def test_a_piece_of_a_known_fruit_is_not_looked_for(lattice: ViewLattice) -> None:
+    piece, faint = track(5, (0.8, 0.0, 0.5), deviation=0.05), track(6, (0.8, 0.3, 0.5), deviation=0.05)
+    faint.existence_log_odds = 0.5
+    row, fruits = inspection(), map_of(piece, faint, track(0, (0.84, 0.02, 0.5)))
+    row.given_up[0] = 2
+    assert row.next(fruits, HERE, lattice) is None and row.is_over
+
+
+def test_where_more_views_did_not_help_v_f_itself_decides_and_not_its_lower_bound(
+    lattice: ViewLattice,
+) -> None:
+    row, fruits = inspection(), FruitMap()
+    row.take_in(fruits, fruits.update(view_of(np.array([0.75, 0.02, 0.5]), hidden=0.2)))
+    (number,) = fruits.tracks
+    assert not row.is_full(number)
+    assert row.next(fruits, HERE, lattice) is not None
+    row.give_up(number)
+    assert row.is_full(number)
+    (listed,) = row.fruits(fruits)
+    assert listed is not None and listed.is_fully_seen and listed.visible_fraction > 0.8
+    assert listed.visible_fraction - listed.fraction_error < 0.8
+    assert row.next(fruits, HERE, lattice) is None, "so that it is not looked at again"
