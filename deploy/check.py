@@ -58,14 +58,11 @@ def check(profile: Profile, policy: str | None, seed: int, out: Path | None) -> 
     except TomatoError as error:
         yield Finding("drivers", str(error), good=False)
         return
-    calibrated = profile.calibrated or workcell.simulated
     where = np.round(profile.T_flange_camera[:3, 3] * 1e3, 1).tolist()
-    detail = (
-        f"camera at {where} mm from the flange, {'measured' if profile.calibrated else 'from the drawings'}"
-    )
-    if not calibrated:
-        detail += "; run `maniskill-tomato deploy calibrate`, without it only dry runs are allowed"
-    yield Finding("calibration", detail, calibrated)
+    yield Finding("calibration", f"camera at {where} mm from the flange, {_measured(profile)}")
+    told = workcell.calibration_problems()
+    for problem in told:
+        yield Finding("calibration", problem, good=False)
     joints: Any = None
     try:
         with workcell.arm:
@@ -83,6 +80,9 @@ def check(profile: Profile, policy: str | None, seed: int, out: Path | None) -> 
             detail = "can be stopped" if can_stop else "only the smartPAD or the emergency stop halts a move"
             yield Finding("stop", detail)
             with workcell.camera:
+                for problem in workcell.calibration_problems():
+                    if problem not in told:
+                        yield Finding("calibration", problem, good=False)
                 yield from _look(workcell, profile, joints, opened, out)
     except DeployError as error:
         yield Finding("device", str(error), good=False)
@@ -133,6 +133,16 @@ def _look(
         yield Finding("decision", detail)
     except TomatoError as error:
         yield Finding("decision", str(error), good=False)
+
+
+def _measured(profile: Profile) -> str:
+    facts = profile.calibration
+    if facts is None:
+        return "from the drawings"
+    return (
+        f"measured on {facts.taken or 'an unknown date'} with camera {facts.serial or 'without a number'}, "
+        f"{facts.view_count} views, rms_px {facts.rms_px}"
+    )
 
 
 def _facts(facts: dict[str, Any]) -> str:

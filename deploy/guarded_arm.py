@@ -34,16 +34,18 @@ class GuardedArm:
     A stop stays: after `stop`, or once the run's stops say so, no move is sent until `begin_run`.
     """
 
-    def __init__(self, arm: Arm, safety: Safety, clock: Clock, forbidden: str | None = None) -> None:
+    def __init__(
+        self, arm: Arm, safety: Safety, clock: Clock, why_forbidden: Callable[[], str | None] | None = None
+    ) -> None:
         """Wraps an arm.
 
         Args:
             arm: Connected by the caller.
             safety: The envelope.
             clock: The one that the arm's time stamps come from.
-            forbidden: Why no move may be sent at all; None if moves may be sent.
+            why_forbidden: Why no move may be sent at all, None while moves may be sent; asked before every move.
         """
-        self._forbidden = forbidden
+        self._why_forbidden: Callable[[], str | None] = why_forbidden or _nobody
         self._stopped: str | None = None
         self._why_stop: Callable[[], str | None] = _nobody
         self._arm = arm
@@ -128,8 +130,9 @@ class GuardedArm:
             HeartbeatLostError: The same, because the loop stood still.
             FaultError: The driver says it sent something else than was checked.
         """
-        if self._forbidden is not None:
-            raise RefusedError(self._forbidden)
+        forbidden = self._why_forbidden()
+        if forbidden is not None:
+            raise RefusedError(forbidden)
         state = self.read()
         refusal = self.safety.check(move, state, self._clock.now(), frame_stamp, points_w)
         if refusal is not None:
@@ -247,5 +250,5 @@ class GuardedArm:
 
 
 def _nobody() -> None:
-    """Nobody asks for a stop."""
+    """Nobody speaks against a move."""
     return None

@@ -292,5 +292,10 @@ class Camera(Device):
             ProtocolError: It sends something else than announced.
         """
 
+    @property
+    def serial(self) -> str:
+        """The device's number once connected, by which a calibration knows it; empty if it has none."""
+        return ""
+
     def begin_view(self) -> None:
         """Called when the arm has settled at a new viewpoint: filters over time must start anew."""

@@ -15,13 +15,13 @@ from numpy.typing import NDArray
 
 from maniskill_tomato import __version__
 from maniskill_tomato.deploy.clock import Clock
-from maniskill_tomato.deploy.deploy_errors import ProfileError, RecordingError
+from maniskill_tomato.deploy.deploy_errors import RecordingError
 from maniskill_tomato.deploy.goal import Goal
 from maniskill_tomato.deploy.loop import TASK, Loop, default_policy
 from maniskill_tomato.deploy.profile import Profile
 from maniskill_tomato.deploy.recording import McapRecorder
 from maniskill_tomato.deploy.run_records import Mode, Proposal, Recorder, RunResult, Step
-from maniskill_tomato.deploy.workcell import NOT_CALIBRATED, Workcell, make_workcell
+from maniskill_tomato.deploy.workcell import Workcell, make_workcell
 from maniskill_tomato.errors import TomatoError
 from maniskill_tomato.files import write_atomically
 from maniskill_tomato.folder_lock import only_writer
@@ -107,7 +107,7 @@ def prepare(config: RunConfig, clock: Clock | None = None) -> Prepared:
     """Opens the policy and makes the devices of a profile, without touching any.
 
     Raises:
-        DeployError: The profile cannot be used, or the camera is not calibrated and the arm shall move.
+        DeployError: The profile cannot be used, or the camera is not calibrated and a real arm shall move.
         PolicyError: The policy cannot be used.
     """
     profile = config.profile
@@ -115,10 +115,8 @@ def prepare(config: RunConfig, clock: Clock | None = None) -> Prepared:
     policy = open_policy(name, env_id=TASK, seed=config.seed)
     workcell = make_workcell(profile, config.seed, clock)
     mode: Mode = config.mode or ("unattended" if workcell.simulated else "dry_run")
-    if not workcell.simulated and not profile.calibrated:
-        if mode != "dry_run":
-            raise ProfileError(NOT_CALIBRATED)
-        _logger.warning("not calibrated: the camera's place on the flange is that of the drawings")
+    if mode != "dry_run":
+        workcell.check_calibration()
     facts: dict[str, Any] = {
         "profile": profile.name,
         "policy": name,
@@ -158,6 +156,10 @@ def run_goal(
     with ExitStack() as stack:
         arm = stack.enter_context(workcell.arm)
         camera = stack.enter_context(workcell.camera)
+        if prepared.mode != "dry_run":
+            workcell.check_calibration()
+        for problem in workcell.calibration_problems():
+            _logger.warning("only a dry run: %s", problem)
         facts = {**prepared.facts, "devices": {"arm": arm.describe(), "camera": camera.describe()}}
         every = list(recorders)
         if config.record:

@@ -9,6 +9,7 @@ from typing import Any, Final, Literal
 
 import numpy as np
 
+from maniskill_tomato.deploy.calibration.calibration_file import Calibration, read_calibration, rigid_pose
 from maniskill_tomato.deploy.capture import CaptureConfig
 from maniskill_tomato.deploy.deploy_errors import ProfileError
 from maniskill_tomato.deploy.interface import Float64
@@ -20,7 +21,7 @@ from maniskill_tomato.deploy.safety import SafetyConfig
 from maniskill_tomato.deploy.toml_tables import parse_table
 from maniskill_tomato.errors import InvalidInputError, check_ranges
 from maniskill_tomato.robot.d435 import T_flange_camera_color_optical
-from maniskill_tomato.text_files import parse_toml, read_json
+from maniskill_tomato.text_files import parse_toml
 
 TABLES: Final = (
     "description",
@@ -111,9 +112,11 @@ class Profile:
     camera_options: dict[str, Any]
     """Options of the camera's driver."""
     T_flange_camera: Float64
-    """The colour camera's optical frame in `link_ee`. Shape (4, 4)."""
-    calibrated: bool
-    """Whether that was measured, not taken from drawings."""
+    """The colour camera's optical frame in `link_ee`, as calibrated or else by the drawing. Shape (4, 4)."""
+    T_drawing: Float64
+    """The same by the mount's drawing. Shape (4, 4)."""
+    calibration: Calibration | None = None
+    """How `T_flange_camera` was measured; None if it is the drawing's."""
     perception: PerceptionConfig = field(default_factory=PerceptionConfig)
     target: TargetConfig = field(default_factory=TargetConfig)
     safety: SafetyConfig = field(default_factory=SafetyConfig)
@@ -177,7 +180,7 @@ def parse_profile(text: str, path: Path, T_flange_camera: Any = None) -> Profile
     calibration = _table(data, "calibration", where)
     if "file" in calibration and T_flange_camera is not None:
         calibration = {"T_flange_camera": T_flange_camera}
-    mount, calibrated = _calibration(calibration, path)
+    drawing, mount, measured = _calibration(calibration, path)
 
     def read(key: str, kind: Any) -> Any:
         config = parse_table(kind, _table(data, key, where), f"{where}: {key}")
@@ -197,7 +200,8 @@ def parse_profile(text: str, path: Path, T_flange_camera: Any = None) -> Profile
         camera_driver=drivers[1],
         camera_options=twin if drivers[1] == "mock" else camera,
         T_flange_camera=mount,
-        calibrated=calibrated,
+        T_drawing=drawing,
+        calibration=measured,
         perception=read("perception", PerceptionConfig),
         target=read("target", TargetConfig),
         safety=with_base_zone(read("safety", SafetyConfig)),
@@ -214,38 +218,20 @@ def _table(data: Mapping[str, Any], key: str, where: str) -> dict[str, Any]:
     return dict(table)
 
 
-def _calibration(table: Mapping[str, Any], path: Path) -> tuple[Float64, bool]:
-    """T_flange_camera from the table itself, from the file it names, or from the drawings."""
+def _calibration(table: Mapping[str, Any], path: Path) -> tuple[Float64, Float64, Calibration | None]:
+    """T_flange_camera by the drawing, by the file if one is named, and what that says beside."""
     for key in table:
         if key not in ("T_flange_camera", "file"):
             raise ProfileError(
                 f"{path.name}: calibration.{key} is unknown; allowed are T_flange_camera and file"
             )
-    where, values = f"{path.name}: calibration.T_flange_camera", table.get("T_flange_camera")
-    if "file" in table:
-        if values is not None:
-            raise ProfileError(f"{path.name}: calibration must have T_flange_camera or file, not both")
-        file = path.parent / str(table["file"])
-        where = f"T_flange_camera in {file}"
-        try:
-            values = read_json(file)["T_flange_camera"]
-        except (OSError, ValueError, KeyError, TypeError) as error:
-            raise ProfileError(
-                f"{path.name}: calibration.file {file} cannot be used ({error}); `maniskill-tomato deploy calibrate` "
-                "writes it"
-            ) from error
-    if values is None:
-        return T_flange_camera_color_optical, False
+    drawing = T_flange_camera_color_optical
+    if "T_flange_camera" in table:
+        drawing = rigid_pose(table["T_flange_camera"], f"{path.name}: calibration.T_flange_camera")
+    if "file" not in table:
+        return drawing, drawing, None
     try:
-        T = np.array(values, dtype=np.float64)
-    except (TypeError, ValueError, OverflowError):
-        T = np.zeros(0)
-    if T.shape != (4, 4) or not np.isfinite(T).all() or not np.allclose(T[3], [0, 0, 0, 1]):
-        raise ProfileError(f"{where} must be a 4 x 4 transform, got {values!r}")
-    R = T[:3, :3]
-    if not np.allclose(R @ R.T, np.eye(3), atol=1e-3) or np.linalg.det(R) < 0.0:
-        raise ProfileError(f"{where} has no rotation in its upper left 3 x 3 entries")
-    if np.linalg.norm(T[:3, 3]) > 0.5:
-        raise ProfileError(f"{where} puts the camera more than 0.5 m from the flange; metres are expected")
-    T.setflags(write=False)
-    return T, True
+        mount, measured = read_calibration(path.parent / str(table["file"]))
+    except ProfileError as error:
+        raise ProfileError(f"{path.name}: calibration.file: {error}") from error
+    return drawing, mount, measured

@@ -1,12 +1,19 @@
 """The devices of a profile, and what connects them to the policy."""
 
 import logging
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from maniskill_tomato.deploy.calibration.calibration_limits import (
+    age_warning,
+    camera_problems,
+    file_problems,
+    pose_problems,
+)
 from maniskill_tomato.deploy.clock import CheckedClock, Clock, MonotonicClock, SimulatedClock
 from maniskill_tomato.deploy.deploy_errors import ProfileError, RecordingError
 from maniskill_tomato.deploy.drivers import DriverContext, make_arm, make_camera
@@ -33,6 +40,8 @@ class Workcell:
     camera: Camera
     guarded_arm: GuardedArm
     perception: Perception
+    calibrates: bool = False
+    """Whether the run is there to calibrate the camera."""
 
     def __post_init__(self) -> None:
         if self.camera.simulated and not self.arm.simulated:
@@ -45,6 +54,21 @@ class Workcell:
     def simulated(self) -> bool:
         """Whether nothing real moves."""
         return self.arm.simulated
+
+    def calibration_problems(self) -> list[str]:
+        """What speaks against moving a real arm by the profile's calibration, a sentence each; more once the camera is
+        connected. Nothing speaks against it where nothing real moves."""
+        return [] if self.simulated else _problems(self.profile, self.camera, self.calibrates)
+
+    def check_calibration(self) -> None:
+        """Accepts a calibration by which the arm may move.
+
+        Raises:
+            ProfileError: Something speaks against it; all of it is told.
+        """
+        problems = self.calibration_problems()
+        if problems:
+            raise ProfileError(in_words(problems))
 
     def target_position(self) -> Float64 | None:
         """Where the profile says that the target is, world frame, in [m]; None to look for it. Shape (3,).
@@ -98,7 +122,28 @@ NOT_CALIBRATED = (
     "the camera's place on the flange is not calibrated: run `maniskill-tomato deploy calibrate` and name its file in "
     "calibration.file; without it only a dry run is allowed"
 )
-"""Why a real arm with a camera does not move."""
+"""Why a real arm with a camera does not move by a drawing."""
+
+NOT_CONNECTED = "the camera is not connected, and nobody knows whether it is the calibrated one; connect it first"
+"""Why a real arm does not move without its camera."""
+
+
+def _problems(profile: Profile, camera: Camera, calibrates: bool) -> list[str]:
+    if calibrates:
+        return [*pose_problems(profile.T_flange_camera, profile.T_drawing)]
+    if profile.calibration is None:
+        return [NOT_CALIBRATED]
+    problems = [*file_problems(profile.T_flange_camera, profile.calibration, profile.T_drawing)]
+    if camera.is_connected:
+        problems += camera_problems(profile.calibration, camera.serial, camera.intrinsics)
+    return problems
+
+
+def in_words(problems: Sequence[str]) -> str:
+    """What speaks against a calibration, as one message."""
+    return (
+        problems[0] if problems == [NOT_CALIBRATED] else f"the calibration is refused: {'; '.join(problems)}"
+    )
 
 
 def make_workcell(
@@ -110,8 +155,8 @@ def make_workcell(
         profile: Which.
         seed: Of simulated devices: the twin's episode.
         clock: Another clock than the machine's, or than a simulated one where both devices are simulated.
-        calibrates: Whether the run is there to calibrate the camera. Without a calibration every other one is refused
-            each move of a real arm.
+        calibrates: Whether the run is there to calibrate the camera: it may move a real arm by the drawing. Every
+            other one needs a calibration of the camera that is connected.
 
     Raises:
         ProfileError: A driver or an option is wrong, or a simulated camera would guide a real arm.
@@ -128,13 +173,26 @@ def make_workcell(
     camera = make_camera(profile.camera_driver, profile.camera_options, context)
     for line in (*profile.relaxations(), *arm.relaxations()):
         _logger.warning("the profile relaxes %s", line)
-    is_allowed = arm.simulated or profile.calibrated or calibrates
+    if not arm.simulated and profile.calibration is not None:
+        warning = age_warning(profile.calibration)
+        if warning is not None:
+            _logger.warning("%s", warning)
+
+    def why_forbidden() -> str | None:
+        if arm.simulated:
+            return None
+        problems = _problems(profile, camera, calibrates)
+        if not problems and not camera.is_connected:
+            return NOT_CONNECTED
+        return in_words(problems) if problems else None
+
     safety = Safety(profile.safety, profile.T_flange_camera)
     return Workcell(
         profile=profile,
         clock=checked,
         arm=arm,
         camera=camera,
-        guarded_arm=GuardedArm(arm, safety, checked, None if is_allowed else NOT_CALIBRATED),
+        guarded_arm=GuardedArm(arm, safety, checked, why_forbidden),
         perception=open_perception(profile.perception.sight, profile.perception.segmenter),
+        calibrates=calibrates,
     )

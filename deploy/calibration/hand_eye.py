@@ -8,10 +8,8 @@ pixels and not in poses. OpenCV has closed forms of this too, but its Python mod
 them from 5.0.0 on.
 """
 
-import json
 from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any, Final
 
 import cv2
@@ -24,7 +22,6 @@ from maniskill_tomato.deploy.calibration.board import CharucoBoard
 from maniskill_tomato.deploy.deploy_errors import DeployError
 from maniskill_tomato.deploy.interface import Float64
 from maniskill_tomato.deploy.rigid import difference, transform
-from maniskill_tomato.files import write_atomically
 from maniskill_tomato.robot.d435 import CameraIntrinsics
 
 MIN_VIEWS: Final = 5
@@ -61,23 +58,19 @@ class BoardView:
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class HandEyeResult:
-    """The camera on the flange, and how well the views agree about it."""
+class Agreement:
+    """How well views of one fixed board agree about where the camera sits on the flange."""
 
     T_flange_camera: Float64
     """The colour camera's optical frame in `link_ee`. Shape (4, 4)."""
     T_base_board: Float64
-    """The board in the base frame. Shape (4, 4)."""
+    """The board in the base frame, where all views together put it. Shape (4, 4)."""
     views: tuple[BoardView, ...]
     """Those that were used."""
     left_out: tuple[str, ...]
     """Names of those that were not, with the reason."""
     residuals_px: tuple[Float64, ...]
     """Seen less predicted corner of each used view, in [px]. Shapes (M, 2)."""
-    position_std: float
-    """Standard deviation of the camera's position on the flange, from the residuals, in [m]."""
-    rotation_std: float
-    """The same of its orientation, in [rad]."""
     board_offsets: Float64
     """Position of the board by each view alone less that by all, base frame, in [m]. Shape (V, 3)."""
     board_turns: Float64
@@ -86,7 +79,32 @@ class HandEyeResult:
     @property
     def rms_px(self) -> float:
         """Root mean square distance of a seen corner from its prediction, in [px]."""
-        return float(np.sqrt(np.mean(np.sum(np.concatenate(self.residuals_px) ** 2, axis=1))))
+        return rms(np.concatenate(self.residuals_px))
+
+    @property
+    def board_position_rms(self) -> float:
+        """Root mean square length of `board_offsets`, in [m]."""
+        return rms(self.board_offsets)
+
+    @property
+    def board_turn_rms(self) -> float:
+        """Root mean square of `board_turns`, in [rad]."""
+        return rms(self.board_turns[:, None])
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class HandEyeResult(Agreement):
+    """The camera on the flange, moved until the views agreed best about it."""
+
+    position_std: float
+    """Standard deviation of the camera's position on the flange, from the residuals, in [m]."""
+    rotation_std: float
+    """The same of its orientation, in [rad]."""
+
+
+def rms(vectors: Float64) -> float:
+    """Root mean square length. Shape (N, D)."""
+    return float(np.sqrt(np.mean(np.sum(vectors**2, axis=1))))
 
 
 def board_pose(board: CharucoBoard, view: BoardView, intrinsics: CameraIntrinsics) -> Float64:
@@ -125,27 +143,22 @@ def calibrate_hand_eye(
     Raises:
         CalibrationError: Too few views, too few corners, or turns about one axis only.
     """
-    left_out = [f"{v.name}: {len(v.corner_ids)} corners" for v in views if len(v.corner_ids) < MIN_CORNERS]
-    used = [v for v in views if len(v.corner_ids) >= MIN_CORNERS]
+    used, left_out = usable_views(views)
     while True:
-        if len(used) < MIN_VIEWS:
-            detail = f" (left out: {'; '.join(left_out)})" if left_out else ""
-            raise CalibrationError(
-                f"{len(used)} usable views, {MIN_VIEWS} are needed{detail}; take more with the whole board in "
-                "the picture"
-            )
         flanges = np.stack([v.T_base_flange for v in used])
         boards = np.stack([board_pose(board, v, intrinsics) for v in used])
+        check_turns(flanges)
         start = _closed_form(flanges, boards)
         about = _mean_pose(flanges @ start @ boards)
         pose, about, covariance, residuals = _refine(board, used, intrinsics, start, about)
-        rms = np.array([np.sqrt(np.mean(np.sum(r**2, axis=1))) for r in residuals])
-        worst = int(np.argmax(rms))
-        if rms[worst] <= OUTLIER_PX:
+        errors = np.array([rms(r) for r in residuals])
+        worst = int(np.argmax(errors))
+        if errors[worst] <= OUTLIER_PX:
             break
-        left_out.append(f"{used[worst].name}: {rms[worst]:.1f} px off")
+        left_out.append(f"{used[worst].name}: {errors[worst]:.1f} px off")
         del used[worst]
-    alone = flanges @ pose @ boards
+        _check_count(used, left_out)
+    offsets, turns = _boards_alone(flanges @ pose @ boards, about)
     return HandEyeResult(
         T_flange_camera=pose,
         T_base_board=about,
@@ -154,9 +167,81 @@ def calibrate_hand_eye(
         residuals_px=tuple(residuals),
         position_std=float(np.sqrt(np.trace(covariance[3:6, 3:6]))),
         rotation_std=float(np.sqrt(np.trace(covariance[:3, :3]))),
-        board_offsets=alone[:, :3, 3] - about[:3, 3],
-        board_turns=np.array([difference(about, pose)[1] for pose in alone]),
+        board_offsets=offsets,
+        board_turns=turns,
     )
+
+
+def agreement_about(
+    board: CharucoBoard, views: Sequence[BoardView], intrinsics: CameraIntrinsics, T_flange_camera: Float64
+) -> Agreement:
+    """How well views agree about a camera whose place on the flange is given.
+
+    Only the board's place is fitted. No view is left out because it does not agree.
+
+    Args:
+        board: As measured on the print.
+        views: From different places, turned about different axes.
+        intrinsics: Of the colour pictures.
+        T_flange_camera: The colour camera's optical frame in `link_ee`. Shape (4, 4).
+
+    Raises:
+        CalibrationError: Too few views, too few corners, or turns about one axis only.
+    """
+    used, left_out = usable_views(views)
+    flanges = np.stack([v.T_base_flange for v in used])
+    boards = np.stack([board_pose(board, v, intrinsics) for v in used])
+    check_turns(flanges)
+    pose = np.asarray(T_flange_camera, np.float64)
+    about = _mean_pose(flanges @ pose @ boards)
+    _, about, _, residuals = _refine(board, used, intrinsics, pose, about, is_camera_fixed=True)
+    offsets, turns = _boards_alone(flanges @ pose @ boards, about)
+    return Agreement(
+        T_flange_camera=pose,
+        T_base_board=about,
+        views=tuple(used),
+        left_out=tuple(left_out),
+        residuals_px=tuple(residuals),
+        board_offsets=offsets,
+        board_turns=turns,
+    )
+
+
+def usable_views(views: Sequence[BoardView]) -> tuple[list[BoardView], list[str]]:
+    """Those with enough corners, and the others' names with the reason.
+
+    Raises:
+        CalibrationError: Too few are left.
+    """
+    left_out = [f"{v.name}: {len(v.corner_ids)} corners" for v in views if len(v.corner_ids) < MIN_CORNERS]
+    used = [v for v in views if len(v.corner_ids) >= MIN_CORNERS]
+    _check_count(used, left_out)
+    return used, left_out
+
+
+def _check_count(used: Sequence[BoardView], left_out: Sequence[str]) -> None:
+    if len(used) < MIN_VIEWS:
+        detail = f" (left out: {'; '.join(left_out)})" if left_out else ""
+        raise CalibrationError(
+            f"{len(used)} usable views, {MIN_VIEWS} are needed{detail}; take more with the whole board in "
+            "the picture"
+        )
+
+
+def check_turns(flanges: Float64) -> None:
+    """Accepts views that turn about more than one axis; others do not tell where the camera is. Shape (V, 4, 4).
+
+    Raises:
+        CalibrationError: They do not.
+    """
+    i, j = np.triu_indices(len(flanges), k=1)
+    turns = Rotation.from_matrix((np.linalg.inv(flanges[j]) @ flanges[i])[:, :3, :3]).as_rotvec()
+    spread = np.linalg.svd(turns / np.sqrt(len(turns)), compute_uv=False)
+    if spread[1] < MIN_TURN:
+        raise CalibrationError(
+            f"the views hardly turn about a second axis ({np.degrees(spread[1]):.1f} degrees, "
+            f"{np.degrees(MIN_TURN):.1f} are needed): tilt the camera and roll it between views"
+        )
 
 
 def _closed_form(flanges: Float64, boards: Float64) -> Float64:
@@ -164,16 +249,15 @@ def _closed_form(flanges: Float64, boards: Float64) -> Float64:
     i, j = np.triu_indices(len(flanges), k=1)
     a, b = np.linalg.inv(flanges[j]) @ flanges[i], boards[j] @ np.linalg.inv(boards[i])
     turns = Rotation.from_matrix(a[:, :3, :3]).as_rotvec()
-    spread = np.linalg.svd(turns / np.sqrt(len(turns)), compute_uv=False)
-    if spread[1] < MIN_TURN:
-        raise CalibrationError(
-            f"the views hardly turn about a second axis ({np.degrees(spread[1]):.1f} degrees, "
-            f"{np.degrees(MIN_TURN):.1f} are needed): tilt the camera and roll it between views"
-        )
     rotation = Rotation.align_vectors(turns, Rotation.from_matrix(b[:, :3, :3]).as_rotvec())[0]
     matrix = np.concatenate(a[:, :3, :3] - np.eye(3))
     right = np.concatenate(rotation.apply(b[:, :3, 3]) - a[:, :3, 3])
     return transform(rotation, np.linalg.lstsq(matrix, right, rcond=None)[0])
+
+
+def _boards_alone(boards: Float64, about: Float64) -> tuple[Float64, Float64]:
+    """How far the board by each view lies from that by all, in [m] and [rad]. Shapes (V, 3) and (V,)."""
+    return boards[:, :3, 3] - about[:3, 3], np.array([difference(about, pose)[1] for pose in boards])
 
 
 def _mean_pose(poses: Float64) -> Float64:
@@ -186,8 +270,12 @@ def _refine(
     intrinsics: CameraIntrinsics,
     T_flange_camera: Float64,
     T_base_board: Float64,
+    is_camera_fixed: bool = False,
 ) -> tuple[Float64, Float64, Float64, list[Float64]]:
-    """X, Z, the covariance of X (rotation, then translation) and each view's residuals at the smallest squares."""
+    """X, Z, the covariance of X (rotation, then translation) and each view's residuals at the smallest squares.
+
+    With the camera fixed only Z is moved, and the covariance is that of Z.
+    """
     corners = board.corners
     points = [corners[v.corner_ids] for v in views]
     seen = np.concatenate([v.corners_px for v in views])
@@ -200,50 +288,26 @@ def _refine(
 
     pose, about = T_flange_camera, T_base_board
 
+    def stepped(steps: Float64) -> tuple[Float64, Float64]:
+        return pose if is_camera_fixed else moved(pose, steps[:6]), moved(about, steps[-6:])
+
     def residual(steps: Float64) -> Float64:
-        chains = (np.linalg.inv(moved(pose, steps[:6])) @ to_flange @ moved(about, steps[6:]))[of_view]
+        camera, print_ = stepped(steps)
+        chains = (np.linalg.inv(camera) @ to_flange @ print_)[of_view]
         in_camera = (chains[:, :3, :3] @ stacked[:, :, None])[..., 0] + chains[:, :3, 3]
         return np.nan_to_num((seen - intrinsics.project(in_camera)).ravel(), nan=1e4)
 
     def fit() -> Any:
-        return least_squares(residual, np.zeros(12), "3-point", x_scale="jac", ftol=1e-12, xtol=1e-12)
+        return least_squares(residual, np.zeros(count), "3-point", x_scale="jac", ftol=1e-12, xtol=1e-12)
 
+    count = 6 if is_camera_fixed else 12
     found = fit()
     # Once more from the solution, where the Jacobian is wanted for the covariance.
-    pose, about = moved(pose, found.x[:6]), moved(about, found.x[6:])
+    pose, about = stepped(found.x)
     found = fit()
-    pose, about = moved(pose, found.x[:6]), moved(about, found.x[6:])
+    pose, about = stepped(found.x)
     error = found.fun
-    variance = float(error @ error) / max(1, len(error) - 12)
+    variance = float(error @ error) / max(1, len(error) - count)
     covariance = np.asarray(variance * np.linalg.pinv(found.jac.T @ found.jac), np.float64)
     ends = np.cumsum([len(p) for p in points])[:-1]
     return pose, about, covariance, [np.asarray(r) for r in np.split(error.reshape(-1, 2), ends)]
-
-
-def write_calibration(
-    path: Path, result: HandEyeResult, intrinsics: CameraIntrinsics, serial: str = ""
-) -> None:
-    """Writes a calibration file, whole or not at all.
-
-    Args:
-        path: The file; one that is there is replaced.
-        result: What the views gave.
-        intrinsics: Of the pictures.
-        serial: Of the camera, empty if unknown.
-
-    Raises:
-        CheckpointError: It cannot be written.
-    """
-    content = {
-        "T_flange_camera": result.T_flange_camera.tolist(),
-        "color_size": (intrinsics.width, intrinsics.height),
-        "color_focal": (intrinsics.fx, intrinsics.fy),
-        "serial": serial,
-        "rms_px": result.rms_px,
-        "position_std": result.position_std,
-        "rotation_std": result.rotation_std,
-        "view_count": len(result.views),
-        "about": "T_flange_camera: the colour camera's optical frame (z forward, x right, y down) in the flange's "
-        "frame link_ee (the plain flange face); metres, radians",
-    }
-    write_atomically(path, (json.dumps(content, indent=1) + "\n").encode())

@@ -10,7 +10,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 from maniskill_tomato.deploy.calibration.board import CharucoBoard
-from maniskill_tomato.deploy.calibration.hand_eye import HandEyeResult
+from maniskill_tomato.deploy.calibration.hand_eye import Agreement, HandEyeResult, rms
 from maniskill_tomato.deploy.rigid import difference
 from maniskill_tomato.errors import InvalidInputError
 from maniskill_tomato.files import write_atomically
@@ -60,7 +60,7 @@ ARROW_LENGTH = 12.0
 """So long is the arrow of a residual of the root mean square, in [px]."""
 
 
-def draw_calibration(path: Path, result: HandEyeResult, intrinsics: CameraIntrinsics) -> None:
+def draw_calibration(path: Path, result: Agreement, intrinsics: CameraIntrinsics) -> None:
     """Writes the picture as PNG.
 
     Args:
@@ -85,7 +85,7 @@ def draw_calibration(path: Path, result: HandEyeResult, intrinsics: CameraIntrin
     write_atomically(path, content.getvalue())
 
 
-def _arrows(axes: Any, result: HandEyeResult, intrinsics: CameraIntrinsics, colors: Any) -> None:
+def _arrows(axes: Any, result: Agreement, intrinsics: CameraIntrinsics, colors: Any) -> None:
     # A round number, so that the title tells it.
     wanted = ARROW_LENGTH / max(result.rms_px, 1e-6)
     times = min((1, 2, 5, 10, 20, 50, 100, 200, 500, 1000), key=lambda t: abs(np.log(t / wanted)))
@@ -112,7 +112,7 @@ def _arrows(axes: Any, result: HandEyeResult, intrinsics: CameraIntrinsics, colo
     )
 
 
-def _cloud(axes: Any, result: HandEyeResult, colors: Any) -> None:
+def _cloud(axes: Any, result: Agreement, colors: Any) -> None:
     for residuals, color in zip(result.residuals_px, colors, strict=True):
         axes.plot(*residuals.T, ".", color=color, markersize=3)
     reach = 1.1 * max(float(np.abs(np.concatenate(result.residuals_px)).max()), 0.05)
@@ -128,14 +128,14 @@ def _cloud(axes: Any, result: HandEyeResult, colors: Any) -> None:
     )
 
 
-def _bars(axes: Any, result: HandEyeResult, colors: Any) -> None:
-    rms = [float(np.sqrt(np.mean(np.sum(r**2, axis=1)))) for r in result.residuals_px]
-    axes.bar(np.arange(len(rms)), rms, color=colors)
+def _bars(axes: Any, result: Agreement, colors: Any) -> None:
+    errors = [rms(r) for r in result.residuals_px]
+    axes.bar(np.arange(len(errors)), errors, color=colors)
     axes.axhline(result.rms_px, color="black", linewidth=0.8, linestyle="--")
     axes.set(xlabel="view", ylabel="RMS (px)", title="Each view; dashed: all")
 
 
-def _boards(axes: Any, result: HandEyeResult, colors: Any) -> None:
+def _boards(axes: Any, result: Agreement, colors: Any) -> None:
     offsets = 1000.0 * result.board_offsets
     numbers = np.arange(len(offsets))
     for k, (name, marker) in enumerate(zip("xyz", "osD", strict=True)):
@@ -147,7 +147,7 @@ def _boards(axes: Any, result: HandEyeResult, colors: Any) -> None:
     axes.set(xlabel="view", title="The board by each view alone, less that by all")
 
 
-def _words(axes: Any, result: HandEyeResult) -> None:
+def _words(axes: Any, result: Agreement) -> None:
     distance, angle = difference(T_flange_camera_color_optical, result.T_flange_camera)
     x, y, z = 1000.0 * result.T_flange_camera[:3, 3]
     lines = [
@@ -155,9 +155,17 @@ def _words(axes: Any, result: HandEyeResult) -> None:
         "",
         "camera in link_ee (optical frame)",
         f"  x {x:.2f}   y {y:.2f}   z {z:.2f} mm",
-        f"  standard deviation {1000 * result.position_std:.3f} mm, {np.degrees(result.rotation_std):.4f} deg",
+        *(
+            [
+                f"  standard deviation {1000 * result.position_std:.3f} mm, {np.degrees(result.rotation_std):.4f} deg"
+            ]
+            if isinstance(result, HandEyeResult)
+            else ["  given, not fitted"]
+        ),
         f"  from the drawing {1000 * distance:.1f} mm, {np.degrees(angle):.2f} deg",
         "",
+        f"the board by one view: {1000 * result.board_position_rms:.2f} mm, "
+        f"{np.degrees(result.board_turn_rms):.2f} deg (RMS)",
         f"left out: {len(result.left_out)}",
         *(f"  {text}" for text in result.left_out[:5]),
     ]

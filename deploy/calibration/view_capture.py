@@ -5,6 +5,7 @@ import math
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass
+from datetime import UTC, datetime
 from pathlib import Path
 
 import numpy as np
@@ -48,12 +49,19 @@ class CapturePlan:
     """Largest angle between the line of sight and the board's normal, in [rad]."""
     largest_roll: float = 0.8
     """Largest turn of the camera about its line of sight from the first view, in [rad]."""
+    turn: float = 0.0
+    """Turn of the whole pattern about the board's normal, in [rad]: another one looks from other places."""
     settle_s: float = 0.7
     """Wait after a move until the arm no longer swings, in [s]."""
 
     def __post_init__(self) -> None:
         check_ranges(
-            self, views=(5, 100), largest_tilt=(0.0, 1.0), largest_roll=(0.0, 3.2), settle_s=(0.0, 10.0)
+            self,
+            views=(5, 100),
+            largest_tilt=(0.0, 1.0),
+            largest_roll=(0.0, 3.2),
+            turn=(-math.pi, math.pi),
+            settle_s=(0.0, 10.0),
         )
         if not 0.1 <= self.distances[0] <= self.distances[1] <= 2.0:
             raise InvalidInputError(f"distances must rise from 0.1 to 2 m, got {self.distances}")
@@ -82,7 +90,7 @@ def camera_poses(
     poses = []
     for k in range(count):
         tilt = plan.largest_tilt * math.sqrt((k + 0.5) / count)
-        azimuth = k * math.pi * (3.0 - math.sqrt(5.0))  # The golden angle spreads them evenly.
+        azimuth = plan.turn + k * math.pi * (3.0 - math.sqrt(5.0))  # The golden angle spreads them evenly.
         distance = plan.distances[0] + (plan.distances[1] - plan.distances[0]) * ((k * 0.618) % 1.0)
         roll = plan.largest_roll * (2.0 * ((k * 0.755) % 1.0) - 1.0)
         sideways = math.cos(azimuth) * x + math.sin(azimuth) * y
@@ -149,7 +157,12 @@ def capture_views(
         camera.begin_view()
         frame = camera.read(after=clock.now())
         joints = arm.read().joint_positions
-        view = RecordedView(name=f"view_{len(views):03d}.png", color=frame.color, joint_positions=joints)
+        view = RecordedView(
+            name=f"view_{len(views):03d}.png",
+            color=frame.color,
+            joint_positions=joints,
+            taken=datetime.now(UTC).isoformat(timespec="seconds"),
+        )
         seen = board_view(board, view)
         if len(seen.corner_ids) < MIN_CORNERS:
             return None

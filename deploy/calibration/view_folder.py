@@ -3,6 +3,7 @@
 import json
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, Final
 
@@ -37,6 +38,8 @@ class RecordedView:
     """RGB. Shape (H, W, 3)."""
     joint_positions: Float64
     """In [rad]. Shape (7,)."""
+    taken: str = ""
+    """When, in UTC as ISO 8601; empty if that is not known."""
 
 
 def flange_pose(joint_positions: Float64) -> Float64:
@@ -71,7 +74,9 @@ def write_views(
     index = {
         "serial": serial,
         "intrinsics": asdict(intrinsics),
-        "views": [{"image": v.name, "joint_positions": v.joint_positions.tolist()} for v in views],
+        "views": [
+            {"image": v.name, "joint_positions": v.joint_positions.tolist(), "taken": v.taken} for v in views
+        ],
     }
     write_atomically(folder / INDEX_NAME, json.dumps(index, indent=1).encode())
 
@@ -118,6 +123,7 @@ def _read_view(folder: Path, entry: Any, k: int, intrinsics: CameraIntrinsics) -
             f"{where}.joint_positions must be {NUM_JOINTS} angles within the joint limits, in radians; got "
             f"{entry['joint_positions']}"
         )
+    taken = _utc(entry.get("taken", ""), where)
     name = entry["image"]
     if Path(name).name != name:
         raise CalibrationError(f"{where}.image must be a file of this folder, got {name!r}")
@@ -130,4 +136,18 @@ def _read_view(folder: Path, entry: Any, k: int, intrinsics: CameraIntrinsics) -
             f"{where}.image is {picture.shape[1]} x {picture.shape[0]} px, the intrinsics are of "
             f"{intrinsics.width} x {intrinsics.height}"
         )
-    return RecordedView(name=name, color=picture, joint_positions=joints)
+    return RecordedView(name=name, color=picture, joint_positions=joints, taken=taken)
+
+
+def _utc(text: Any, where: str) -> str:
+    if text == "":
+        return ""
+    try:
+        date = datetime.fromisoformat(text)
+        if date.tzinfo is None:
+            raise ValueError("it has no time zone")
+        return date.astimezone(UTC).isoformat(timespec="seconds")
+    except (TypeError, ValueError, OverflowError) as error:
+        raise CalibrationError(
+            f"{where}.taken must be a date such as 2026-11-29T12:00:00+00:00, got {text!r} ({error})"
+        ) from error

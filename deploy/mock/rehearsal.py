@@ -74,7 +74,7 @@ def rehearsal(
         camera_driver="mock",
         camera_options=TWIN,
         T_flange_camera=T_flange_camera_color_optical,
-        calibrated=False,
+        T_drawing=T_flange_camera_color_optical,
         target=TargetConfig(source="given", position=(x, y, z)),
         safety=SafetyConfig(speed_fraction=speed_fraction, max_state_age=10.0, max_frame_age=60.0),
         loop=LoopConfig(max_moves=max_moves),

@@ -91,6 +91,10 @@ class RealSenseCamera(Camera):
         """
         return _connected(self._T_color_depth)
 
+    @property
+    def serial(self) -> str:
+        return "" if self._source is None else self._source.serial or ""
+
     def connect(self) -> None:
         if self._source is not None:
             return
@@ -167,7 +171,7 @@ class RealSenseCamera(Camera):
             return facts
         color = self.intrinsics
         return facts | {
-            "serial": self._source.serial or "",
+            "serial": self.serial,
             "recording": self._config.recording or "",
             "color_size": [color.width, color.height],
             "color_focal_px": [round(color.fx, 2), round(color.fy, 2)],

@@ -74,7 +74,7 @@ COMMANDS: Final[dict[str, CommandEntry]] = {
     ),
     "deploy check": CommandEntry("deploy_commands:DeployCheck", "Check everything; nothing moves"),
     "deploy calibrate": CommandEntry(
-        "deploy_commands:DeployCalibrate", "Measure the camera's place on the flange"
+        "calibrate_command:DeployCalibrate", "Measure the camera's place on the flange"
     ),
     "deploy replay": CommandEntry("deploy_commands:DeployReplay", "Run a recording through today's code"),
     "deploy profiles": CommandEntry("deploy_commands:DeployProfiles", "List the profiles, or print one"),

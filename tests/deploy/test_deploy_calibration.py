@@ -1,8 +1,16 @@
 """Hand-eye calibration from rendered boards: a known camera on the flange comes back, and what is wrong is said."""
 
+import importlib
 import json
+import os
+import pty
+import signal
+import sys
+import threading
+import time
 from collections.abc import Callable
 from dataclasses import replace
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
@@ -13,15 +21,21 @@ import torch
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from maniskill_tomato.cli import main
+from maniskill_tomato.cli import calibrate_command, main
+from maniskill_tomato.cli.operator_prompt import goes
 from maniskill_tomato.deploy.calibration.board import CharucoBoard
+from maniskill_tomato.deploy.calibration.calibration_file import (
+    picture_id,
+    read_calibration,
+    write_calibration,
+)
+from maniskill_tomato.deploy.calibration.evaluation import evaluate
 from maniskill_tomato.deploy.calibration.hand_eye import (
     BoardView,
     CalibrationError,
     HandEyeResult,
     board_pose,
     calibrate_hand_eye,
-    write_calibration,
 )
 from maniskill_tomato.deploy.calibration.picture import draw_calibration, print_board
 from maniskill_tomato.deploy.calibration.view_capture import CapturePlan, camera_poses, capture_views
@@ -32,7 +46,7 @@ from maniskill_tomato.deploy.calibration.view_folder import (
     read_views,
     write_views,
 )
-from maniskill_tomato.deploy.clock import SimulatedClock
+from maniskill_tomato.deploy.clock import Clock, SimulatedClock
 from maniskill_tomato.deploy.deploy_errors import ProfileError, StoppedError
 from maniskill_tomato.deploy.guarded_arm import GuardedArm
 from maniskill_tomato.deploy.interface import Arm, ArmState, Camera, Float64, Frame, JointMove
@@ -58,6 +72,7 @@ Z = transform(
     * Rotation.from_rotvec([0.1, 0.0, 0.3]),
     [0.5, -0.1, 0.15],
 )
+TODAY = datetime.now(UTC).isoformat(timespec="seconds")
 START = np.deg2rad([0.0, 20.0, 0.0, -95.0, 0.0, 65.0, 0.0])
 
 
@@ -104,7 +119,7 @@ def postures(count: int, seed: int = 0, roll: float = 1.0, tilt: float = 0.6) ->
 
 def recorded(joints: Float64, number: int, noise: float = 3.0) -> RecordedView:
     picture = rendered(np.linalg.inv(flange_pose(joints) @ X) @ Z, number, noise)
-    return RecordedView(name=f"view_{number:03d}.png", color=picture, joint_positions=joints)
+    return RecordedView(name=f"view_{number:03d}.png", color=picture, joint_positions=joints, taken=TODAY)
 
 
 def exact_views(joints: list[Float64], noise_px: float = 0.0, seed: int = 0) -> list[BoardView]:
@@ -264,6 +279,7 @@ def test_a_folder_of_views_comes_back_as_it_was_written(tmp_path: Path, views: l
     write_views(tmp_path, views[:3], COLOR, "123")
     again, intrinsics, serial = read_views(tmp_path)
     assert serial == "123" and intrinsics == COLOR and len(again) == 3
+    assert [view.taken for view in again] == [TODAY] * 3
     for one, other in zip(again, views, strict=False):
         np.testing.assert_array_equal(one.color, other.color)
         np.testing.assert_array_equal(one.joint_positions, other.joint_positions)
@@ -286,6 +302,9 @@ def broken(change: Callable[[dict[str, Any]], object]) -> Callable[[dict[str, An
         (lambda i: i["views"][0].update(image="../view_000.png"), "file of this folder"),
         (lambda i: i["views"][0].update(image="views.json"), "cannot be read as an image"),
         (lambda i: i["intrinsics"].update(width=641), "640 x 480"),
+        (lambda i: i["views"][1].update(taken="yesterday"), r"views\[1\].taken must be a date such as"),
+        (lambda i: i["views"][1].update(taken="2026-11-29T12:00:00"), "it has no time zone"),
+        (lambda i: i["views"][1].update(taken=7), r"views\[1\].taken must be a date"),
     ],
 )
 def test_a_broken_folder_is_told_with_the_key(
@@ -305,20 +324,33 @@ def profile_of(file: Path) -> Profile:
     return parse_profile(text, file.with_name("lab.toml"))
 
 
-def test_the_profile_reads_what_the_calibration_file_was_given(tmp_path: Path, result: HandEyeResult) -> None:
+def test_the_profile_reads_what_the_calibration_file_was_given(
+    tmp_path: Path, result: HandEyeResult, views: list[RecordedView]
+) -> None:
     path = tmp_path / "calibration.json"
-    write_calibration(path, result, COLOR, "0123 4'5")
+    written = write_calibration(path, result, views, COLOR, "0123 4'5")
     profile = profile_of(path)
-    assert profile.calibrated
     np.testing.assert_array_equal(profile.T_flange_camera, result.T_flange_camera)
-    table = json.loads(path.read_text())
-    assert table["color_size"] == [640, 480] and table["view_count"] == 15 and table["serial"] == "0123 4'5"
+    facts = profile.calibration
+    assert facts == written == read_calibration(path)[1]
+    assert facts is not None
+    assert (facts.serial, facts.taken, facts.intrinsics, facts.view_count) == ("0123 4'5", TODAY, COLOR, 15)
+    assert facts.pictures == tuple(picture_id(view.color) for view in views)
+    assert facts.rms_px == result.rms_px and facts.position_std == result.position_std
+    # By hand: the board by each view alone.
+    chain = [v.T_base_flange @ result.T_flange_camera @ board_pose(BOARD, v, COLOR) for v in result.views]
+    apart = [difference(result.T_base_board, board) for board in chain]
+    assert facts.board_position_rms == pytest.approx(np.sqrt(np.mean([d**2 for d, _ in apart])))
+    assert facts.board_turn_rms == pytest.approx(np.sqrt(np.mean([a**2 for _, a in apart])))
 
 
 @pytest.mark.parametrize(
     ("change", "match"),
     [
-        (lambda t: t.pop("T_flange_camera"), "calibration.file .* cannot be used"),
+        (lambda t: t.pop("T_flange_camera"), "calibration.file: .* it has no T_flange_camera"),
+        (lambda t: t.update(rms_px=float("nan")), "rms_px must be a finite number"),
+        (lambda t: t.update(taken=3), "taken must be a string"),
+        (lambda t: t["intrinsics"].update(fx=-1.0), "fx must be a positive number"),
         (lambda t: t["T_flange_camera"][0].__setitem__(0, float("nan")), "must be a 4 x 4 transform"),
         (lambda t: t["T_flange_camera"][0].__setitem__(0, 2.0), "rotation"),
         (lambda t: t["T_flange_camera"][2].__setitem__(3, 47.0), "metres"),
@@ -326,10 +358,14 @@ def test_the_profile_reads_what_the_calibration_file_was_given(tmp_path: Path, r
     ],
 )
 def test_a_broken_calibration_file_is_told_with_the_key(
-    tmp_path: Path, result: HandEyeResult, change: Callable[[dict[str, Any]], object], match: str
+    tmp_path: Path,
+    result: HandEyeResult,
+    views: list[RecordedView],
+    change: Callable[[dict[str, Any]], object],
+    match: str,
 ) -> None:
     path = tmp_path / "calibration.json"
-    write_calibration(path, result, COLOR)
+    write_calibration(path, result, views, COLOR)
     table = json.loads(path.read_text())
     change(table)
     path.write_text(json.dumps(table))
@@ -376,6 +412,131 @@ def test_the_command_says_in_one_line_what_is_wrong(
     assert lines[-1].startswith("error: ") and match in lines[-1]
 
 
+@pytest.fixture(scope="module")
+def new_views() -> list[RecordedView]:
+    """Views that no calibration here is made from."""
+    return [recorded(q, 100 + k) for k, q in enumerate(postures(15, seed=21))]
+
+
+@pytest.fixture(scope="module")
+def calibration_file(
+    tmp_path_factory: pytest.TempPathFactory, result: HandEyeResult, views: list[RecordedView]
+) -> Path:
+    path = tmp_path_factory.mktemp("calibration") / "calibration.json"
+    write_calibration(path, result, views, COLOR, "42")
+    return path
+
+
+def test_a_good_calibration_passes_on_views_that_it_was_not_made_from(
+    calibration_file: Path, new_views: list[RecordedView], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    write_views(tmp_path / "new", new_views, COLOR, "42")
+    command = ["deploy", "calibrate", "--evaluate", str(calibration_file), "--views", str(tmp_path / "new")]
+    main([*command, "--out", str(tmp_path / "out")])
+    told = capsys.readouterr().out
+    assert told.splitlines()[0].startswith("15 new views, 0.0") and told.splitlines()[-1] == "passed"
+    found = json.loads((tmp_path / "out" / "evaluation.json").read_text())
+    assert found["passed"] is True and found["problems"] == [] and found["view_count"] == 15
+    # The corners by projection with the calibrated camera and the board where it really is: no worse than these.
+    pose, _ = read_calibration(calibration_file)
+    off = []
+    for view in new_views:
+        seen = board_view(BOARD, view)
+        chain = np.linalg.inv(seen.T_base_flange @ pose) @ Z
+        points = BOARD.corners[seen.corner_ids] @ chain[:3, :3].T + chain[:3, 3]
+        off.append(COLOR.project(points) - seen.corners_px)
+    there = float(np.sqrt(np.mean(np.sum(np.concatenate(off) ** 2, axis=1))))
+    assert 0.5 * there < found["rms_px"] <= there < 0.2
+    assert 0.0 < found["board_position_rms"] < 0.0003 and 0.0 < found["board_turn_rms"] < np.radians(0.2)
+    assert (tmp_path / "out" / "evaluation.png").stat().st_size > 10_000
+
+
+@pytest.mark.parametrize("kind", ["shifted", "turned", "another file's pose", "identity", "49 cm off"])
+def test_a_wrong_calibration_does_not_pass_an_evaluation(
+    kind: str,
+    calibration_file: Path,
+    new_views: list[RecordedView],
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    rng = np.random.default_rng(1)
+    direction = rng.normal(size=3)
+    direction /= np.linalg.norm(direction)
+    table = json.loads(calibration_file.read_text())
+    T = np.array(table["T_flange_camera"])
+    table["T_flange_camera"] = {
+        "shifted": T @ transform(Rotation.identity(), 0.002 * direction),
+        "turned": T @ transform(Rotation.from_rotvec(np.radians(0.5) * direction), np.zeros(3)),
+        "another file's pose": d435.T_flange_camera_color_optical,
+        "identity": np.eye(4),
+        "49 cm off": T @ transform(Rotation.identity(), 0.49 * direction),
+    }[kind].tolist()
+    wrong = tmp_path / "calibration.json"
+    wrong.write_text(json.dumps(table))
+    write_views(tmp_path / "new", new_views, COLOR, "42")
+    with pytest.raises(SystemExit) as end:
+        main(
+            ["deploy", "calibrate", "--evaluate", str(wrong), "--views", str(tmp_path / "new")]
+            + ["--out", str(tmp_path / "out")]
+        )
+    captured = capsys.readouterr()
+    assert isinstance(end.value, SystemExit)
+    if kind == "49 cm off":
+        assert end.value.code == 2 and "more than 0.5 m from the flange" in captured.err
+        return
+    assert end.value.code == 3
+    assert "FAIL    rms_px is " in captured.out and "1 px at most is allowed" in captured.out
+    assert captured.out.splitlines()[-1] == f"{wrong} does not pass"
+    assert json.loads((tmp_path / "out" / "evaluation.json").read_text())["passed"] is False
+
+
+def test_views_that_the_calibration_was_made_from_say_nothing_of_it(
+    calibration_file: Path, views: list[RecordedView], new_views: list[RecordedView]
+) -> None:
+    pose, facts = read_calibration(calibration_file)
+    # In another file, under another name.
+    old = replace(views[3], name="holiday.png")
+    with pytest.raises(
+        CalibrationError, match=r"1 of 15 views were used for this calibration \(holiday.png\)"
+    ):
+        evaluate(BOARD, pose, facts, [*new_views[:14], old], COLOR, "42")
+    with pytest.raises(CalibrationError, match="does not say from which pictures"):
+        evaluate(BOARD, pose, replace(facts, pictures=()), new_views, COLOR, "42")
+    with pytest.raises(CalibrationError, match="it is of camera 42, the connected one is 43"):
+        evaluate(BOARD, pose, facts, new_views, COLOR, "43")
+    other = replace(COLOR, fx=COLOR.fx + 4.0)
+    with pytest.raises(CalibrationError, match=r"differ by 2\.1 px at a corner"):
+        evaluate(BOARD, pose, facts, new_views, other, "42")
+    with pytest.raises(CalibrationError, match="4 usable views, 5 are needed"):
+        evaluate(BOARD, pose, facts, new_views[:4], COLOR, "42")
+
+
+def test_one_view_that_does_not_agree_stays_in_an_evaluation(
+    calibration_file: Path, new_views: list[RecordedView]
+) -> None:
+    pose, facts = read_calibration(calibration_file)
+    pushed = replace(new_views[0], joint_positions=new_views[0].joint_positions + 0.02)
+    found = evaluate(BOARD, pose, facts, [pushed, *new_views[1:]], COLOR, "42")
+    assert len(found.agreement.views) == 15 and found.problems
+
+
+def test_a_calibration_that_a_real_arm_would_refuse_is_written_and_said_to_be_refused(
+    tmp_path: Path, views: list[RecordedView], capsys: pytest.CaptureFixture[str]
+) -> None:
+    undated = [replace(view, taken="") for view in views[:7]]
+    write_views(tmp_path / "views", undated, COLOR, "42")
+    with pytest.raises(SystemExit) as end:
+        main(["deploy", "calibrate", "--views", str(tmp_path / "views"), "--out", str(tmp_path / "out")])
+    assert end.value.code == 3
+    told = capsys.readouterr().out.splitlines()
+    assert told[-1] == "a real arm would not move by it"
+    assert [line.split(",")[0] for line in told[-3:-1]] == [
+        "FAIL    it tells of 7 views",
+        "FAIL    it has no date with a time zone when its views were taken",
+    ]
+    assert (tmp_path / "out" / "calibration.json").exists()
+
+
 def test_boards_that_cannot_be_are_refused() -> None:
     cases: list[dict[str, Any]] = [
         {"columns": 2},
@@ -390,11 +551,11 @@ def test_boards_that_cannot_be_are_refused() -> None:
 
 
 class StillArm(Arm):
-    """An arm that is at once where it is sent."""
+    """An arm that stands where it was sent as soon as that is asked."""
 
     name = "still"
 
-    def __init__(self, clock: SimulatedClock) -> None:
+    def __init__(self, clock: Clock) -> None:
         self.joints, self.clock = START, clock
         self.moves: list[JointMove] = []
 
@@ -412,7 +573,7 @@ class StillArm(Arm):
         return ArmState(joint_positions=self.joints, joint_velocities=np.zeros(7), stamp=self.clock.now())
 
     def command(self, move: JointMove) -> JointMove:
-        self.clock.sleep(20.0)
+        self.clock.sleep(self.move_seconds(move.joint_positions - self.joints, move.speed_fraction))
         self.joints = move.joint_positions
         self.moves.append(move)
         return move
@@ -441,6 +602,10 @@ class BoardCamera(Camera):
 
     def disconnect(self) -> None:
         pass
+
+    @property
+    def serial(self) -> str:
+        return "B7"
 
     @property
     def intrinsics(self) -> CameraIntrinsics:
@@ -519,6 +684,83 @@ def test_a_stop_ends_the_taking_of_views_and_keeps_those_taken(tmp_path: Path) -
     with pytest.raises(StoppedError, match="SIGTERM"):
         capture_views(guarded, BoardCamera(moving), BOARD, tmp_path / "b", clock, lambda q: True, stops=stops)
     assert len(moving.moves) == 1
+
+
+DRIVERS = """
+from maniskill_tomato.deploy.interface import Arm, Camera
+
+
+def make_arm(options, context):
+    return context.shared("arm", lambda: HERE.StillArm(context.clock))
+
+
+def make_camera(options, context):
+    return HERE.BoardCamera(make_arm(options, context))
+"""
+
+
+@pytest.fixture
+def board_profile(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A profile whose drivers come from another package, by their entry points: the arm and the camera above."""
+    package = tmp_path / "site"
+    (package / "board_lab-1.dist-info").mkdir(parents=True)
+    (package / "board_lab-1.dist-info" / "METADATA").write_text(
+        "Metadata-Version: 2.1\nName: board-lab\nVersion: 1\n"
+    )
+    (package / "board_lab-1.dist-info" / "entry_points.txt").write_text(
+        "[maniskill_tomato.drivers]\narm.still = board_lab:make_arm\ncamera.board = board_lab:make_camera\n"
+    )
+    (package / "board_lab.py").write_text(DRIVERS)
+    monkeypatch.syspath_prepend(package)
+    module = importlib.import_module("board_lab")
+    monkeypatch.setattr(module, "HERE", sys.modules[__name__], raising=False)
+    profile = tmp_path / "board.toml"
+    profile.write_text(
+        '[arm]\ndriver = "still"\n[camera]\ndriver = "board"\n[safety]\nspeed_fraction = 0.3\n'
+    )
+    return profile
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_signal_at_the_prompt_ends_the_taking_of_views_and_names_those_that_stay(
+    number: signal.Signals,
+    tmp_path: Path,
+    board_profile: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    master, slave = pty.openpty()
+    monkeypatch.setattr(sys, "stdin", os.fdopen(slave))
+    asked = threading.Semaphore(0)
+
+    def ask() -> bool:
+        asked.release()
+        return goes()
+
+    def operate() -> None:
+        """Says yes once, and then presses Ctrl-C or ends the process."""
+        assert asked.acquire(timeout=60)
+        os.write(master, b"y\n")
+        assert asked.acquire(timeout=60)
+        time.sleep(0.2)
+        os.kill(os.getpid(), number)
+
+    monkeypatch.setattr(calibrate_command, "goes", ask)
+    operator = threading.Thread(target=operate, daemon=True)
+    operator.start()
+    out = tmp_path / "out"
+    with pytest.raises(SystemExit) as end:
+        main(["deploy", "calibrate", "--profile", str(board_profile), "--confirm", "--out", str(out)])
+    operator.join()
+    os.close(master)
+    assert end.value.code == 128 + number
+    told = capsys.readouterr().out.splitlines()
+    assert told[-2].endswith(f"stopped ({number.name}) after 2 views; the arm holds its position")
+    kept = "view_000.png, view_001.png"
+    assert told[-1] == f"kept    {out / 'views'}: {kept}; --views {out / 'views'} calculates from them"
+    again, _, serial = read_views(out / "views")
+    assert [view.name for view in again] == kept.split(", ") and serial == "B7"
+    assert all(view.taken for view in again)
 
 
 def test_capture_poses_look_at_the_middle_of_the_board_from_its_front() -> None:

@@ -13,6 +13,7 @@ from pathlib import Path
 import pytest
 
 from maniskill_tomato.cli import deploy_commands, main, parse
+from maniskill_tomato.cli.operator_prompt import goes
 from maniskill_tomato.deploy.stops import Stops
 
 BLOCKED = """
@@ -132,7 +133,7 @@ def test_a_signal_at_the_prompt_ends_the_run_before_anything_moves(
 ) -> None:
     master, slave = pty.openpty()
     monkeypatch.setattr(sys, "stdin", os.fdopen(slave))
-    asked, goes = threading.Event(), deploy_commands._goes
+    asked = threading.Event()
 
     def ask() -> bool:
         asked.set()
@@ -143,7 +144,7 @@ def test_a_signal_at_the_prompt_ends_the_run_before_anything_moves(
         time.sleep(0.2)
         os.kill(os.getpid(), number)
 
-    monkeypatch.setattr(deploy_commands, "_goes", ask)
+    monkeypatch.setattr(deploy_commands, "goes", ask)
     threading.Thread(target=press, daemon=True).start()
     profile = tmp_path / "small.toml"
     profile.write_text(
@@ -195,7 +196,7 @@ def test_a_fault_has_its_own_exit_status(tmp_path: Path, capsys: pytest.CaptureF
             ["inspect", "--out", "/dev/null/x"],
             "cannot write to /dev/null/x: Not a directory; choose another --out",
         ),
-        (["calibrate", "--profile", "mock", "--out", "/dev/null/x"], "cannot use the folder"),
+        (["calibrate", "--profile", "mock", "--out", "/dev/null/x"], "cannot write to /dev/null/x"),
         (["calibrate", "--views", "missing"], "--views: there is no folder missing"),
         (["profiles", "--show", "missing"], "no profile 'missing'"),
         (["replay", "/dev/null"], "RECORDING: there is no file /dev/null"),

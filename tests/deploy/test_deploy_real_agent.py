@@ -1,5 +1,6 @@
 """ManiSkill's Sim2RealEnv over the twin: the same spaces, wrappers and observations as in the simulation."""
 
+import json
 from pathlib import Path
 from typing import Any
 
@@ -60,6 +61,21 @@ def test_a_real_arm_without_a_calibration_is_not_moved_by_a_policy_nor_by_manisk
     arm.command = sent.append
     with pytest.raises(RefusedError, match="not calibrated"):
         real.set_target_qpos(READY_QPOS + 0.05)
+    assert sent == []
+
+
+def test_maniskill_does_not_move_a_real_arm_by_a_bad_calibration(tmp_path: Path) -> None:
+    file = tmp_path / "calibration.json"
+    file.write_text(json.dumps({"T_flange_camera": np.eye(4).tolist(), "rms_px": 500.0}))
+    text = REAL.format(camera="") + '[calibration]\nfile = "calibration.json"\n'
+    workcell = make_workcell(parse_profile(text, tmp_path / "real.toml"))
+    state = ArmState(joint_positions=READY_QPOS, joint_velocities=np.zeros(7), stamp=workcell.clock.now())
+    arm: Any = workcell.arm
+    arm.read = lambda max_age_s=0.5: state
+    sent: list[Any] = []
+    arm.command = sent.append
+    with pytest.raises(RefusedError, match="is the identity.* rms_px is 500 px"):
+        IiwaRealAgent(workcell).set_target_qpos(READY_QPOS + 0.05)
     assert sent == []
 
 

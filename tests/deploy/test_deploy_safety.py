@@ -706,7 +706,7 @@ def test_a_stop_asked_for_while_a_move_is_sent_is_passed_on() -> None:
 def test_a_forbidden_arm_is_not_moved_by_any_command() -> None:
     clock = SimulatedClock(100.0)
     arm = SpyArm(clock)
-    guard = GuardedArm(arm, Safety(), clock, forbidden="not calibrated")
+    guard = GuardedArm(arm, Safety(), clock, why_forbidden=lambda: "not calibrated")
     with pytest.raises(RefusedError, match="not calibrated"):
         guard.command(move(turned(j1=0.1)))
     assert arm.sent == []
