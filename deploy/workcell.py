@@ -124,7 +124,9 @@ NOT_CALIBRATED = (
 )
 """Why a real arm with a camera does not move by a drawing."""
 
-NOT_CONNECTED = "the camera is not connected, and nobody knows whether it is the calibrated one; connect it first"
+NOT_CONNECTED = (
+    "the camera is not connected, and nobody knows whether it is the calibrated one; connect it first"
+)
 """Why a real arm does not move without its camera."""
 
 

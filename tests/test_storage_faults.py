@@ -213,6 +213,70 @@ def test_a_folder_that_another_process_works_in_is_refused_before_anything_is_wr
             pass
 
 
+def _light_training(out: Path) -> None:
+    from maniskill_tomato.segmentation.training.light_training import LightTraining
+
+    object.__new__(LightTraining).run(out, print)  # The folder comes before the network and the images.
+
+
+def _yolo(out: Path) -> None:
+    from maniskill_tomato.segmentation.training.yolo_training import YOLO_SETTINGS, train_yolo
+
+    images: Any = None
+    train_yolo(images, out, YOLO_SETTINGS["thesis"], "yolov8n.yaml", 0)
+
+
+def _demonstrations(out: Path) -> None:
+    from maniskill_tomato.learning.imitation.demonstrations import record_demonstrations
+
+    env: Any = None
+    record_demonstrations(env, env, range(2), out)
+
+
+LONG_COMMANDS: dict[str, Callable[[Path], object]] = {
+    "train-imitation": lambda out: main(["train-imitation", "--out", str(out)]),
+    "train-view-quality": lambda out: main(["train-view-quality", "--out", str(out)]),
+    "train-ppo": lambda out: main(["train-ppo", "TomatoViewpoint-v1", "--out", str(out.parent)]),
+    "train --seeds": lambda out: main(
+        ["train", "TomatoViewpoint-v1", "--seeds", "0", "1", "--out", str(out)]
+    ),
+    "train-segmenter light": _light_training,
+    "train-segmenter yolo": _yolo,
+    "demonstrations": _demonstrations,
+    "benchmark-rows": lambda out: main(["benchmark-rows", "--policies", "fixed_sweep", "--out", str(out)]),
+    "judge perception": lambda out: main(["judge", "perception", "--policies", "nbv", "--out", str(out)]),
+    "judge twin": lambda out: main(["judge", "twin", "--out", str(out)]),
+    "ablate": lambda out: main(["ablate", "--out", str(out)]),
+    "reproduce": lambda out: main(["reproduce", "guided", "--out", str(out.parent)]),
+    "deploy calibrate": lambda out: main(["deploy", "calibrate", "--profile", "mock", "--out", str(out)]),
+}
+"""What writes into a folder for minutes or hours, beside what the test above has."""
+
+HELD_NAMES = {"train-ppo": "seed-0", "reproduce": "guided"}
+"""The folder in `--out` that is held, where that is not all of it."""
+
+
+def test_every_command_that_writes_for_long_is_refused_in_the_folder_of_another(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for name, run in LONG_COMMANDS.items():
+        out = tmp_path / name / HELD_NAMES.get(name, "out")
+        out.mkdir(parents=True)
+        # This process holds it through another open file, as another one would.
+        with only_writer(out):
+            try:
+                run(out)
+            except CheckpointError as error:
+                told = str(error)
+            except SystemExit as end:
+                assert end.code in (1, 2), name
+                told = capsys.readouterr().err
+            else:
+                pytest.fail(f"{name} worked in a folder that another process holds")
+        assert "another process " in told and f" in {out}; wait for it" in told, (name, told)
+        assert list(out.iterdir()) == [], name
+
+
 ADD = """
 import sys
 from pathlib import Path

@@ -14,6 +14,7 @@ from maniskill_tomato.experiments.statistics import Interval, interquartile_inte
 from maniskill_tomato.experiments.training_study import SOLVED, WINDOW, Trial, run_trials
 from maniskill_tomato.experiments.variants import Evaluation, Variant, choose_variants
 from maniskill_tomato.files import write_atomically, write_json
+from maniskill_tomato.folder_lock import only_writer
 from maniskill_tomato.learning.rl.presets import get_preset
 from maniskill_tomato.report_design import markdown_table
 from maniskill_tomato.tasks import THESIS_IDS
@@ -92,7 +93,13 @@ def run_ablation(config: AblationConfig, report: Callable[[str], None] = lambda 
     Raises:
         InvalidInputError: An option cannot be used, or a folder holds a run of other settings.
         SeedsFailedError: Some runs failed; the others are done by then.
+        CheckpointError: Another process measures in the folder.
     """
+    with only_writer(config.out, "measures"):
+        return _run_ablation(config, report)
+
+
+def _run_ablation(config: AblationConfig, report: Callable[[str], None]) -> str:
     variants = choose_variants(config.variants)
     trials = plan_trials(config, variants)
     results: list[Result] = []

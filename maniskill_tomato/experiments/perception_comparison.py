@@ -12,6 +12,7 @@ from maniskill_tomato.experiments.episode_record import EpisodeRecord
 from maniskill_tomato.experiments.policy_runs import Condition, parse_policies, run_policies
 from maniskill_tomato.experiments.result_store import ResultStore
 from maniskill_tomato.files import write_atomically, write_json
+from maniskill_tomato.folder_lock import only_writer
 from maniskill_tomato.report_design import markdown_table
 from maniskill_tomato.sensing.perception_kinds import RENDERED, Perception
 from maniskill_tomato.tasks.row.row_config import GeneralTaskConfig
@@ -63,7 +64,13 @@ def compare_perceptions(config: PerceptionComparisonConfig) -> str:
 
     Raises:
         InvalidInputError: An option cannot be used, or the folder holds other episodes.
+        CheckpointError: Another process measures in the folder.
     """
+    with only_writer(config.out, "measures"):
+        return _compare(config)
+
+
+def _compare(config: PerceptionComparisonConfig) -> str:
     for name in config.perceptions:
         if name not in PERCEPTIONS:
             raise InvalidInputError.choice("--perceptions", name, PERCEPTIONS)

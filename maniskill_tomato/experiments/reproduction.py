@@ -16,6 +16,7 @@ from maniskill_tomato.experiments.statistics import mean_interval
 from maniskill_tomato.experiments.training_study import SATURATED, Trial, run_trials
 from maniskill_tomato.experiments.variants import Experiment, Variant, experiments, find_variant, variants_of
 from maniskill_tomato.files import write_atomically, write_json
+from maniskill_tomato.folder_lock import only_writer
 from maniskill_tomato.learning.rl.agent import make_actor, make_normalizer
 from maniskill_tomato.learning.rl.envs import make_env
 from maniskill_tomato.learning.rl.presets import TrainConfig
@@ -46,8 +47,16 @@ def run_reproduction(config: ReproductionConfig, report: Callable[[str], None] =
     Raises:
         InvalidInputError: There is no such variant, or a folder holds a run of other settings.
         StudyStoppedError: A signal ended a training.
+        CheckpointError: Another process reproduces the experiment in the folder.
     """
     experiment = experiments()[config.experiment]
+    with only_writer(config.out / experiment.name, "measures"):
+        _run_reproduction(config, experiment, report)
+
+
+def _run_reproduction(
+    config: ReproductionConfig, experiment: Experiment, report: Callable[[str], None]
+) -> None:
     names = config.variant or (tuple(variants_of(experiment)) if config.ablate else ("exact",))
     chosen = [find_variant(experiment, name) for name in names]
     rows = []

@@ -16,6 +16,7 @@ from maniskill_tomato.experiments.policy_runs import Condition, parse_policies, 
 from maniskill_tomato.experiments.result_store import ResultStore
 from maniskill_tomato.experiments.statistics import mean_interval, sign_flip_p
 from maniskill_tomato.files import write_atomically, write_json
+from maniskill_tomato.folder_lock import only_writer
 from maniskill_tomato.learning.rl.envs import make_env
 from maniskill_tomato.policies.oracle import FARTHEST, SHOULDER, shell_points
 from maniskill_tomato.report_design import markdown_table
@@ -67,7 +68,13 @@ def run_row_benchmark(config: RowBenchmarkConfig) -> str:
 
     Raises:
         InvalidInputError: An option cannot be used, or the folder holds another benchmark.
+        CheckpointError: Another process measures in the folder.
     """
+    with only_writer(config.out, "measures"):
+        return _run_benchmark(config)
+
+
+def _run_benchmark(config: RowBenchmarkConfig) -> str:
     specs = parse_policies(config.policies)
     name = f"{config.split}-{config.transits}"
     options: dict[str, Any] = {"plant": {"seed": config.split, "pool": None}, "transits": config.transits}

@@ -19,6 +19,7 @@ from maniskill_tomato.experiments.rollout import run_episode
 from maniskill_tomato.experiments.statistics import mcnemar_p, wilson_interval
 from maniskill_tomato.experiments.viewpoint_benchmark import MAIN
 from maniskill_tomato.files import write_json
+from maniskill_tomato.folder_lock import only_writer
 from maniskill_tomato.learning.rl.envs import make_env
 from maniskill_tomato.policies.opening import open_policy
 
@@ -32,7 +33,15 @@ def compare_twin(config: TwinConfig, report: Callable[[str], None] = lambda line
 
     Returns:
         The content of summary.json.
+
+    Raises:
+        CheckpointError: Another process measures in the folder.
     """
+    with only_writer(config.out, "measures"):
+        return _compare(config, report)
+
+
+def _compare(config: TwinConfig, report: Callable[[str], None]) -> dict[str, Any]:
     profile = load_profile(config.profile)
     settings = {
         "profile": config.profile,

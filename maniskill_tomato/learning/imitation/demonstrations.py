@@ -13,6 +13,7 @@ import gymnasium as gym
 import torch
 
 from maniskill_tomato.errors import InvalidInputError
+from maniskill_tomato.folder_lock import only_writer
 from maniskill_tomato.policies.protocol import Policy, reseed
 
 NAME = "trajectory"
@@ -49,13 +50,24 @@ def record_demonstrations(
 
     Raises:
         InvalidInputError: The folder holds demonstrations.
+        CheckpointError: Another process records in the folder, or it cannot be made.
     """
+    with only_writer(folder, "records"):
+        return _record(env, planner, episodes, folder, reset_options)
+
+
+def _record(
+    env: gym.Env[Any, Any],
+    planner: Policy,
+    episodes: Iterable[int],
+    folder: Path,
+    reset_options: Callable[[int], dict[str, Any] | None],
+) -> Demonstrations:
     from mani_skill.utils.wrappers.record import RecordEpisode
 
     path = folder / f"{NAME}.h5"
     if path.exists():
         raise InvalidInputError(f"{path} exists; choose another folder, or delete it")
-    folder.mkdir(parents=True, exist_ok=True)
     task: Any = env
     recorder = RecordEpisode(
         task,

@@ -11,6 +11,7 @@ from torch import Tensor
 
 import maniskill_tomato
 from maniskill_tomato.files import write_atomically, write_tensors
+from maniskill_tomato.folder_lock import only_writer
 from maniskill_tomato.learning.blocks import Block, begin_training, run_blocks
 from maniskill_tomato.learning.imitation.imitation_config import ImitationConfig
 from maniskill_tomato.learning.imitation.imitation_fit import fit_actor, fit_recurrent
@@ -53,9 +54,19 @@ def train_imitation(
     Raises:
         InvalidInputError: The folder holds a training with another configuration.
         TrainingDivergedError: A loss is not finite.
+        CheckpointError: Another process trains in the folder, or a file cannot be written.
     """
-    config = config or ImitationConfig()
-    options = env_options or {}
+    with only_writer(out, "trains"):
+        return _train(out, config or ImitationConfig(), jobs, env_options or {}, report)
+
+
+def _train(
+    out: Path,
+    config: ImitationConfig,
+    jobs: int,
+    options: dict[str, Any],
+    report: Callable[[str], None],
+) -> Path:
     begin_training(out, {"config": asdict(config), "env_options": options})
     blocks: list[Block] = []
     path = out / "round-0.pt"

@@ -18,6 +18,7 @@ from tqdm import tqdm
 import maniskill_tomato
 from maniskill_tomato.errors import MissingPackageError
 from maniskill_tomato.files import write_json, write_tensors
+from maniskill_tomato.folder_lock import only_writer
 from maniskill_tomato.learning.interrupt import stop_on_signals
 from maniskill_tomato.learning.rl.export import DenseActor, export_actor
 from maniskill_tomato.learning.rl.gymnasium_env import Array, make_gymnasium_env, normalize_observation
@@ -113,7 +114,13 @@ def train_ppo(env_id: str, config: PpoConfig, run_dir: Path, seed: int, progress
 
     Raises:
         InvalidInputError: The folder holds a run.
+        CheckpointError: Another process trains in the folder, or it cannot be made.
     """
+    with only_writer(run_dir, "trains"):
+        return _train(env_id, config, run_dir, seed, progress)
+
+
+def _train(env_id: str, config: PpoConfig, run_dir: Path, seed: int, progress: bool) -> bool:
     check_run_dir(run_dir)
     torch.set_num_threads(1)
     content = {

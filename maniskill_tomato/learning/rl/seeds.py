@@ -21,6 +21,7 @@ from tqdm import tqdm
 import maniskill_tomato
 from maniskill_tomato.errors import InvalidInputError, TomatoError
 from maniskill_tomato.files import write_json
+from maniskill_tomato.folder_lock import only_writer
 from maniskill_tomato.learning.interrupt import stop_on_signals
 from maniskill_tomato.learning.rl.presets import TrainConfig
 from maniskill_tomato.learning.rl.progress import Progress
@@ -93,11 +94,27 @@ def train_seeds(
 
     Raises:
         InvalidInputError: `seeds` is empty, `jobs` is less than 1, or the folder holds runs.
+        CheckpointError: Another process trains seeds in the folder.
     """
     if not seeds:
         raise InvalidInputError("give one seed or more")
     if jobs is not None and jobs < 1:
         raise InvalidInputError(f"jobs must be 1 or more, got {jobs}")
+    with only_writer(out, "trains"):
+        return _train_seeds(env_id, config, out, seeds, env_options, jobs, overwrite, resume, show_progress)
+
+
+def _train_seeds(
+    env_id: str,
+    config: TrainConfig,
+    out: Path,
+    seeds: Sequence[int],
+    env_options: dict[str, Any],
+    jobs: int | None,
+    overwrite: bool,
+    resume: bool,
+    show_progress: bool,
+) -> list[SeedResult]:
     if (out / "config.json").exists():
         raise InvalidInputError(f"{out} holds a single run; choose another --out for several seeds")
     folders = {seed: out / f"seed-{seed}" for seed in seeds}

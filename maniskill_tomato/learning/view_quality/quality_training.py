@@ -13,6 +13,7 @@ from torch import Tensor
 import maniskill_tomato
 from maniskill_tomato.errors import CheckpointError, InvalidInputError
 from maniskill_tomato.files import write_atomically
+from maniskill_tomato.folder_lock import only_writer
 from maniskill_tomato.learning.blocks import Block, begin_training, run_blocks
 from maniskill_tomato.learning.rl.envs import make_env
 from maniskill_tomato.learning.view_quality.quality_config import (
@@ -52,17 +53,27 @@ def train_view_quality(
 
     Raises:
         InvalidInputError: The folder holds a training with another configuration.
-        CheckpointError: `start_from` cannot be read.
+        CheckpointError: `start_from` cannot be read, or another process trains in the folder.
     """
-    config = config or QualityTrainConfig()
+    with only_writer(out, "trains"):
+        return _train(out, config or QualityTrainConfig(), jobs, env_options or {}, report, start_from)
+
+
+def _train(
+    out: Path,
+    config: QualityTrainConfig,
+    jobs: int,
+    options: dict[str, Any],
+    report: Callable[[str], None],
+    start_from: Path | None,
+) -> Path:
     network: ViewQualityNetwork | None = None
-    settings: dict[str, Any] = {"config": asdict(config), "env_options": env_options or {}}
+    settings: dict[str, Any] = {"config": asdict(config), "env_options": options}
     if start_from is not None:
         network = load_view_quality(start_from).network
         settings["start_from"] = hashlib.sha256(start_from.read_bytes()).hexdigest()
     begin_training(out, settings)
     start = time.perf_counter()
-    options = env_options or {}
     validation_plan = _blocks(
         out / "validation", config, 0, config.validation_episodes, "validation", options
     )
@@ -89,7 +100,7 @@ def train_view_quality(
         )
         facts = {
             "env_id": ENV_ID,
-            "env_options": json.dumps(env_options or {}),
+            "env_options": json.dumps(options),
             "package_version": maniskill_tomato.__version__,
             "looks": len(data.scalars),
             "episodes": len(data.reachable),

@@ -14,6 +14,7 @@ from torch import Tensor, nn
 
 from maniskill_tomato.errors import CheckpointError, TrainingDivergedError
 from maniskill_tomato.files import read_tensors, write_atomically
+from maniskill_tomato.folder_lock import only_writer
 from maniskill_tomato.network_weights import fill_network
 from maniskill_tomato.segmentation.training.training_pictures import TrainingImages, TrainingPicture
 from maniskill_tomato.segmentation.weights import save_weights
@@ -153,8 +154,13 @@ class DetectorTraining(ABC, Generic[Network]):
 
         Raises:
             TrainingDivergedError: A loss is no longer a finite number.
-            CheckpointError: A file cannot be written, or the checkpoint is of other settings.
+            CheckpointError: A file cannot be written, the checkpoint is of other settings, or another process trains
+                in the folder.
         """
+        with only_writer(out, "trains"):
+            return self._run(out, report, stopped)
+
+    def _run(self, out: Path, report: Callable[[str], None], stopped: Callable[[], bool]) -> Path | None:
         if (out / CHECKPOINT).is_file():
             self.resume(out)
         while self.step < self.steps:

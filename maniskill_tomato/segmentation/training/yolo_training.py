@@ -8,6 +8,7 @@ from typing import Any
 
 from maniskill_tomato.errors import CheckpointError, InvalidInputError
 from maniskill_tomato.files import write_atomically
+from maniskill_tomato.folder_lock import only_writer
 from maniskill_tomato.segmentation.datasets.annotations import AnnotatedImage, ignored_fruit
 from maniskill_tomato.segmentation.datasets.picture_files import write_picture
 from maniskill_tomato.segmentation.instances import TOMATO
@@ -96,8 +97,13 @@ def train_yolo(images: TrainingImages, out: Path, settings: dict[str, Any], mode
     Raises:
         InvalidInputError: There is no image to train or to validate on, or one cannot be read.
         MissingPackageError: Ultralytics is not installed.
-        CheckpointError: A file cannot be written.
+        CheckpointError: A file cannot be written, or another process trains in the folder.
     """
+    with only_writer(out, "trains"):
+        return _train(images, out, settings, model, seed)
+
+
+def _train(images: TrainingImages, out: Path, settings: dict[str, Any], model: str, seed: int) -> Path:
     network = import_ultralytics().YOLO(model)
     data = write_yolo_data([image for one in images.sets for image in one], images.validation, out / "data")
     network.train(
