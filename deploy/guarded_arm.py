@@ -2,6 +2,7 @@
 comes back during a move is held against its plan (`move_watch`)."""
 
 import logging
+from collections import deque
 from collections.abc import Callable
 from typing import Final
 
@@ -17,6 +18,7 @@ from maniskill_tomato.deploy.deploy_errors import (
     StaleError,
     StoppedError,
 )
+from maniskill_tomato.deploy.fault_state import STATES_KEPT
 from maniskill_tomato.deploy.interface import LIMIT_SLACK, Arm, ArmState, Float64, JointMove
 from maniskill_tomato.deploy.move_watch import MoveWatch
 from maniskill_tomato.deploy.safety import Safety
@@ -52,6 +54,10 @@ class GuardedArm:
         self.safety = safety
         self._clock = clock
         self._last: ArmState | None = None
+        self.recent: deque[ArmState] = deque(maxlen=STATES_KEPT)
+        """The last readings, as the arm gave them, wrong ones too; the newest last."""
+        self.refused = ""
+        """What the last command that was refused was told."""
         self._under_way: JointMove | None = None
         self.watch: MoveWatch | None = None
         """Of the move under way, or of the last one."""
@@ -71,6 +77,16 @@ class GuardedArm:
         return self._arm.simulated
 
     @property
+    def is_under_way(self) -> bool:
+        """Whether a move was sent whose end nobody has seen."""
+        return self._under_way is not None
+
+    @property
+    def why_stopped(self) -> str | None:
+        """Why no move is sent until the next run; None if moves are sent."""
+        return self._stopped
+
+    @property
     def can_stop(self) -> bool:
         """Whether `stop` halts a move under way."""
         return self._arm.can_stop
@@ -83,6 +99,7 @@ class GuardedArm:
             DeployError: The arm does not give one.
         """
         state = self._arm.read(self.safety.config.max_state_age)
+        self.recent.append(state)
         for name, values in (("positions", state.joint_positions), ("velocities", state.joint_velocities)):
             if not np.isfinite(values).all():
                 raise FaultError(f"the arm reports joint {name} that are not finite: {values.tolist()}")
@@ -136,7 +153,8 @@ class GuardedArm:
         state = self.read()
         refusal = self.safety.check(move, state, self._clock.now(), frame_stamp, points_w)
         if refusal is not None:
-            raise RefusedError(str(refusal))
+            self.refused = str(refusal)
+            raise RefusedError(self.refused)
         if self._under_way is not None:
             raise RefusedError("busy: the last move has not ended")
         self._check_stopped()

@@ -31,6 +31,14 @@ from maniskill_tomato.deploy.deploy_errors import (
     RefusedError,
     StoppedError,
 )
+from maniskill_tomato.deploy.fault_state import (
+    FaultState,
+    detail_of,
+    lines_of,
+    plan_facts,
+    reason_of,
+    state_facts,
+)
 from maniskill_tomato.deploy.goal import Goal, Look, OneFruit
 from maniskill_tomato.deploy.interface import Float64, Frame, JointMove
 from maniskill_tomato.deploy.move_choice import Choice, MoveChooser, MoveRequest
@@ -41,7 +49,7 @@ from maniskill_tomato.deploy.safety import Refusal
 from maniskill_tomato.deploy.stops import Stops
 from maniskill_tomato.deploy.way import Way, WayPlanner
 from maniskill_tomato.deploy.workcell import Workcell
-from maniskill_tomato.errors import PolicyError, TomatoError
+from maniskill_tomato.errors import PolicyError
 from maniskill_tomato.policies.lattice_planner import LatticePlanner
 from maniskill_tomato.policies.next_best_view import NextBestView
 from maniskill_tomato.policies.opening import shipped_policy
@@ -181,10 +189,12 @@ class Loop:
         self._last: Step | None = None
         self._true_fraction: float | None = None
         self._times = _StageTimes()
+        self._not_finite: FaultState | None = None
 
     def run(self) -> RunResult:
         """Runs to an end; faults end it too, and are told in the result."""
         began, device_began = time.perf_counter(), self._clock.now()
+        fault: FaultState | None = None
         try:
             while True:
                 self._one_look()
@@ -192,13 +202,14 @@ class Loop:
             reason, detail, is_fault = end.reason, end.detail, end.is_fault
         except StoppedError as error:
             reason, detail, is_fault = error.reason, str(error), False
-        except PolicyError as error:
-            reason, detail, is_fault = "policy", str(error), True
-        except DeployError as error:
-            reason, detail, is_fault = error.reason, str(error), True
-        except TomatoError as error:
-            reason, detail, is_fault = "fault", str(error), True
-        end_state = self._come_to_rest()
+        except Exception as error:
+            reason, detail, is_fault = reason_of(error), detail_of(error), True
+            fault = self._fault_state(reason, detail, error)
+        fault = fault or self._not_finite
+        try:
+            end_state = self._come_to_rest()
+        except Exception as error:
+            end_state = f"what the arm does nobody knows ({detail_of(error)}); use the emergency stop"
         try:
             device_seconds = self._clock.now() - device_began
         except DeployError:
@@ -218,6 +229,7 @@ class Loop:
             device_seconds=device_seconds,
             stage_ms=self._times.mean_ms,
             end_state=end_state,
+            fault=fault,
         )
         self._log(f"end: {reason}: {detail} ({end_state})")
         return result
@@ -512,6 +524,8 @@ class Loop:
             self._end(step, "declined", "the move was not confirmed")
 
     def _count_refusal(self, step: Step, why: str) -> None:
+        if why.startswith("not_finite") and self._not_finite is None:
+            self._not_finite = self._fault_state("not_finite", why)
         self._refused += 1
         self._refused_in_a_row += 1
         _logger.info("move %d refused: %s", self._moves, why)
@@ -536,13 +550,37 @@ class Loop:
         self._record(replace(step, outcome=reason, detail=detail))
         raise _End(reason, detail)
 
-    def _come_to_rest(self) -> str:
-        """Leaves the arm without a command; says what it does then."""
+    def _fault_state(self, reason: str, detail: str, error: Exception | None = None) -> FaultState:
+        """What is known now, before anything is done about it."""
+        arm, journey, stamp = self._arm, self._journey, None
         with suppress(DeployError):
+            stamp = self._clock.now()
+        return FaultState(
+            reason=reason,
+            detail=detail,
+            stamp=stamp,
+            arm_states=tuple(state_facts(state) for state in arm.recent),
+            plan=None if arm.watch is None else plan_facts(arm.watch, arm.is_under_way),
+            refused=arm.refused,
+            stop=arm.why_stopped or self._stops.reason,
+            memory={
+                "looks": len(self._fractions),
+                "moves": self._moves,
+                "refused": self._refused,
+                "views to go back by": len(self._trail),
+                "pieces of a way left": 0 if journey is None else len(journey.pieces),
+                "plant points": len(self._points),
+            },
+            traceback="" if error is None else lines_of(error),
+        )
+
+    def _come_to_rest(self) -> str:
+        """Leaves the arm without a command, whatever fails; says what it does then."""
+        with suppress(Exception):
             if self._arm.wait(0.0) and self._speed() < AT_REST:
                 return "the arm stands and holds its position"
         if self._arm.stop():
-            with suppress(DeployError):
+            with suppress(Exception):
                 self._arm.wait(STOP_TIME)
             speed = self._speed()
             if speed < AT_REST:
@@ -556,7 +594,7 @@ class Loop:
         """Of the fastest joint as it is read, in [rad/s]; infinite where the arm does not answer."""
         try:
             return float(np.abs(self._arm.read().joint_velocities).max())
-        except DeployError:
+        except Exception:
             return math.inf
 
     def _record(self, step: Step) -> None:

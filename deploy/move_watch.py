@@ -65,16 +65,17 @@ class MoveWatch:
             seconds: How long the driver expects it to take, in [s].
             now: The time, in [s].
         """
-        self._start = np.array(start)
-        self._turn = move.joint_positions - self._start
+        self.start = np.array(start)
+        self.goal = move.joint_positions
+        self._turn = self.goal - self.start
         self._largest = float(np.abs(self._turn).max())
         cruise = float((np.abs(self._turn) / (VELOCITY_LIMITS * move.speed_fraction)).max())
         self._speed = np.abs(self._turn) / cruise if cruise > 0.0 else np.zeros_like(self._turn)
-        self._fraction = move.speed_fraction
-        self._seconds = seconds
-        self._began = self._last_stamp = now
+        self.speed_fraction = move.speed_fraction
+        self.seconds = seconds
+        self.began = self._last_stamp = now
         # The smallest of q - v t and of -q - v t so far: no later reading may lie farther above them than the slack.
-        self._lowest = np.stack([self._start, -self._start])
+        self._lowest = np.stack([self.start, -self.start])
         self._watched = self._since_turn = self._since_there = 0.0
         self._turned_to = self._farthest = 0.0
         self.worst: dict[str, float] = {"off_path": 0.0, "back": 0.0, "fast": 0.0, "late": 0.0, "still": 0.0}
@@ -101,7 +102,7 @@ class MoveWatch:
         departure = (
             self._beside(joint_positions, share)
             or self._back(done)
-            or self._fast(joint_positions, earliest - self._began, stamp - self._began)
+            or self._fast(joint_positions, earliest - self.began, stamp - self.began)
             or self._slow(share, done, gap)
         )
         self._farthest = max(self._farthest, done)
@@ -112,10 +113,10 @@ class MoveWatch:
         length = float(self._turn @ self._turn)
         if length == 0.0:
             return 1.0
-        return min(max(float((joints - self._start) @ self._turn) / length, 0.0), 1.0)
+        return min(max(float((joints - self.start) @ self._turn) / length, 0.0), 1.0)
 
     def _beside(self, joints: Float64, share: float) -> Departure | None:
-        off = np.abs(joints - self._start - share * self._turn)
+        off = np.abs(joints - self.start - share * self._turn)
         k = int(off.argmax())
         self._note("off_path", off[k] / PATH_TOLERANCE)
         if off[k] <= PATH_TOLERANCE:
@@ -148,7 +149,7 @@ class MoveWatch:
         return Departure(
             kind="fast",
             detail=f"{JOINT_NAMES[int(k)]} is faster than asked: {worst:.3f} rad ahead of {limit[k]:.3f} rad/s, "
-            f"{SPEED_TOLERANCE} times the speed fraction {self._fraction:g}; allowed are {PATH_TOLERANCE} rad",
+            f"{SPEED_TOLERANCE} times the speed fraction {self.speed_fraction:g}; allowed are {PATH_TOLERANCE} rad",
         )
 
     def _slow(self, share: float, done: float, gap: float) -> Departure | None:
@@ -166,7 +167,7 @@ class MoveWatch:
                 detail=f"the arm is there, but the driver has not said so for {self._since_there:.1f} s; it may be "
                 "blocked just before its end",
             )
-        allowed = LATE_FACTOR * self._seconds * share + LATE_S
+        allowed = LATE_FACTOR * self.seconds * share + LATE_S
         self._note("late", self._watched / allowed)
         self._note("still", self._since_turn / STILL_S)
         if self._since_turn > STILL_S:

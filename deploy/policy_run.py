@@ -4,7 +4,7 @@ import json
 import logging
 import math
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Final
@@ -16,7 +16,9 @@ from numpy.typing import NDArray
 from maniskill_tomato import __version__
 from maniskill_tomato.deploy.clock import Clock
 from maniskill_tomato.deploy.deploy_errors import RecordingError
+from maniskill_tomato.deploy.fault_state import FaultState, early_fault
 from maniskill_tomato.deploy.goal import Goal
+from maniskill_tomato.deploy.interface import Float64
 from maniskill_tomato.deploy.loop import TASK, Loop, default_policy
 from maniskill_tomato.deploy.profile import Profile
 from maniskill_tomato.deploy.recording import McapRecorder
@@ -41,6 +43,9 @@ MARK = (0, 230, 255)
 
 RECORDING = "run.mcap"
 """Name of the recording in the output folder."""
+
+FAULT_RECORDING = "fault.mcap"
+"""Of one that holds a fault alone: where no recording was asked for, or it cannot be written to."""
 
 _logger = logging.getLogger(__name__)
 
@@ -153,6 +158,15 @@ def run_goal(
     """
     profile, workcell = config.profile, prepared.workcell
     stops = workcell.listen(config.out, keyboard)
+    with suppress(OSError):
+        (config.out / FAULT_RECORDING).unlink()
+    mount, facts = profile.T_flange_camera, prepared.facts
+    info = {**facts, "profile_text": profile.text, "T_flange_camera": mount.tolist()}
+    recorder: McapRecorder | None = None
+
+    def keep(fault: FaultState) -> str:
+        return keep_fault(fault, recorder, config.out, info, workcell.clock, mount)
+
     with ExitStack() as stack:
         arm = stack.enter_context(workcell.arm)
         camera = stack.enter_context(workcell.camera)
@@ -160,19 +174,64 @@ def run_goal(
             workcell.check_calibration()
         for problem in workcell.calibration_problems():
             _logger.warning("only a dry run: %s", problem)
-        facts = {**prepared.facts, "devices": {"arm": arm.describe(), "camera": camera.describe()}}
+        facts = {**facts, "devices": {"arm": arm.describe(), "camera": camera.describe()}}
+        info |= facts
         every = list(recorders)
         if config.record:
-            mount = profile.T_flange_camera
-            info = {**facts, "profile_text": profile.text, "T_flange_camera": mount.tolist()}
             recorder = McapRecorder(config.out / RECORDING, info, workcell.clock, mount)
             every.append(stack.enter_context(recorder))
         stack.enter_context(stops)
-        # What is slow the first time is done before the loop's first beat, from which on the heartbeat is watched.
-        load_kernels()
-        workcell.perception.warm_up(camera.intrinsics)
-        loop = Loop(workcell, prepared.policy, stops, prepared.mode, every, confirm, goal)
-        return loop.run(), facts
+        try:
+            # What is slow the first time is done before the loop's first beat, from which on the heartbeat is watched.
+            load_kernels()
+            workcell.perception.warm_up(camera.intrinsics)
+            result = Loop(workcell, prepared.policy, stops, prepared.mode, every, confirm, goal).run()
+        except Exception as error:
+            # Before the loop's first look, in which nothing moves.
+            keep(early_fault(error))
+            raise
+        if result.fault is not None:
+            result = replace(result, fault_file=keep(result.fault))
+    return result, facts
+
+
+def keep_fault(
+    fault: FaultState,
+    recorder: McapRecorder | None,
+    out: Path,
+    info: dict[str, Any],
+    clock: Clock,
+    T_flange_camera: Float64,
+) -> str:
+    """Writes what is known of a fault into the run's recording, or into one of its own. Never raises.
+
+    Args:
+        fault: What is known.
+        recorder: Of the run; None if it has none.
+        out: Folder of the run.
+        info: What was run, for a recording of its own.
+        clock: Of the run.
+        T_flange_camera: The colour camera's optical frame in `link_ee`. Shape (4, 4).
+
+    Returns:
+        Name of the file that holds it; empty if the disk takes none.
+    """
+    try:
+        if recorder is not None:
+            recorder.fault(fault)
+            return recorder.path.name
+    except RecordingError as error:
+        _logger.warning("%s", error)
+    path = out / FAULT_RECORDING
+    try:
+        with McapRecorder(path, info, clock, T_flange_camera) as alone:
+            alone.fault(fault)
+        return path.name
+    except (TomatoError, OSError) as error:
+        _logger.error("the state at the fault is lost: %s", error)
+        with suppress(OSError):
+            path.unlink(missing_ok=True)
+        return ""
 
 
 def kept_result(result: RunResult, write: Callable[[], None]) -> RunResult:

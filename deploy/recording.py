@@ -3,8 +3,9 @@
 As `foxglove.*` messages in Protobuf: `/tf` (every link), `/joint_states`, `/camera/calibration`, `/camera/color`,
 `/camera/mask` (PNG), `/camera/depth` (16UC1, in [mm]), `/camera/depth_m` (32FC1, in [m], where millimetres lose
 something), `/camera/points`, `/arm/shape` (once) and `/log`. As ROS 2's string: `/robot_description` (once). As JSON:
-`/info` (once: profile, policy, seed), `/step` (everything else of a look, numbers as they were) and `/truth`
-(simulated cameras only). All times are the run's clock, counted from the date at which the recording began.
+`/info` (once: profile, policy, seed), `/step` (everything else of a look, numbers as they were), `/truth` (simulated
+cameras only) and `/fault` (the last message of a run that a fault ended). All times are the run's clock, counted from
+the date at which the recording began.
 """
 
 import base64
@@ -22,8 +23,9 @@ from numpy.typing import NDArray
 
 from maniskill_tomato.deploy.clock import Clock
 from maniskill_tomato.deploy.deploy_errors import RecordingError
+from maniskill_tomato.deploy.fault_state import FaultState
 from maniskill_tomato.deploy.interface import Float64, Frame
-from maniskill_tomato.deploy.recording_schemas import INFO, STEP, TRUTH
+from maniskill_tomato.deploy.recording_schemas import FAULT, INFO, STEP, TRUTH
 from maniskill_tomato.deploy.run_records import Step
 from maniskill_tomato.deploy.viewer_arm import link_frames, simple_urdf
 
@@ -38,6 +40,7 @@ JSON_TOPICS: Final = {
     "/info": ("maniskill_tomato.RunInfo", INFO),
     "/step": ("maniskill_tomato.Step", STEP),
     "/truth": ("maniskill_tomato.Truth", TRUTH),
+    "/fault": ("maniskill_tomato.Fault", FAULT),
 }
 """Name and JSON Schema of our own messages."""
 
@@ -84,7 +87,7 @@ class McapRecorder:
                 "--no-record"
             ) from error
         self.path = path
-        self._failed = False
+        self._failed = self._is_finished = False
         self._made, self._timestamp = viewer_messages, messages.Timestamp
         self._T_flange_camera = T_flange_camera
         self._clock_start, self._unix_start_ns = clock.now(), time.time_ns()
@@ -125,13 +128,33 @@ class McapRecorder:
 
     def close(self) -> None:
         """Finishes the file; on a full disk what was written stays readable up to there. Never raises."""
-        if not self._failed:
-            try:
-                self._writer.finish()
-            except OSError as error:
-                _logger.warning("%s", self._error(error))
+        try:
+            self._finish()
+        except RecordingError as error:
+            _logger.warning("%s", error)
         with suppress(OSError):
             self._file.close()
+
+    def fault(self, fault: FaultState) -> None:
+        """Writes what is known of a fault, and finishes the file: whoever asks is told whether it is kept.
+
+        Raises:
+            RecordingError: It is not.
+        """
+        stamp = self._clock_start if fault.stamp is None else fault.stamp
+        self._write_json("/fault", stamp, fault.to_json())
+        self._finish()
+
+    def _finish(self) -> None:
+        if self._failed or self._is_finished:
+            return
+        self._is_finished = True
+        try:
+            self._writer.finish()
+            self._file.flush()
+        except OSError as error:
+            self._failed = True
+            raise self._error(error) from error
 
     def step(self, step: Step) -> None:
         frame, stamp, made = step.frame, step.frame.stamp, self._made

@@ -101,6 +101,45 @@ STEP: Final = _object(
 )
 """Of `/step`."""
 
+_ANY_NUMBER: Final[Schema] = {"anyOf": [_NUMBER, {"enum": ["nan", "inf", "-inf"]}]}
+_ANY_JOINTS: Final[Schema] = {**_JOINTS, "items": _ANY_NUMBER}
+
+FAULT: Final = _object(
+    {
+        "reason": _TEXT,
+        "detail": _TEXT,
+        "stamp": {**_optional(_NUMBER), "description": "when it was noticed, by the run's clock, in [s]"},
+        "arm_states": {
+            "type": "array",
+            "items": _object(
+                {
+                    "stamp": _ANY_NUMBER,
+                    "joint_positions": {**_ANY_JOINTS, "description": "in [rad]"},
+                    "joint_velocities": {**_ANY_JOINTS, "description": "in [rad/s]"},
+                }
+            ),
+        },
+        "plan": _optional(
+            _object(
+                {
+                    "start": {**_JOINTS, "description": "in [rad]"},
+                    "goal": {**_JOINTS, "description": "in [rad]"},
+                    "speed_fraction": _NUMBER,
+                    "seconds": _NUMBER,
+                    "sent": {**_NUMBER, "description": "in [s]"},
+                    "under_way": {"type": "boolean"},
+                    "worst": {"type": "object", "additionalProperties": _ANY_NUMBER},
+                }
+            )
+        ),
+        "refused": _TEXT,
+        "stop": _optional(_TEXT),
+        "memory": {"type": "object", "additionalProperties": _INTEGER},
+        "traceback": _TEXT,
+    }
+)
+"""Of `/fault`."""
+
 TRUTH: Final = _object(
     {
         "labels": {"type": "string", "contentEncoding": "base64", "description": "PNG of 16 bits"},

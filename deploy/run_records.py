@@ -4,6 +4,7 @@ import math
 from dataclasses import asdict, dataclass, field
 from typing import Any, Literal, Protocol
 
+from maniskill_tomato.deploy.fault_state import FaultState
 from maniskill_tomato.deploy.interface import Float64, Frame
 from maniskill_tomato.deploy.robot_perception import Sighting
 from maniskill_tomato.errors import InvalidInputError, check_ranges
@@ -110,10 +111,14 @@ class RunResult:
     """What the arm does now."""
     report_error: str = ""
     """Why its report could not be written; empty if it was."""
+    fault: FaultState | None = None
+    """What is known of a fault, or of a number that was not finite; None if there was neither."""
+    fault_file: str = ""
+    """The recording in the output folder that holds it; empty if none does."""
 
     def to_json(self) -> dict[str, Any]:
-        """Plain numbers, strings and lists."""
-        return {name: value for name, value in asdict(self).items() if name != "report_error"}
+        """Plain numbers, strings and lists; a fault's state is in its file."""
+        return {name: value for name, value in asdict(self).items() if name not in ("report_error", "fault")}
 
 
 class Recorder(Protocol):

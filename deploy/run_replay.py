@@ -15,6 +15,7 @@ import torch
 
 from maniskill_tomato.deploy.clock import SimulatedClock
 from maniskill_tomato.deploy.deploy_errors import CutOffError, NotConnectedError, RecordingError
+from maniskill_tomato.deploy.fault_state import FaultState
 from maniskill_tomato.deploy.guarded_arm import GuardedArm
 from maniskill_tomato.deploy.inspection_run import whole_row
 from maniskill_tomato.deploy.interface import Arm, ArmState, Camera, Float64, Frame, FrameTruth, JointMove
@@ -63,6 +64,8 @@ class RecordedRun:
     steps: tuple[RecordedStep, ...]
     is_cut_off: bool
     """Whether the file ends early; `steps` are those that are whole."""
+    fault: FaultState | None = None
+    """What was known of a fault; None if there was none."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -94,11 +97,12 @@ def load_recording(path: Path) -> RecordedRun:
     """Reads a recording of `deploy run` or `deploy inspect`; of one that was cut off, the looks that are whole.
 
     Raises:
-        RecordingError: It is missing, damaged, of another kind, or holds no whole look.
+        RecordingError: It is missing, damaged, of another kind, or holds neither a whole look nor a fault.
     """
     info: dict[str, Any] | None = None
     steps: list[RecordedStep] = []
     parts: dict[str, Any] = {}
+    fault: FaultState | None = None
     is_cut_off = False
     try:
         for topic, message in read_messages(path):
@@ -110,19 +114,26 @@ def load_recording(path: Path) -> RecordedRun:
                 except (KeyError, TypeError, ValueError, AttributeError) as error:
                     raise RecordingError(f"{path}: look {len(steps)} is incomplete ({error})") from error
                 parts = {}
+            elif topic == "/fault":
+                try:
+                    fault = FaultState.from_json(message)
+                except (KeyError, TypeError, ValueError, AttributeError) as error:
+                    raise RecordingError(
+                        f"{path}: what it says of a fault is incomplete ({error})"
+                    ) from error
             elif topic != "/log":
                 parts[topic] = message
     except CutOffError:
         is_cut_off = True
     if info is None or info.get("format") not in FORMATS:
         raise RecordingError(f"{path} is no recording of `deploy run` ({' or '.join(FORMATS)})")
-    if not steps:
+    if not steps and fault is None:
         why = "it is cut off" if is_cut_off else "the run ended"
         raise RecordingError(f"{path} holds no look; {why} before its first")
     name = Path(f"{info.get('profile', 'recorded')}.toml")
     mount = info.get("T_flange_camera")
     profile = parse_profile(str(info["profile_text"]), path.parent / name, mount)
-    return RecordedRun(info=info, profile=profile, steps=tuple(steps), is_cut_off=is_cut_off)
+    return RecordedRun(info=info, profile=profile, steps=tuple(steps), is_cut_off=is_cut_off, fault=fault)
 
 
 def replay(recorded: RecordedRun, policy: str | None = None) -> Replay:
@@ -133,8 +144,10 @@ def replay(recorded: RecordedRun, policy: str | None = None) -> Replay:
         policy: Another policy than the recorded one.
 
     Raises:
-        DeployError: The recording's profile or policy cannot be used today.
+        DeployError: The recording's profile or policy cannot be used today, or it holds a fault and no look.
     """
+    if not recorded.steps:
+        raise RecordingError("the recording holds a fault and no look; there is nothing to replay")
     clock = SimulatedClock(recorded.steps[0].frame.stamp - BEFORE)
     playback = _Playback(recorded.steps, clock)
     comparison = _Comparison(recorded.steps)

@@ -304,6 +304,7 @@ class Safety:
                 meets = chords_meet(positions, np.array(box.low) - error, np.array(box.high) + error)
                 if _within(positions[0], box):
                     meets[:leaving] = False
+                    meets[leaving - 1] = _within(positions[leaving], box)
                 if meets.any():
                     k = int(meets.argmax()) + 1
                     return Refusal(

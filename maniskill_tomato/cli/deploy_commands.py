@@ -86,6 +86,7 @@ class DeployRun(_Moving):
         if not result.report_error:
             print(f"result  {self.out / 'result.json'}")
             print(f"report  {self.out / 'report.png'}")
+        _tell_fault(result, self.out)
         _end(result)
 
 
@@ -126,6 +127,7 @@ class DeployInspect(_Moving):
         if not result.report_error:
             print(f"list    {self.out / 'inspection.json'}")
             print(f"report  {self.out / 'report.html'}")
+        _tell_fault(result, self.out)
         _end(result)
 
 
@@ -156,10 +158,14 @@ class DeployCheck:
 
 @dataclass(frozen=True, kw_only=True)
 class DeployReplay:
-    """Run a recording through today's code, and say where it decides otherwise (exit status 1)."""
+    """Run a recording through today's code, and say where it decides otherwise (exit status 1).
+
+    Of a run that a fault ended it first tells what was known then: the arm's last readings, the move under way, what
+    was refused, and where in the code it was noticed.
+    """
 
     recording: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="RECORDING")]
-    """The run.mcap of a run."""
+    """The run.mcap of a run, or its fault.mcap."""
     policy: str | None = None
     """Another policy than the recorded one."""
 
@@ -168,11 +174,18 @@ class DeployReplay:
         check_file("RECORDING", self.recording)
         _check_policy(self.policy)
 
+        from maniskill_tomato.deploy.fault_state import explained
         from maniskill_tomato.deploy.run_replay import each_difference, load_recording, replay
 
         recorded = load_recording(self.recording)
         if recorded.is_cut_off:
             print(f"the recording is cut off; its first {len(recorded.steps)} looks are whole")
+        if recorded.fault is not None:
+            for line in explained(recorded.fault, recorded.profile.name):
+                print(line)
+            if not recorded.steps:
+                print("no look was taken; there is nothing to replay")
+                return
         found = replay(recorded, self.policy)
         for line in each_difference(found):
             print(line)
@@ -202,6 +215,11 @@ class DeployProfiles:
             return
         for name in profile_names():
             print(f"{name:<16}{load_profile(name).description}")
+
+
+def _tell_fault(result: "RunResult", out: Path) -> None:
+    if result.fault_file:
+        print(f"fault   {out / result.fault_file}: `maniskill-tomato deploy replay` shows what was known")
 
 
 def _end(result: "RunResult") -> None:

@@ -112,6 +112,8 @@ def test_out_of_a_zone_leads_a_way_and_into_the_next_one_none() -> None:
     assert check(Safety(SafetyConfig(forbidden=(here,))), start, goal) is None
     refusal = check(Safety(SafetyConfig(forbidden=(here, ahead))), start, goal)
     assert refusal is not None and refusal.reason == "forbidden_zone"
+    refusal = check(Safety(SafetyConfig(forbidden=(here,))), start, start)
+    assert refusal is not None and refusal.reason == "forbidden_zone", "there it may not stay"
     deep = Box(low=tuple(way[0] - 0.1), high=tuple(way[0] + 0.1))
     refusal = check(Safety(SafetyConfig(forbidden=(deep,))), start, goal)
     assert refusal is not None and refusal.reason == "forbidden_zone", "it must be out of it at once"
