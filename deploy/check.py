@@ -74,7 +74,11 @@ def check(profile: Profile, policy: str | None, seed: int, out: Path | None) -> 
             refusal = workcell.guarded_arm.safety.check(
                 stay, workcell.guarded_arm.read(), workcell.clock.now()
             )
-            detail = "the arm stands inside the envelope" if refusal is None else str(refusal)
+            detail = (
+                f"the {workcell.arm.model.name} stands inside the envelope"
+                if refusal is None
+                else str(refusal)
+            )
             yield Finding("limits", detail, refusal is None)
             can_stop = workcell.guarded_arm.can_stop
             detail = "can be stopped" if can_stop else "only the smartPAD or the emergency stop halts a move"
@@ -110,7 +114,7 @@ def _look(
             raise RecordingError(f"cannot write {path}: {error.__cause__ or error}") from error
         yield Finding("saved", str(path))
     perception = workcell.perception
-    robot_belief = RobotBelief(profile.T_flange_camera, profile.loop.max_moves)
+    robot_belief = RobotBelief(profile.T_flange_camera, profile.loop.max_moves, model=workcell.arm.model)
     perception.begin(workcell.target_position())
     view = perception.look(frame, robot_belief.camera_pose(joints))
     if view is None:

@@ -1,4 +1,4 @@
-"""Collisions of the arm with itself, the table and things that stand about, by MuJoCo on the package's URDF."""
+"""Collisions of the arm with itself, the table and things that stand about, by MuJoCo on its URDF."""
 
 from dataclasses import dataclass
 from typing import Any, Final
@@ -7,10 +7,12 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
+from maniskill_tomato.deploy.arm_shapes import arm_shapes
 from maniskill_tomato.deploy.interface import Float64
 from maniskill_tomato.errors import InvalidInputError
-from maniskill_tomato.robot.d435 import CAMERA_LINK_NAME, T_flange_camera_color_optical, camera_link_pose
-from maniskill_tomato.robot.robot_description import urdf_path
+from maniskill_tomato.robot.arm_model import ArmModel
+from maniskill_tomato.robot.d435 import T_flange_camera_color_optical
+from maniskill_tomato.robot.iiwa14 import IIWA14
 
 mj: Any = mujoco
 
@@ -61,19 +63,18 @@ class Contact:
     """After so much of the move."""
 
 
-def arm_spec(table_height: float, obstacles: tuple[Box, ...], T_flange_camera: Float64) -> Any:
+def arm_spec(
+    table_height: float, obstacles: tuple[Box, ...], T_flange_camera: Float64, model: ArmModel = IIWA14
+) -> Any:
     """The arm with its collision shapes, the table and what stands about, not compiled yet.
 
     Args:
         table_height: Height of the surface that the arm stands on, in [m].
         obstacles: Boxes, geoms `obstacle N`.
         T_flange_camera: The camera's optical frame in `link_ee`, which its body goes with. Shape (4, 4).
+        model: Of the arm.
     """
-    spec = mj.MjSpec.from_file(urdf_path())
-    pose = camera_link_pose(T_flange_camera)
-    camera = spec.body(CAMERA_LINK_NAME)
-    camera.pos = pose[:3, 3]
-    mj.mju_mat2Quat(camera.quat, np.ascontiguousarray(pose[:3, :3]).ravel())
+    spec = arm_shapes(model, T_flange_camera)
     world = spec.worldbody
     world.add_geom(
         name=TABLE, type=mj.mjtGeom.mjGEOM_PLANE, size=[2.0, 2.0, 0.1], pos=[0.0, 0.0, table_height]
@@ -101,6 +102,7 @@ class CollisionChecker:
         obstacles: tuple[Box, ...] = (),
         obstacle_clearance: float = 0.05,
         T_flange_camera: Float64 = T_flange_camera_color_optical,
+        model: ArmModel = IIWA14,
     ) -> None:
         """Compiles the model.
 
@@ -111,27 +113,28 @@ class CollisionChecker:
             obstacles: Boxes to stay clear of.
             obstacle_clearance: By so much, in [m].
             T_flange_camera: The camera's optical frame in `link_ee`, which its body goes with. Shape (4, 4).
+            model: Of the arm.
         """
-        spec = arm_spec(table_height, obstacles, T_flange_camera)
+        spec = arm_spec(table_height, obstacles, T_flange_camera, model)
         self._model: Any = spec.compile()
         self._data: Any = mj.MjData(self._model)
-        model = self._model
-        model.geom_margin[:] = max(table_clearance, self_clearance, obstacle_clearance) + LOOK_AHEAD
-        names = [self._name(g) for g in range(model.ngeom)]
+        compiled = self._model
+        compiled.geom_margin[:] = max(table_clearance, self_clearance, obstacle_clearance) + LOOK_AHEAD
+        names = [self._name(g) for g in range(compiled.ngeom)]
         self._names = names
         # Links that are welded together count as one; the base is welded to the world.
-        weld = model.body_weldid[model.geom_bodyid]
-        parent = model.body_weldid[model.body_parentid[weld]]
-        in_world = model.geom_bodyid == 0
+        weld = compiled.body_weldid[compiled.geom_bodyid]
+        parent = compiled.body_weldid[compiled.body_parentid[weld]]
+        in_world = compiled.geom_bodyid == 0
         is_table = np.array([name.startswith(TABLE) for name in names])
         is_obstacle = np.array([name.startswith(OBSTACLE) for name in names])
         # By pair of shapes. Neighbours have at most one joint between them.
         neighbours = (weld[:, None] == weld) | (parent[:, None] == weld) | (weld[:, None] == parent)
         self._ignored = neighbours & ~(in_world[:, None] | in_world)
-        self._needed = np.full((model.ngeom, model.ngeom), self_clearance)
+        self._needed = np.full((compiled.ngeom, compiled.ngeom), self_clearance)
         self._needed[is_obstacle[:, None] | is_obstacle] = obstacle_clearance
         self._needed[is_table[:, None] | is_table] = table_clearance
-        levers = np.stack([self._levers(g) for g in range(model.ngeom)])
+        levers = np.stack([self._levers(g) for g in range(compiled.ngeom)])
         # A joint that moves both shapes moves neither about the other.
         moves = levers > 0.0
         self._pair_levers = np.where(moves[:, None] ^ moves, levers[:, None] + levers, 0.0)

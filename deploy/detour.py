@@ -20,7 +20,6 @@ from maniskill_tomato.deploy.interface import ArmState, Float64, JointMove
 from maniskill_tomato.deploy.motion_bounds import joint_path
 from maniskill_tomato.deploy.plant_points import sphere_distances
 from maniskill_tomato.deploy.safety import Safety
-from maniskill_tomato.robot.iiwa14 import EE_LINK_NAME, LINK_NAMES
 from maniskill_tomato.robot.kinematics import forward_kinematics
 from maniskill_tomato.robot.spheres import sphere_table
 
@@ -105,10 +104,13 @@ class DetourPlanner:
             return np.zeros((0, 3))
         cells = np.unique(np.floor(points_w / BALL), axis=0)
         centres: Float64 = (cells + 0.5) * BALL
-        distances = sphere_distances(joint_path(start, goal, 0.1), centres, self._T_flange_camera).min(axis=0)
+        distances = self._sphere_distances(joint_path(start, goal, 0.1), centres).min(axis=0)
         order = np.argsort(distances, kind="stable")
         near: Float64 = centres[order[distances[order] < NEAR][:MAX_BALLS]]
         return near
+
+    def _sphere_distances(self, path: Float64, points_w: Float64) -> Float64:
+        return sphere_distances(path, points_w, self._T_flange_camera, self._safety.model)
 
     def _straightened(
         self, path: Float64, state: ArmState, now: float, frame_stamp: float, points_w: Float64
@@ -136,13 +138,14 @@ class _SteeredArm:
 
     def __init__(self, safety: Safety, T_flange_camera: Float64, balls: Float64) -> None:
         config = safety.config
-        spec = arm_spec(config.table_height, config.obstacles, T_flange_camera)
+        self._arm = safety.model
+        spec = arm_spec(config.table_height, config.obstacles, T_flange_camera, self._arm)
         shapes = [geom for body in spec.bodies for geom in body.geoms if body.name not in ("world", "")]
         for k, geom in enumerate(shapes):
             geom.name = f"shape {k}"
-        links, spheres = sphere_table(T_flange_camera)
+        links, spheres = sphere_table(T_flange_camera, self._arm)
         for k, (link, sphere) in enumerate(zip(links, spheres.astype(np.float64), strict=True)):
-            spec.body(LINK_NAMES[link]).add_geom(
+            spec.body(self._arm.link_names[link]).add_geom(
                 name=f"sphere {k}", type=mj.mjtGeom.mjGEOM_SPHERE, size=[sphere[3], 0.0, 0.0], pos=sphere[:3]
             )
         for k, centre in enumerate(balls):
@@ -182,8 +185,8 @@ class _SteeredArm:
         passed = [np.array(start)]
         posture: Any = mink.PostureTask(self._model, cost=1.0)
         if around is not None:
-            via: Any = mink.FrameTask(EE_LINK_NAME, "body", position_cost=10.0, orientation_cost=1.0)
-            middle = forward_kinematics(torch.as_tensor((start + goal) / 2)).numpy()
+            via: Any = mink.FrameTask(self._arm.flange_link, "body", position_cost=10.0, orientation_cost=1.0)
+            middle = forward_kinematics(torch.as_tensor((start + goal) / 2), self._arm).numpy()
             middle[:3, 3] += around
             via.set_target(mink.SE3.from_matrix(middle))
             posture.set_target((start + goal) / 2)

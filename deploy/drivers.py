@@ -1,10 +1,12 @@
-"""Drivers by name: ours, loaded when they are asked for, and those of other packages.
+"""Drivers and arm models by name: ours, loaded when they are asked for, and those of other packages.
 
 A driver is a callable `(options, context)` that makes an `Arm` or a `Camera` without touching any device;
-`options` is its table of the profile, and `parse_table` checks it. Another package adds one by an entry point:
+`options` is its table of the profile, and `parse_table` checks it. Another package adds one by an entry point, and the
+model of its arm by another, by which the twin and recordings find it:
 
     [project.entry-points."maniskill_tomato.drivers"]
-    "arm.franka" = "my_package.franka:make_arm"
+    "arm.iiwa7" = "my_package.iiwa7:make_arm"
+    "model.iiwa7" = "my_package.iiwa7:MODEL"
     "camera.zed" = "my_package.zed:make_camera"
 """
 
@@ -14,11 +16,14 @@ from dataclasses import dataclass, field
 from importlib.metadata import entry_points
 from typing import Any, Final, Literal, TypeVar
 
+from maniskill_tomato.deploy.arm_shapes import check_arm_shapes
 from maniskill_tomato.deploy.clock import Clock
 from maniskill_tomato.deploy.deploy_errors import ProfileError
-from maniskill_tomato.deploy.interface import Arm, Camera
+from maniskill_tomato.deploy.interface import Arm, Camera, declared_model
+from maniskill_tomato.errors import InvalidInputError
+from maniskill_tomato.robot.arm_model import ArmModel
 
-Kind = Literal["arm", "camera"]
+Kind = Literal["arm", "camera", "model"]
 T = TypeVar("T")
 
 ENTRY_POINT_GROUP: Final = "maniskill_tomato.drivers"
@@ -33,8 +38,9 @@ BUILT_IN: Final[dict[Kind, dict[str, str]]] = {
         "mock": "maniskill_tomato.deploy.mock.mock_camera:make_camera",
         "realsense": "maniskill_tomato.deploy.realsense.realsense_camera:make_camera",
     },
+    "model": {"iiwa14": "maniskill_tomato.robot.iiwa14:IIWA14"},
 }
-"""Module and callable of each driver of this package."""
+"""Module and callable of each driver, and module and name of each model, of this package."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -66,9 +72,15 @@ def make_arm(name: str, options: Mapping[str, Any], context: DriverContext) -> A
     """An arm's driver, not connected.
 
     Raises:
-        ProfileError: There is no such driver, it cannot be loaded, or an option is wrong.
+        ProfileError: There is no such driver, it cannot be loaded, an option is wrong, or it declares no model of its
+            arm, or one that cannot be served.
     """
-    return _made("arm", Arm, name, options, context)  # type: ignore[type-abstract]
+    arm = _made("arm", Arm, name, options, context)  # type: ignore[type-abstract]
+    try:
+        check_arm_shapes(declared_model(arm))
+    except InvalidInputError as error:
+        raise ProfileError(f"the driver arm.{name} cannot be used: {error}") from error
+    return arm
 
 
 def make_camera(name: str, options: Mapping[str, Any], context: DriverContext) -> Camera:
@@ -80,8 +92,26 @@ def make_camera(name: str, options: Mapping[str, Any], context: DriverContext) -
     return _made("camera", Camera, name, options, context)  # type: ignore[type-abstract]
 
 
+def arm_model(name: str) -> ArmModel:
+    """A registered model of an arm.
+
+    Raises:
+        ProfileError: There is none of this name, or it cannot be loaded.
+    """
+    model = _load("model", name)
+    if not isinstance(model, ArmModel) or model.name != name:
+        found = f"the model {model.name!r}" if isinstance(model, ArmModel) else f"a {type(model).__name__}"
+        raise ProfileError(
+            f"the entry point model.{name} must name an ArmModel called {name!r}, it names {found}"
+        )
+    return model
+
+
 def _made(kind: Kind, device: type[T], name: str, options: Mapping[str, Any], context: DriverContext) -> T:
-    made = _load(kind, name)(options, context)
+    try:
+        made = _load(kind, name)(options, context)
+    except InvalidInputError as error:
+        raise ProfileError(f"the driver {kind}.{name} cannot be used: {error}") from error
     if not isinstance(made, device):
         raise ProfileError(
             f"the driver {kind}.{name} made {type(made).__name__}, which is no {device.__name__}"
@@ -89,19 +119,19 @@ def _made(kind: Kind, device: type[T], name: str, options: Mapping[str, Any], co
     return made
 
 
-def _load(kind: Kind, name: str) -> Callable[[Mapping[str, Any], DriverContext], object]:
-    make: Callable[[Mapping[str, Any], DriverContext], object]
+def _load(kind: Kind, name: str) -> Any:
+    what = f"the entry point {kind}.{name}" if kind == "model" else f"the driver {kind}.{name}"
     try:
         if name in BUILT_IN[kind]:
             module, _, attribute = BUILT_IN[kind][name].partition(":")
-            make = getattr(importlib.import_module(module), attribute)
-            return make
+            return getattr(importlib.import_module(module), attribute)
         for entry in entry_points(group=ENTRY_POINT_GROUP, name=f"{kind}.{name}"):
-            make = entry.load()
-            return make
+            return entry.load()
     except (ImportError, AttributeError) as error:
-        raise ProfileError(
-            f"the driver {kind}.{name} cannot be loaded: {error}; is its package installed?"
-        ) from error
+        raise ProfileError(f"{what} cannot be loaded: {error}; is its package installed?") from error
+    except InvalidInputError as error:
+        raise ProfileError(f"{what} cannot be used: {error}") from error
     names = ", ".join(driver_names(kind))
+    if kind == "model":
+        raise ProfileError(f"no package registers a model of the arm {name!r}; there are {names}")
     raise ProfileError(f"{kind}.driver must be one of {names}; got {name!r}")

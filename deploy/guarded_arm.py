@@ -14,15 +14,15 @@ from maniskill_tomato.deploy.deploy_errors import (
     DeviceTimeoutError,
     FaultError,
     HeartbeatLostError,
+    ProfileError,
     RefusedError,
     StaleError,
     StoppedError,
 )
 from maniskill_tomato.deploy.fault_state import STATES_KEPT
-from maniskill_tomato.deploy.interface import LIMIT_SLACK, Arm, ArmState, Float64, JointMove
+from maniskill_tomato.deploy.interface import LIMIT_SLACK, Arm, ArmState, Float64, JointMove, declared_model
 from maniskill_tomato.deploy.move_watch import MoveWatch
 from maniskill_tomato.deploy.safety import Safety
-from maniskill_tomato.robot.iiwa14 import JOINT_LOWER, JOINT_NAMES, JOINT_UPPER, VELOCITY_LIMITS
 
 _logger = logging.getLogger(__name__)
 
@@ -46,7 +46,16 @@ class GuardedArm:
             safety: The envelope.
             clock: The one that the arm's time stamps come from.
             why_forbidden: Why no move may be sent at all, None while moves may be sent; asked before every move.
+
+        Raises:
+            ProfileError: The arm declares no model, or the envelope is of another one.
         """
+        self._model = declared_model(arm)
+        if safety.model is not self._model:
+            raise ProfileError(
+                f"the driver {arm.name} moves a {self._model.name!r}, but the safety checks are those of a "
+                f"{safety.model.name!r}; make Safety with model=arm.model"
+            )
         self._why_forbidden: Callable[[], str | None] = why_forbidden or _nobody
         self._stopped: str | None = None
         self._why_stop: Callable[[], str | None] = _nobody
@@ -104,12 +113,12 @@ class GuardedArm:
             if not np.isfinite(values).all():
                 raise FaultError(f"the arm reports joint {name} that are not finite: {values.tolist()}")
         joints = state.joint_positions
-        beyond = np.maximum(JOINT_LOWER - joints, joints - JOINT_UPPER)
+        beyond = np.maximum(self._model.joint_lower - joints, joints - self._model.joint_upper)
         if (beyond > LIMIT_SLACK).any():
             k = int(beyond.argmax())
             raise FaultError(
-                f"the arm reports {JOINT_NAMES[k]} at {np.rad2deg(joints[k]):.1f} deg, outside its limits; check which "
-                "unit it sends"
+                f"the arm reports {self._model.joint_names[k]} at {np.rad2deg(joints[k]):.1f} deg, outside its limits; "
+                "check which unit it sends"
             )
         if self._last is not None:
             self._check_jump(self._last, state)
@@ -120,12 +129,12 @@ class GuardedArm:
         elapsed = after.stamp - before.stamp
         if elapsed < 0.0:
             raise FaultError(f"the arm's time stamps went back by {-elapsed:.3f} s")
-        allowed = VELOCITY_LIMITS * elapsed + JUMP_SLACK
+        allowed = self._model.velocity_limits * elapsed + JUMP_SLACK
         turned = np.abs(after.joint_positions - before.joint_positions)
         if (turned > allowed).any():
             k = int((turned - allowed).argmax())
             raise FaultError(
-                f"{JOINT_NAMES[k]} jumped by {turned[k]:.3f} rad in {elapsed:.3f} s, more than it can turn"
+                f"{self._model.joint_names[k]} jumped by {turned[k]:.3f} rad in {elapsed:.3f} s, more than it can turn"
             )
 
     def command(
@@ -160,7 +169,8 @@ class GuardedArm:
         self._check_stopped()
         start = state.joint_positions
         seconds = self._arm.move_seconds(move.joint_positions - start, move.speed_fraction)
-        self.watch, self._watches = MoveWatch(start, move, seconds, self._clock.now()), True
+        self.watch = MoveWatch(start, move, seconds, self._clock.now(), self._model)
+        self._watches = True
         self._arm.on_reading = self._see
         try:
             sent = self._arm.command(move)
@@ -197,7 +207,8 @@ class GuardedArm:
             if off.max() > self.safety.config.arrival_tolerance:
                 k = int(off.argmax())
                 raise FaultError(
-                    f"the arm stands {off[k]:.3f} rad from where {JOINT_NAMES[k]} was sent; something holds it back"
+                    f"the arm stands {off[k]:.3f} rad from where {self._model.joint_names[k]} was sent; something "
+                    "holds it back"
                 )
         return True
 

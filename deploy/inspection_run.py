@@ -132,7 +132,7 @@ def whole_row(workcell: Workcell, row_moves: int) -> WholeRow:
     perception, profile = workcell.perception, workcell.profile
     if not isinstance(perception, ImagePerception):
         raise ProfileError("perception.sight = 'rays' follows one target; an inspection needs 'images'")
-    return WholeRow(perception, profile.loop, row_moves)
+    return WholeRow(perception, profile.loop, row_moves, workcell.arm.model)
 
 
 def _entry(fruit: InspectedFruit) -> dict[str, Any]:

@@ -14,11 +14,11 @@ from typing import Any, Final, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from maniskill_tomato.deploy.deploy_errors import ProtocolError
-from maniskill_tomato.deploy.iiwa_pieces import move_seconds
+from maniskill_tomato.deploy.deploy_errors import ProfileError, ProtocolError
+from maniskill_tomato.deploy.straight_moves import move_seconds
 from maniskill_tomato.raycast.view_rays import ViewRays
+from maniskill_tomato.robot.arm_model import NUM_JOINTS, ArmModel
 from maniskill_tomato.robot.d435 import CameraIntrinsics
-from maniskill_tomato.robot.iiwa14 import NUM_JOINTS
 
 Float64 = NDArray[np.float64]
 
@@ -184,6 +184,8 @@ class Device(ABC):
 class Arm(Device):
     """A seven-joint arm that goes to joint positions. `GuardedArm` is the only thing that may command one."""
 
+    model: ArmModel
+    """Its limits, geometry and shapes, by which every command is judged; every driver declares it."""
     simulated: bool = False
     """Whether nothing real moves: then runs need no confirmation."""
     can_stop: bool = False
@@ -236,7 +238,7 @@ class Arm(Device):
         Returns:
             In [s].
         """
-        return move_seconds(np.zeros(NUM_JOINTS), turn, speed_fraction)
+        return move_seconds(np.zeros(NUM_JOINTS), turn, speed_fraction, model=self.model)
 
     @abstractmethod
     def wait(self, timeout_s: float) -> bool:
@@ -260,6 +262,22 @@ class Arm(Device):
         Returns:
             Whether the arm stands or comes to a stop by it; False if the move goes on.
         """
+
+
+def declared_model(arm: Arm) -> ArmModel:
+    """The model that an arm's driver declares.
+
+    Raises:
+        ProfileError: It declares none.
+    """
+    model = getattr(arm, "model", None)
+    if not isinstance(model, ArmModel):
+        raise ProfileError(
+            f"the driver {getattr(arm, 'name', type(arm).__name__)} declares no model of its arm, so that nothing "
+            "could judge its moves; set `model` to an ArmModel, such as read_arm_model makes of a URDF "
+            "(docs/deploy.md, 'Another arm')"
+        )
+    return model
 
 
 class Camera(Device):

@@ -174,11 +174,13 @@ class Loop:
         self._settle, self._mode = profile.loop.settle, mode
         self._arm.begin_run(stops.asked)
         self._recorders, self._confirm = recorders, confirm
-        self._robot_belief = RobotBelief(profile.T_flange_camera, self._goal.max_moves)
+        self._robot_belief = RobotBelief(
+            profile.T_flange_camera, self._goal.max_moves, model=workcell.arm.model
+        )
         self._chooser = MoveChooser(self._arm.safety, profile.T_flange_camera)
         self._ways = WayPlanner(self._arm.safety, profile.T_flange_camera)
         self._planner = policy if isinstance(policy, LatticePlanner) else NextBestView()
-        self._points = PlantPoints(profile.T_flange_camera)
+        self._points = PlantPoints(profile.T_flange_camera, model=workcell.arm.model)
         self._fractions: list[float] = []
         self._moves = self._refused = self._refused_in_a_row = 0
         self._settled_at = self._clock.now()

@@ -19,7 +19,8 @@ from torch import Tensor
 from maniskill_tomato.deploy.detour import DetourPlanner
 from maniskill_tomato.deploy.interface import ArmState, Float64, JointMove
 from maniskill_tomato.deploy.safety import COLLISIONS, Refusal, Safety
-from maniskill_tomato.robot.iiwa14 import JOINT_LOWER, JOINT_UPPER, NUM_JOINTS, READY_QPOS
+from maniskill_tomato.robot.arm_model import NUM_JOINTS, ArmModel
+from maniskill_tomato.robot.iiwa14 import IIWA14
 from maniskill_tomato.robot.inverse_kinematics import IkConfig, InverseKinematics, Reach
 from maniskill_tomato.robot.look_at import CAMERA_ROLLS, look_at_pose
 from maniskill_tomato.robot.look_at_move import (
@@ -84,8 +85,9 @@ class MoveChooser:
             T_flange_camera: The camera's optical frame in `link_ee`. Shape (4, 4).
         """
         self._safety = safety
-        self._mover = LookAtMover(T_flange_camera=np.array(T_flange_camera, dtype=np.float64))
-        self._postures = Postures(T_flange_camera, safety.config.joint_margin)
+        mount = np.array(T_flange_camera, dtype=np.float64)
+        self._mover = LookAtMover(T_flange_camera=mount, model=safety.model)
+        self._postures = Postures(T_flange_camera, safety.config.joint_margin, safety.model)
         self._detours = DetourPlanner(safety, T_flange_camera)
 
     def own_goal(self, request: MoveRequest) -> Float64 | None:
@@ -156,18 +158,20 @@ class MoveChooser:
 class Postures:
     """Solves for postures in batches."""
 
-    def __init__(self, T_flange_camera: Float64, joint_margin: float) -> None:
+    def __init__(self, T_flange_camera: Float64, joint_margin: float, model: ArmModel = IIWA14) -> None:
         """Prepares the inverse kinematics.
 
         Args:
             T_flange_camera: The camera's optical frame in `link_ee`. Shape (4, 4).
             joint_margin: How far joints must stay from their limits, in [rad].
+            model: Of the arm.
         """
+        self._model = model
         # Limits weigh more than in the task, so that postures stay off them.
-        self._ik = InverseKinematics(config=IkConfig(limit_margin=0.3, limit_weight=2.0))
+        self._ik = InverseKinematics(config=IkConfig(limit_margin=0.3, limit_weight=2.0), model=model)
         self._T_camera_flange = torch.as_tensor(np.linalg.inv(T_flange_camera), dtype=torch.float64)
-        self._low = torch.as_tensor(JOINT_LOWER + joint_margin)
-        self._high = torch.as_tensor(JOINT_UPPER - joint_margin)
+        self._low = torch.as_tensor(model.joint_lower + joint_margin)
+        self._high = torch.as_tensor(model.joint_upper - joint_margin)
         self._rolls = torch.tensor(CAMERA_ROLLS, dtype=torch.float64)
 
     def of_move(
@@ -220,13 +224,12 @@ class Postures:
         for k in good.nonzero()[:, 0].tolist():
             yield float(cost[k]), q[k].float().double().numpy()
 
-    @staticmethod
-    def _references(joints: Float64) -> Tensor:
-        references = []
-        for base in (np.array(joints), np.array(READY_QPOS)):
+    def _references(self, joints: Float64) -> Tensor:
+        model, references = self._model, []
+        for base in (np.array(joints), np.array(model.ready_qpos)):
             for swivel in SWIVELS:
                 posture = base.copy()
-                posture[2] = np.clip(posture[2] + swivel, JOINT_LOWER[2], JOINT_UPPER[2])
+                posture[2] = np.clip(posture[2] + swivel, model.joint_lower[2], model.joint_upper[2])
                 references.append(posture)
         return torch.as_tensor(np.stack(references).reshape(-1, NUM_JOINTS))
 

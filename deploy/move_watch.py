@@ -11,7 +11,7 @@ from typing import Final, Literal
 import numpy as np
 
 from maniskill_tomato.deploy.interface import Float64, JointMove
-from maniskill_tomato.robot.iiwa14 import JOINT_NAMES, VELOCITY_LIMITS
+from maniskill_tomato.robot.arm_model import ArmModel
 
 PATH_TOLERANCE: Final = 0.03
 """How far a joint may be beside the line, back from where it has been, or ahead of its time, in [rad]."""
@@ -56,7 +56,7 @@ class Departure:
 class MoveWatch:
     """One move, from before it is sent until it ends."""
 
-    def __init__(self, start: Float64, move: JointMove, seconds: float, now: float) -> None:
+    def __init__(self, start: Float64, move: JointMove, seconds: float, now: float, model: ArmModel) -> None:
         """Takes the plan.
 
         Args:
@@ -64,12 +64,14 @@ class MoveWatch:
             move: What is about to be sent.
             seconds: How long the driver expects it to take, in [s].
             now: The time, in [s].
+            model: Of the arm.
         """
+        self._joint_names = model.joint_names
         self.start = np.array(start)
         self.goal = move.joint_positions
         self._turn = self.goal - self.start
         self._largest = float(np.abs(self._turn).max())
-        cruise = float((np.abs(self._turn) / (VELOCITY_LIMITS * move.speed_fraction)).max())
+        cruise = float((np.abs(self._turn) / (model.velocity_limits * move.speed_fraction)).max())
         self._speed = np.abs(self._turn) / cruise if cruise > 0.0 else np.zeros_like(self._turn)
         self.speed_fraction = move.speed_fraction
         self.seconds = seconds
@@ -123,7 +125,8 @@ class MoveWatch:
             return None
         return Departure(
             kind="off_path",
-            detail=f"{JOINT_NAMES[k]} is {off[k]:.3f} rad beside the planned line, allowed are {PATH_TOLERANCE} rad",
+            detail=f"{self._joint_names[k]} is {off[k]:.3f} rad beside the planned line, allowed are "
+            f"{PATH_TOLERANCE} rad",
         )
 
     def _back(self, done: float) -> Departure | None:
@@ -148,7 +151,7 @@ class MoveWatch:
             return None
         return Departure(
             kind="fast",
-            detail=f"{JOINT_NAMES[int(k)]} is faster than asked: {worst:.3f} rad ahead of {limit[k]:.3f} rad/s, "
+            detail=f"{self._joint_names[int(k)]} is faster than asked: {worst:.3f} rad ahead of {limit[k]:.3f} rad/s, "
             f"{SPEED_TOLERANCE} times the speed fraction {self.speed_fraction:g}; allowed are {PATH_TOLERANCE} rad",
         )
 

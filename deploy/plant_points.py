@@ -8,8 +8,9 @@ import torch
 
 from maniskill_tomato.deploy.interface import Float64, Frame
 from maniskill_tomato.deploy.motion_bounds import chord_error, lever_arms, motion, straight_line
+from maniskill_tomato.robot.arm_model import ArmModel
 from maniskill_tomato.robot.d435 import T_flange_camera_color_optical
-from maniskill_tomato.robot.iiwa14 import EE_ORIGIN, JOINT_ORIGINS
+from maniskill_tomato.robot.iiwa14 import IIWA14
 from maniskill_tomato.robot.kinematics import link_transforms
 from maniskill_tomato.robot.spheres import sphere_table
 
@@ -41,13 +42,20 @@ FINE_STEP: Final = 0.01
 class PlantPoints:
     """A cloud of occupied cells in the base frame that grows with every view."""
 
-    def __init__(self, T_flange_camera: Float64 = T_flange_camera_color_optical, cell: float = CELL) -> None:
+    def __init__(
+        self,
+        T_flange_camera: Float64 = T_flange_camera_color_optical,
+        cell: float = CELL,
+        model: ArmModel = IIWA14,
+    ) -> None:
         """Begins with nothing.
 
         Args:
             T_flange_camera: The camera's optical frame in `link_ee`. Shape (4, 4).
             cell: Edge of a cell, in [m].
+            model: Of the arm.
         """
+        self._model = model
         self._T_flange_camera = T_flange_camera
         self._cell = cell
         self._cells: dict[tuple[int, int, int], None] = {}
@@ -77,7 +85,7 @@ class PlantPoints:
         """
         points = depth_points(frame, T_world_camera)
         if len(points):
-            distances = sphere_distances(joint_positions[None], points, self._T_flange_camera)
+            distances = sphere_distances(joint_positions[None], points, self._T_flange_camera, self._model)
             points = points[distances[0] > SELF_MARGIN]
         before = len(self._cells)
         for x, y, z in np.unique(np.floor(points / self._cell).astype(np.int64), axis=0).tolist():
@@ -108,7 +116,10 @@ def depth_points(frame: Frame, T_world_camera: Float64) -> Float64:
 
 
 def sphere_distances(
-    joint_positions: Float64, points_w: Float64, T_flange_camera: Float64 = T_flange_camera_color_optical
+    joint_positions: Float64,
+    points_w: Float64,
+    T_flange_camera: Float64 = T_flange_camera_color_optical,
+    model: ArmModel = IIWA14,
 ) -> Float64:
     """Distances between points and the nearest of the arm's spheres (`robot.spheres`).
 
@@ -116,16 +127,22 @@ def sphere_distances(
         joint_positions: In [rad]. Shape (N, 7).
         points_w: In the base frame, in [m]. Shape (P, 3).
         T_flange_camera: The camera's optical frame in `link_ee`. Shape (4, 4).
+        model: Of the arm.
 
     Returns:
         In [m], negative inside a sphere. Shape (N, P).
     """
-    radii = sphere_table(T_flange_camera)[1][:, 3].astype(np.float64)
-    return _distances(_centres(joint_positions, T_flange_camera), radii, points_w)
+    radii = sphere_table(T_flange_camera, model)[1][:, 3].astype(np.float64)
+    return _distances(_centres(joint_positions, T_flange_camera, model), radii, points_w)
 
 
 def swept_distances(
-    start: Float64, goal: Float64, points_w: Float64, limit: float, T_flange_camera: Float64
+    start: Float64,
+    goal: Float64,
+    points_w: Float64,
+    limit: float,
+    T_flange_camera: Float64,
+    model: ArmModel = IIWA14,
 ) -> Float64:
     """The same at the nearest posture of a straight line in joint space.
 
@@ -135,18 +152,20 @@ def swept_distances(
         points_w: In the base frame, in [m]. Shape (P, 3).
         limit: What is farther away need not be known exactly, in [m].
         T_flange_camera: The camera's optical frame in `link_ee`. Shape (4, 4).
+        model: Of the arm.
 
     Returns:
         In [m], below the limit wherever the true one is 1 mm below it, and never too small. Shape (P,).
     """
-    links, spheres = sphere_table(T_flange_camera)
+    links, spheres = sphere_table(T_flange_camera, model)
     radii = spheres[:, 3].astype(np.float64)
     last = spheres[links == links.max(), :3].astype(np.float64)
     turn = goal - start
-    levers = lever_arms(JOINT_ORIGINS, float(np.linalg.norm(EE_ORIGIN) + np.linalg.norm(last, axis=1).max()))
+    beyond = abs(model.flange_height) + float(np.linalg.norm(last, axis=1).max())
+    levers = lever_arms(model.joint_origins, beyond)
     pieces = max(1, math.ceil(motion(turn, levers) / COARSE_STEP))
     line = straight_line(start, goal, pieces)
-    centres = _centres(line, T_flange_camera)
+    centres = _centres(line, T_flange_camera, model)
     coarse = _distances(centres, radii, points_w)
     nearest: Float64 = coarse.min(axis=0)
     error = chord_error(turn, levers, pieces)
@@ -155,15 +174,15 @@ def swept_distances(
     for k in np.flatnonzero(within.any(axis=1)):
         # A smooth curve is at most four errors of its chord faster than the chord.
         fine = straight_line(line[k], line[k + 1], math.ceil((chords[k] + 4.0 * error) / FINE_STEP) or 1)
-        found = sphere_distances(fine, points_w[within[k]], T_flange_camera).min(axis=0)
+        found = sphere_distances(fine, points_w[within[k]], T_flange_camera, model).min(axis=0)
         nearest[within[k]] = np.minimum(nearest[within[k]], found)
     return nearest
 
 
-def _centres(joint_positions: Float64, T_flange_camera: Float64) -> Float64:
+def _centres(joint_positions: Float64, T_flange_camera: Float64, model: ArmModel) -> Float64:
     """Of the spheres, base frame, in [m]. Shape (N, S, 3)."""
-    links, spheres = sphere_table(T_flange_camera)
-    T = link_transforms(torch.as_tensor(np.array(joint_positions), dtype=torch.float64)).numpy()
+    links, spheres = sphere_table(T_flange_camera, model)
+    T = link_transforms(torch.as_tensor(np.array(joint_positions), dtype=torch.float64), model).numpy()
     centres_l = np.concatenate([spheres[:, :3], np.ones((len(spheres), 1))], axis=1).astype(np.float64)
     centres: Float64 = np.einsum("nsij,sj->nsi", T[:, links], centres_l)[..., :3]
     return centres

@@ -30,6 +30,8 @@ from maniskill_tomato.folder_lock import only_writer
 from maniskill_tomato.policies.opening import open_policy
 from maniskill_tomato.policies.protocol import Policy
 from maniskill_tomato.report_design import INK, rgb
+from maniskill_tomato.robot.arm_model import ArmModel
+from maniskill_tomato.robot.iiwa14 import IIWA14
 from maniskill_tomato.warp_runtime import load_kernels
 
 TILE: Final = (320, 240)
@@ -165,7 +167,7 @@ def run_goal(
     recorder: McapRecorder | None = None
 
     def keep(fault: FaultState) -> str:
-        return keep_fault(fault, recorder, config.out, info, workcell.clock, mount)
+        return keep_fault(fault, recorder, config.out, info, workcell.clock, mount, workcell.arm.model)
 
     with ExitStack() as stack:
         arm = stack.enter_context(workcell.arm)
@@ -178,7 +180,7 @@ def run_goal(
         info |= facts
         every = list(recorders)
         if config.record:
-            recorder = McapRecorder(config.out / RECORDING, info, workcell.clock, mount)
+            recorder = McapRecorder(config.out / RECORDING, info, workcell.clock, mount, workcell.arm.model)
             every.append(stack.enter_context(recorder))
         stack.enter_context(stops)
         try:
@@ -202,6 +204,7 @@ def keep_fault(
     info: dict[str, Any],
     clock: Clock,
     T_flange_camera: Float64,
+    model: ArmModel = IIWA14,
 ) -> str:
     """Writes what is known of a fault into the run's recording, or into one of its own. Never raises.
 
@@ -212,6 +215,7 @@ def keep_fault(
         info: What was run, for a recording of its own.
         clock: Of the run.
         T_flange_camera: The colour camera's optical frame in `link_ee`. Shape (4, 4).
+        model: Of the arm.
 
     Returns:
         Name of the file that holds it; empty if the disk takes none.
@@ -224,7 +228,7 @@ def keep_fault(
         _logger.warning("%s", error)
     path = out / FAULT_RECORDING
     try:
-        with McapRecorder(path, info, clock, T_flange_camera) as alone:
+        with McapRecorder(path, info, clock, T_flange_camera, model) as alone:
             alone.fault(fault)
         return path.name
     except (TomatoError, OSError) as error:

@@ -17,8 +17,8 @@ from maniskill_tomato.deploy.interface import Float64, Frame, JointMove
 from maniskill_tomato.deploy.plant_points import PlantPoints
 from maniskill_tomato.deploy.workcell import Workcell
 from maniskill_tomato.errors import InvalidInputError
+from maniskill_tomato.robot.arm_model import NUM_JOINTS
 from maniskill_tomato.robot.d435 import CameraIntrinsics
-from maniskill_tomato.robot.iiwa14 import NUM_JOINTS
 from maniskill_tomato.robot.kinematics import forward_kinematics
 
 SETTLE_S: Final = 0.5
@@ -48,7 +48,7 @@ class IiwaRealAgent(BaseRealAgent):  # type: ignore[misc]
         super().__init__()
         self.workcell = workcell
         self._camera_name = camera_name
-        self._points = PlantPoints(workcell.profile.T_flange_camera)
+        self._points = PlantPoints(workcell.profile.T_flange_camera, model=workcell.arm.model)
         self._capture = Capture(workcell.camera, workcell.profile.capture, workcell.clock)
         self._settled_at = -math.inf
         self._frame: Frame | None = None
@@ -159,7 +159,9 @@ class IiwaRealAgent(BaseRealAgent):  # type: ignore[misc]
 
     def camera_pose(self, joint_positions: Float64) -> Float64:
         """The colour camera's optical frame in the world at joint angles in [rad], by the calibration. Shape (4, 4)."""
-        flange = forward_kinematics(torch.as_tensor(np.array(joint_positions))).numpy()
+        flange = forward_kinematics(
+            torch.as_tensor(np.array(joint_positions)), self.workcell.arm.model
+        ).numpy()
         return np.asarray(flange @ self.workcell.profile.T_flange_camera, np.float64)
 
     def get_qpos(self) -> Tensor:

@@ -28,6 +28,8 @@ from maniskill_tomato.deploy.interface import Float64, Frame
 from maniskill_tomato.deploy.recording_schemas import FAULT, INFO, STEP, TRUTH
 from maniskill_tomato.deploy.run_records import Step
 from maniskill_tomato.deploy.viewer_arm import link_frames, simple_urdf
+from maniskill_tomato.robot.arm_model import ArmModel
+from maniskill_tomato.robot.iiwa14 import IIWA14
 
 _logger = logging.getLogger(__name__)
 
@@ -64,7 +66,14 @@ DESCRIPTION: Final = "/robot_description"
 class McapRecorder:
     """Writes a run while it happens; a context manager that finishes the file."""
 
-    def __init__(self, path: Path, info: dict[str, Any], clock: Clock, T_flange_camera: Float64) -> None:
+    def __init__(
+        self,
+        path: Path,
+        info: dict[str, Any],
+        clock: Clock,
+        T_flange_camera: Float64,
+        model: ArmModel = IIWA14,
+    ) -> None:
         """Begins the file.
 
         Args:
@@ -72,6 +81,7 @@ class McapRecorder:
             info: What was run: profile text, policy, seed, and so on.
             clock: The run's, which stamps of pictures and events come from.
             T_flange_camera: The colour camera's optical frame in `link_ee`. Shape (4, 4).
+            model: Of the arm.
 
         Raises:
             RecordingError: It cannot be written, or a package is missing.
@@ -89,7 +99,7 @@ class McapRecorder:
         self.path = path
         self._failed = self._is_finished = False
         self._made, self._timestamp = viewer_messages, messages.Timestamp
-        self._T_flange_camera = T_flange_camera
+        self._T_flange_camera, self._model = T_flange_camera, model
         self._clock_start, self._unix_start_ns = clock.now(), time.time_ns()
         schemas = {name: getattr(messages, name).get_schema() for name in VIEWER_TOPICS.values()}
         try:
@@ -115,10 +125,13 @@ class McapRecorder:
         except OSError as error:
             raise self._error(error) from error
         start = {"clock_start": self._clock_start, "unix_start_ns": self._unix_start_ns}
-        self._write_json("/info", self._clock_start, {"format": FORMAT, **start, **info})
-        self._write(DESCRIPTION, self._clock_start, _ros_string(simple_urdf()))
+        self._write_json(
+            "/info", self._clock_start, {"format": FORMAT, "arm_model": model.name, **start, **info}
+        )
+        urdf = simple_urdf(model)
+        self._write(DESCRIPTION, self._clock_start, _ros_string(urdf))
         began = self._time(self._clock_start)
-        self._write("/arm/shape", self._clock_start, viewer_messages.arm_shape(began, simple_urdf()).encode())
+        self._write("/arm/shape", self._clock_start, viewer_messages.arm_shape(began, urdf).encode())
 
     def __enter__(self) -> "McapRecorder":
         return self
@@ -160,10 +173,14 @@ class McapRecorder:
         frame, stamp, made = step.frame, step.frame.stamp, self._made
         at = self._time(stamp)
         millimetres, is_exact = made.in_millimetres(frame.depth)
-        links = link_frames(step.joint_positions, self._T_flange_camera)
+        links = link_frames(step.joint_positions, self._T_flange_camera, self._model)
         # Viewers place a picture by the transforms that came before it.
         self._write("/tf", stamp, made.transforms(at, links).encode())
-        self._write("/joint_states", stamp, made.joint_states(at, step.joint_positions).encode())
+        self._write(
+            "/joint_states",
+            stamp,
+            made.joint_states(at, self._model.joint_names, step.joint_positions).encode(),
+        )
         self._write("/camera/calibration", stamp, made.calibration(at, frame.intrinsics).encode())
         self._write("/camera/color", stamp, made.picture(at, frame.color).encode())
         self._write("/camera/depth", stamp, made.depth_image(at, millimetres).encode())

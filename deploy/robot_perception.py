@@ -13,7 +13,9 @@ from maniskill_tomato.deploy.interface import Float64, Frame, FrameTruth
 from maniskill_tomato.errors import TomatoError
 from maniskill_tomato.raycast.images import ROBOT_LABEL
 from maniskill_tomato.raycast.view_rays import ViewRays
+from maniskill_tomato.robot.arm_model import ArmModel
 from maniskill_tomato.robot.d435 import CameraIntrinsics
+from maniskill_tomato.robot.iiwa14 import IIWA14
 from maniskill_tomato.robot.kinematics import forward_kinematics, link_transforms
 from maniskill_tomato.robot.rotations import FORWARD_RPY, matrix_to_rpy
 from maniskill_tomato.segmentation.instances import Instances
@@ -290,6 +292,7 @@ class RobotBelief:
         T_flange_camera: Float64,
         max_moves: int,
         layout: ObservationLayout | None = None,
+        model: ArmModel = IIWA14,
     ) -> None:
         """Begins without a view.
 
@@ -297,10 +300,12 @@ class RobotBelief:
             T_flange_camera: The camera's optical frame in `link_ee`. Shape (4, 4).
             max_moves: Moves of an episode.
             layout: What the observation holds.
+            model: Of the arm.
         """
+        self._model = model
         self._exact_mount = torch.as_tensor(np.array(T_flange_camera), dtype=torch.float64)
         self._mount = self._exact_mount.float()
-        self._observer = ViewpointObserver(1, layout=layout, max_moves=max_moves)
+        self._observer = ViewpointObserver(1, layout=layout, max_moves=max_moves, model=model)
         self._rpy = torch.tensor([FORWARD_RPY])
         self._has_views = False
 
@@ -312,7 +317,7 @@ class RobotBelief:
     def camera_position(self, joint_positions: Float64) -> Float64:
         """Where a move begins, in the precision of the task's `pd_look_at`, world frame, in [m]. Shape (3,)."""
         joints = torch.tensor(joint_positions[None], dtype=torch.float32).double()
-        pose = forward_kinematics(joints) @ self._exact_mount
+        pose = forward_kinematics(joints, self._model) @ self._exact_mount
         position: Float64 = pose[0, :3, 3].numpy()
         return position
 
@@ -345,5 +350,5 @@ class RobotBelief:
 
     def _poses(self, joint_positions: Float64) -> tuple[torch.Tensor, torch.Tensor]:
         joints = torch.as_tensor(np.array(joint_positions)[None], dtype=torch.float32)
-        flange = link_transforms(joints)[:, -1]
+        flange = link_transforms(joints, self._model)[:, -1]
         return flange, flange @ self._mount

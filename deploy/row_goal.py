@@ -14,6 +14,8 @@ from maniskill_tomato.deploy.goal import End, Look
 from maniskill_tomato.deploy.interface import Float64, Frame
 from maniskill_tomato.deploy.robot_perception import ImagePerception
 from maniskill_tomato.deploy.run_records import LoopConfig
+from maniskill_tomato.robot.arm_model import ArmModel
+from maniskill_tomato.robot.iiwa14 import IIWA14
 from maniskill_tomato.robot.transit import STAND_OFF, TRANSIT_MOVES, TransitPlanner
 from maniskill_tomato.sensing.inspection import InspectedFruit, Inspection
 from maniskill_tomato.sensing.view_lattice import ViewLattice
@@ -28,13 +30,16 @@ STUCK: Final = 3
 class WholeRow:
     """All fruits in reach, until nothing is worth another move."""
 
-    def __init__(self, perception: ImagePerception, loop: LoopConfig, row_moves: int) -> None:
+    def __init__(
+        self, perception: ImagePerception, loop: LoopConfig, row_moves: int, model: ArmModel = IIWA14
+    ) -> None:
         """Begins without a view.
 
         Args:
             perception: Turns pictures into a map of fruits.
             loop: V_f of a fully seen fruit, and the most moves for one.
             row_moves: The most moves for the row.
+            model: Of the arm.
         """
         self.max_moves = loop.max_moves
         self.view_joints: list[Float64] = []
@@ -42,7 +47,7 @@ class WholeRow:
         self._perception, self._loop, self._row_moves = perception, loop, row_moves
         self._mapper = perception.begin_row()
         self._inspection = Inspection(loop.threshold, self._mapper.config.stop_errors)
-        self._lattice, self._planner = ViewLattice(), TransitPlanner()
+        self._lattice, self._planner = ViewLattice(model=model), TransitPlanner(model=model)
         self._places: Float64 | None = None
         self._turned_at = self._refused = 0
         self._is_new = self._gives_up = self._moved = False

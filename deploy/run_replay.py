@@ -15,6 +15,7 @@ import torch
 
 from maniskill_tomato.deploy.clock import SimulatedClock
 from maniskill_tomato.deploy.deploy_errors import CutOffError, NotConnectedError, RecordingError
+from maniskill_tomato.deploy.drivers import arm_model
 from maniskill_tomato.deploy.fault_state import FaultState
 from maniskill_tomato.deploy.guarded_arm import GuardedArm
 from maniskill_tomato.deploy.inspection_run import whole_row
@@ -36,7 +37,9 @@ from maniskill_tomato.deploy.stops import Stops
 from maniskill_tomato.deploy.workcell import Workcell
 from maniskill_tomato.policies.opening import open_policy
 from maniskill_tomato.raycast.view_rays import ViewRays
+from maniskill_tomato.robot.arm_model import ArmModel
 from maniskill_tomato.robot.d435 import CameraIntrinsics
+from maniskill_tomato.robot.iiwa14 import IIWA14
 
 TOLERANCE: Final = 1e-5
 """Actions, V_f and joint positions [rad] that differ by less are the same."""
@@ -180,13 +183,13 @@ def _played_workcell(recorded: RecordedRun, playback: "_Playback") -> Workcell:
         capture=replace(profile.capture, attempts=1),
         loop=replace(profile.loop, settle=0.0),
     )
-    arm = _PlayedArm(playback)
+    arm = _PlayedArm(playback, arm_model(str(recorded.info.get("arm_model", IIWA14.name))))
     return Workcell(
         profile=profile,
         clock=clock,
         arm=arm,
         camera=_PlayedCamera(playback),
-        guarded_arm=_PlayedGuard(arm, Safety(profile.safety, profile.T_flange_camera), clock),
+        guarded_arm=_PlayedGuard(arm, Safety(profile.safety, profile.T_flange_camera, arm.model), clock),
         perception=open_perception(profile.perception.sight, profile.perception.segmenter),
     )
 
@@ -225,8 +228,8 @@ class _PlayedArm(Arm):
     simulated = True
     can_stop = True
 
-    def __init__(self, playback: _Playback) -> None:
-        self._playback = playback
+    def __init__(self, playback: _Playback, model: ArmModel) -> None:
+        self._playback, self.model = playback, model
 
     @property
     def is_connected(self) -> bool:

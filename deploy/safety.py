@@ -27,8 +27,9 @@ from maniskill_tomato.deploy.motion_bounds import (
 )
 from maniskill_tomato.deploy.plant_points import sphere_distances, swept_distances
 from maniskill_tomato.errors import InvalidInputError, check_positive, check_ranges
+from maniskill_tomato.robot.arm_model import ArmModel
 from maniskill_tomato.robot.d435 import T_flange_camera_color_optical
-from maniskill_tomato.robot.iiwa14 import EE_ORIGIN, JOINT_LOWER, JOINT_NAMES, JOINT_ORIGINS, JOINT_UPPER
+from maniskill_tomato.robot.iiwa14 import IIWA14
 from maniskill_tomato.robot.kinematics import forward_kinematics
 
 LARGEST_SPEED_FRACTION: Final = 0.3
@@ -154,6 +155,7 @@ class Safety:
         self,
         config: SafetyConfig | None = None,
         T_flange_camera: Float64 = T_flange_camera_color_optical,
+        model: ArmModel = IIWA14,
     ) -> None:
         """Prepares the checks.
 
@@ -161,11 +163,13 @@ class Safety:
             config: The envelope; the usual one if None.
             T_flange_camera: Where the camera's optical frame was measured to be in `link_ee`; its housing goes with
                 it. Shape (4, 4).
+            model: Of the arm, whose limits and shapes are held against every command.
         """
         self.config = config or SafetyConfig()
+        self.model = model
         self._T_flange_camera = T_flange_camera
-        beyond = np.linalg.norm(EE_ORIGIN) + np.linalg.norm(T_flange_camera[:3, 3])
-        self._levers = lever_arms(JOINT_ORIGINS, float(beyond))
+        beyond = abs(model.flange_height) + float(np.linalg.norm(T_flange_camera[:3, 3]))
+        self._levers = lever_arms(model.joint_origins, beyond)
         c = self.config
         self._collisions = CollisionChecker(
             table_height=c.table_height,
@@ -174,6 +178,7 @@ class Safety:
             obstacles=c.obstacles,
             obstacle_clearance=c.obstacle_clearance,
             T_flange_camera=T_flange_camera,
+            model=model,
         )
 
     def check(
@@ -219,8 +224,11 @@ class Safety:
             return True
         if c.plant_clearance is None or points_w is None or len(points_w) < c.plant_points_needed:
             return False
-        near = sphere_distances(joint_positions[None], points_w, self._T_flange_camera) < c.plant_clearance
+        near = self._sphere_distances(joint_positions[None], points_w) < c.plant_clearance
         return int(near.sum()) >= c.plant_points_needed
+
+    def _sphere_distances(self, path: Float64, points_w: Float64) -> Float64:
+        return sphere_distances(path, points_w, self._T_flange_camera, self.model)
 
     def _numbers(
         self, move: JointMove, state: ArmState, now: float, frame_stamp: float | None
@@ -253,20 +261,22 @@ class Safety:
         if not 0.0 < move.speed_fraction <= c.max_speed_fraction:
             detail = f"the speed fraction must be above 0 and at most {c.max_speed_fraction}, got {move.speed_fraction}"
             return Refusal(reason="speed", detail=detail)
-        over = np.maximum(JOINT_LOWER + c.joint_margin - joints, joints - JOINT_UPPER + c.joint_margin)
+        low, high = self.model.joint_lower + c.joint_margin, self.model.joint_upper - c.joint_margin
+        over = np.maximum(low - joints, joints - high)
         if (over > 0.0).any():
             k = int(over.argmax())
-            bound = (JOINT_UPPER[k] - c.joint_margin) * DEGREES
             return Refusal(
                 reason="joint_limit",
-                detail=f"{JOINT_NAMES[k]} must stay within +-{bound:.1f} deg, got {float(joints[k]) * DEGREES:.1f} deg",
+                detail=f"{self.model.joint_names[k]} must stay from {low[k] * DEGREES:.1f} to {high[k] * DEGREES:.1f} "
+                f"deg, got {float(joints[k]) * DEGREES:.1f} deg",
             )
         step = np.abs(joints - state.joint_positions)
         if (step > c.max_joint_step).any():
             k = int(step.argmax())
             return Refusal(
                 reason="joint_step",
-                detail=f"{JOINT_NAMES[k]} would turn {step[k]:.2f} rad in one move, allowed are {c.max_joint_step}",
+                detail=f"{self.model.joint_names[k]} would turn {step[k]:.2f} rad in one move, allowed are "
+                f"{c.max_joint_step}",
             )
         return None
 
@@ -285,7 +295,7 @@ class Safety:
         c, turn = self.config, goal - start
         pieces = pieces_for(turn, self._levers, CHORD_ERROR)
         path = straight_line(start, goal, pieces)
-        T_w_flange = forward_kinematics(torch.as_tensor(path)).numpy()
+        T_w_flange = forward_kinematics(torch.as_tensor(path), self.model).numpy()
         flange = T_w_flange[:, :3, 3]
         camera = flange + T_w_flange[:, :3, :3] @ self._T_flange_camera[:3, 3]
         error = chord_error(turn, self._levers, pieces)
@@ -338,8 +348,8 @@ class Safety:
         c = self.config
         if c.plant_clearance is None or points_w is None or len(points_w) < c.plant_points_needed:
             return None
-        nearest = swept_distances(start, goal, points_w, c.plant_clearance, self._T_flange_camera)
-        standing = sphere_distances(start[None], points_w, self._T_flange_camera)[0]
+        nearest = swept_distances(start, goal, points_w, c.plant_clearance, self._T_flange_camera, self.model)
+        standing = self._sphere_distances(start[None], points_w)[0]
         # Where the arm is near a leaf already, it may go away from it but not nearer.
         touched = (nearest < c.plant_clearance) & (nearest < standing - 1e-3)
         if int(touched.sum()) < c.plant_points_needed:

@@ -103,7 +103,9 @@ class TomatoSim2RealEnv(Sim2RealEnv):  # type: ignore[misc]
         self._viewpoint: Tensor = self._world.state.viewpoint.clone()
         layout = getattr(self.base_sim_env, "layout", None)
         if layout is not None:
-            self._robot_belief = RobotBelief(workcell.profile.T_flange_camera, self._max_moves, layout)
+            self._robot_belief = RobotBelief(
+                workcell.profile.T_flange_camera, self._max_moves, layout, workcell.arm.model
+            )
         self._reach = torch.full((1,), int(Reach.REACHABLE), dtype=torch.int64)
         self._take_view()
         assert self._view is not None

@@ -18,7 +18,6 @@ from maniskill_tomato.deploy.deploy_errors import RecordingError
 from maniskill_tomato.deploy.interface import Float64, Frame
 from maniskill_tomato.deploy.viewer_arm import LinkFrame
 from maniskill_tomato.robot.d435 import CameraIntrinsics
-from maniskill_tomato.robot.iiwa14 import JOINT_NAMES
 
 CAMERA_FRAME: Final = "camera_color_optical_frame"
 """The frame of all pictures and points."""
@@ -48,13 +47,13 @@ def transforms(stamp: fox.Timestamp, frames: Sequence[LinkFrame]) -> fox.FrameTr
     )
 
 
-def joint_states(stamp: fox.Timestamp, joint_positions: Float64) -> fox.JointStates:
+def joint_states(stamp: fox.Timestamp, names: Sequence[str], joint_positions: Float64) -> fox.JointStates:
     """The joints by the URDF's names, in [rad]. Shape (7,)."""
     return fox.JointStates(
         timestamp=stamp,
         joints=[
             fox.JointState(name=name, position=float(position))
-            for name, position in zip(JOINT_NAMES, joint_positions, strict=True)
+            for name, position in zip(names, joint_positions, strict=True)
         ],
     )
 

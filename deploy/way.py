@@ -19,7 +19,8 @@ from maniskill_tomato.deploy.interface import ArmState, Float64, JointMove
 from maniskill_tomato.deploy.motion_bounds import joint_path
 from maniskill_tomato.deploy.move_choice import Postures
 from maniskill_tomato.deploy.safety import Safety
-from maniskill_tomato.robot.iiwa14 import READY_QPOS
+from maniskill_tomato.robot.arm_model import ArmModel
+from maniskill_tomato.robot.iiwa14 import IIWA14
 from maniskill_tomato.robot.kinematics import forward_kinematics
 from maniskill_tomato.robot.transit import TransitPlanner
 
@@ -37,8 +38,6 @@ OTHERWISE: Final = 0.3
 
 WAYS_TRIED: Final = 16
 """Postures whose ways are tried before there is none."""
-
-READY: Final[Float64] = np.array(READY_QPOS, dtype=np.float64)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -64,9 +63,10 @@ class WayPlanner:
             T_flange_camera: The camera's optical frame in `link_ee`. Shape (4, 4).
         """
         self._safety = safety
-        self._postures = Postures(T_flange_camera, safety.config.joint_margin)
+        self._postures = Postures(T_flange_camera, safety.config.joint_margin, safety.model)
         self._detours = DetourPlanner(safety, T_flange_camera)
-        self._transits = TransitPlanner()
+        self._transits = TransitPlanner(model=safety.model)
+        self._ready: Float64 = np.array(safety.model.ready_qpos)
 
     def to_view(
         self,
@@ -111,7 +111,7 @@ class WayPlanner:
     def _candidates(self, place: Float64, target: Float64, joints: Float64) -> Iterator[tuple[Float64, bool]]:
         """Postures at a place, and whether they were chosen for being near to where the arm is."""
         given: list[Float64] = []
-        for reference, is_near in ((joints, True), (READY, False)):
+        for reference, is_near in ((joints, True), (self._ready, False)):
             found = self._postures.at(place, target, reference)
             others = (q for q in found if all(np.abs(q - other).max() > OTHERWISE for other in given))
             for posture in islice(others, POSTURES_TRIED):
@@ -134,6 +134,7 @@ class _Search:
     ) -> None:
         self._safety, self._detours, self._transits = safety, detours, transits
         self._state, self._now, self._stamp, self._points = state, now, frame_stamp, points_w
+        self._ready: Float64 = np.array(safety.model.ready_qpos)
         self._to_ready: list[Float64] | None = None
         self._knows_ready = False
 
@@ -147,7 +148,7 @@ class _Search:
             self._to_ready, self._knows_ready = self._find_ready(before), True
         if self._to_ready is None:
             return None
-        coming_in = self._pieces([READY, *reversed(self._backed_away(goal))])
+        coming_in = self._pieces([self._ready, *reversed(self._backed_away(goal))])
         return None if coming_in is None else [*self._to_ready, *coming_in]
 
     def _find_ready(self, before: Sequence[Float64]) -> list[Float64] | None:
@@ -156,10 +157,10 @@ class _Search:
         for earlier in (None, *reversed(before[-RETREATS:])):
             if earlier is not None:
                 back.append(earlier)
-            pieces = self._pieces([*back[:-1], *self._backed_away(back[-1]), READY])
+            pieces = self._pieces([*back[:-1], *self._backed_away(back[-1]), self._ready])
             if pieces is not None:
                 return pieces
-        way = self._detours.plan(self._state, READY, self._now, self._stamp, self._points)
+        way = self._detours.plan(self._state, self._ready, self._now, self._stamp, self._points)
         return None if way is None else [move.joint_positions for move in way]
 
     def _backed_away(self, joints: Float64) -> list[Float64]:
@@ -168,7 +169,8 @@ class _Search:
     def _pieces(self, waypoints: Iterable[Float64]) -> list[Float64] | None:
         config = self._safety.config
         way = np.stack(list(waypoints))
-        pieces = cut_way(way, WITHIN * config.max_joint_step, WITHIN * config.max_flange_step)
+        joint_step, flange_step = WITHIN * config.max_joint_step, WITHIN * config.max_flange_step
+        pieces = cut_way(way, joint_step, flange_step, self._safety.model)
         at = way[0]
         for end in pieces:
             move = JointMove(joint_positions=end, speed_fraction=config.speed_fraction)
@@ -179,13 +181,16 @@ class _Search:
         return pieces
 
 
-def cut_way(waypoints: Float64, joint_step: float, flange_step: float) -> list[Float64]:
+def cut_way(
+    waypoints: Float64, joint_step: float, flange_step: float, model: ArmModel = IIWA14
+) -> list[Float64]:
     """Cuts straight lines in joint space into pieces.
 
     Args:
         waypoints: Joint positions, the present ones first, in [rad]. Shape (n, 7).
         joint_step: The most that one joint turns in a piece, in [rad].
         flange_step: The farthest that the flange gets from where a piece begins, in [m].
+        model: Of the arm.
 
     Returns:
         Where each piece ends, in [rad]. Each of shape (7,).
@@ -195,14 +200,14 @@ def cut_way(waypoints: Float64, joint_step: float, flange_step: float) -> list[F
         count = max(int(np.ceil(np.abs(goal - start).max() / joint_step)), 1)
         while True:
             stops = [start + (goal - start) * k / count for k in range(count + 1)]
-            if all(_reach(a, b) <= flange_step for a, b in zip(stops[:-1], stops[1:], strict=True)):
+            if all(_reach(a, b, model) <= flange_step for a, b in zip(stops[:-1], stops[1:], strict=True)):
                 break
             count += 1
         ends += stops[1:]
     return ends
 
 
-def _reach(start: Float64, end: Float64) -> float:
+def _reach(start: Float64, end: Float64, model: ArmModel) -> float:
     """The farthest that the flange gets from its start on a straight line in joint space, in [m]."""
-    flange = forward_kinematics(torch.as_tensor(joint_path(start, end, 0.05))).numpy()[:, :3, 3]
+    flange = forward_kinematics(torch.as_tensor(joint_path(start, end, 0.05)), model).numpy()[:, :3, 3]
     return float(np.linalg.norm(flange - flange[0], axis=-1).max())

@@ -188,7 +188,7 @@ def make_workcell(
             return NOT_CONNECTED
         return in_words(problems) if problems else None
 
-    safety = Safety(profile.safety, profile.T_flange_camera)
+    safety = Safety(profile.safety, profile.T_flange_camera, arm.model)
     return Workcell(
         profile=profile,
         clock=checked,

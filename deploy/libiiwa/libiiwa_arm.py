@@ -25,7 +25,6 @@ from maniskill_tomato.deploy.deploy_errors import (
     RefusedError,
 )
 from maniskill_tomato.deploy.drivers import DriverContext
-from maniskill_tomato.deploy.iiwa_pieces import move_seconds, straight_pieces
 from maniskill_tomato.deploy.iiwa_readings import Reading, ReadingLog, pose_difference
 from maniskill_tomato.deploy.interface import Arm, ArmState, Float64, JointMove
 from maniskill_tomato.deploy.libiiwa.client import TOLD_TO_STOP, LibiiwaClient
@@ -33,6 +32,7 @@ from maniskill_tomato.deploy.libiiwa.libiiwa_config import LibiiwaConfig
 from maniskill_tomato.deploy.libiiwa.messages import ERRORS, Code, RobotState
 from maniskill_tomato.deploy.libiiwa.robot_connection import RobotConnection
 from maniskill_tomato.deploy.profile_bounds import relaxed
+from maniskill_tomato.deploy.straight_moves import move_seconds, straight_pieces
 from maniskill_tomato.deploy.toml_tables import parse_table
 from maniskill_tomato.robot import iiwa14
 
@@ -70,6 +70,7 @@ class LibiiwaArm(Arm):
     """An iiwa 14 whose controller runs LibIiwa. Not for use from several threads, except `stop`."""
 
     name = "libiiwa"
+    model = iiwa14.IIWA14
     simulated = False
     can_stop = True
 

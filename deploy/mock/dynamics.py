@@ -1,13 +1,15 @@
-"""The twin's arm: MuJoCo on the package's URDF, driven along minimum-jerk moves by computed torques."""
+"""The twin's arm: MuJoCo on its URDF, driven along minimum-jerk moves by computed torques."""
 
 from typing import Any, Final
 
 import mujoco
 import numpy as np
 
+from maniskill_tomato.deploy.arm_shapes import arm_shapes
 from maniskill_tomato.deploy.interface import Float64
-from maniskill_tomato.robot.iiwa14 import ACCELERATION_LIMITS, NUM_JOINTS, TORQUE_LIMITS, VELOCITY_LIMITS
-from maniskill_tomato.robot.robot_description import urdf_path
+from maniskill_tomato.robot.arm_model import NUM_JOINTS, ArmModel
+from maniskill_tomato.robot.d435 import T_flange_camera_color_optical
+from maniskill_tomato.robot.iiwa14 import IIWA14
 
 mj: Any = mujoco
 
@@ -26,23 +28,25 @@ BANDWIDTH: Final = 40.0
 """Of the position control, critically damped, in [rad/s]."""
 
 
-def duration(turn: Float64, speed_fraction: float) -> float:
+def duration(turn: Float64, speed_fraction: float, model: ArmModel = IIWA14) -> float:
     """How long a move takes, without the settling, in [s].
 
     Args:
         turn: How far each joint turns, in [rad]. Shape (7,).
         speed_fraction: Share of the joints' largest speeds.
+        model: Of the arm.
     """
-    by_speed = PEAK_SPEED * np.abs(turn) / (speed_fraction * VELOCITY_LIMITS)
-    by_acceleration = np.sqrt(PEAK_ACCELERATION * np.abs(turn) / (speed_fraction * ACCELERATION_LIMITS))
+    by_speed = PEAK_SPEED * np.abs(turn) / (speed_fraction * model.velocity_limits)
+    by_acceleration = np.sqrt(PEAK_ACCELERATION * np.abs(turn) / (speed_fraction * model.acceleration_limits))
     return float(max(by_speed.max(), by_acceleration.max()))
 
 
 class ArmDynamics:
     """Joint positions and velocities over time, with the joints' torque limits; self-collision is `safety`'s part."""
 
-    def __init__(self, start_joints: Float64) -> None:
-        spec = mj.MjSpec.from_file(urdf_path())
+    def __init__(self, start_joints: Float64, model: ArmModel = IIWA14) -> None:
+        self._arm = model
+        spec = arm_shapes(model, T_flange_camera_color_optical)
         for geom in spec.geoms:
             geom.contype, geom.conaffinity = 0, 0
         self._model: Any = spec.compile()
@@ -78,7 +82,9 @@ class ArmDynamics:
         """Begins a move from where the arm is sent now; how long it will take, in [s]."""
         self._start, self._goal = self._goal.copy(), np.array(goal, dtype=np.float64)
         self._began = self.time
-        self._duration = slowness * max(duration(self._goal - self._start, speed_fraction), TIME_STEP)
+        self._duration = slowness * max(
+            duration(self._goal - self._start, speed_fraction, self._arm), TIME_STEP
+        )
         return self._duration
 
     def halt(self) -> None:
@@ -106,5 +112,5 @@ class ArmDynamics:
         torque = np.zeros(NUM_JOINTS)
         mj.mj_mulM(model, data, torque, push)
         torque += data.qfrc_bias
-        data.qfrc_applied[:] = np.clip(torque, -TORQUE_LIMITS, TORQUE_LIMITS)
+        data.qfrc_applied[:] = np.clip(torque, -self._arm.torque_limits, self._arm.torque_limits)
         mj.mj_step2(model, data)

@@ -16,8 +16,9 @@ from maniskill_tomato.plants.episode_list import Episode, load_episodes
 from maniskill_tomato.plants.mesh_set import ALL
 from maniskill_tomato.plants.organs import Plant
 from maniskill_tomato.plants.spec import ROW_PLANT, PlantSpec
+from maniskill_tomato.robot.arm_model import ArmModel
 from maniskill_tomato.robot.d435 import T_flange_camera_color_optical
-from maniskill_tomato.robot.iiwa14 import JOINT_LOWER, JOINT_UPPER, READY_QPOS
+from maniskill_tomato.robot.iiwa14 import IIWA14
 from maniskill_tomato.robot.inverse_kinematics import Reach
 from maniskill_tomato.robot.look_at_move import LookAtMover
 
@@ -41,13 +42,14 @@ class TwinEpisode:
 
 
 @lru_cache(maxsize=4)
-def load_episode(name: str, index: int, plants: str | None = None) -> TwinEpisode:
+def load_episode(name: str, index: int, plants: str | None = None, model: ArmModel = IIWA14) -> TwinEpisode:
     """The episode that `TomatoViewpoint-v1` with `episodes=name` begins at `reset(seed=index)`.
 
     Args:
         name: One of the fixed lists, or a `.json` file of one.
         index: Which, modulo the list's length.
         plants: Mesh file or folder whose plants the list names; None for our own.
+        model: Of the arm.
 
     Raises:
         ProfileError: The index is negative.
@@ -57,15 +59,16 @@ def load_episode(name: str, index: int, plants: str | None = None) -> TwinEpisod
         raise ProfileError(f"the seed must be 0 or more, got {index}")
     episodes = load_episodes(name)
     spec = ROW_PLANT if plants is None else PlantSpec.parse({"mesh": plants, "seed": ALL}, ROW_PLANT)
-    return make_episode(episodes[index % len(episodes)], spec)
+    return make_episode(episodes[index % len(episodes)], spec, model)
 
 
-def make_episode(episode: Episode, spec: PlantSpec = ROW_PLANT) -> TwinEpisode:
+def make_episode(episode: Episode, spec: PlantSpec = ROW_PLANT, model: ArmModel = IIWA14) -> TwinEpisode:
     """Grows the plant and works out the start.
 
     Args:
         episode: Which plant, target and start.
         spec: The kind of plant that the episode's seed is of.
+        model: Of the arm.
 
     Raises:
         ProfileError: The arm cannot look at the target from the episode's start.
@@ -76,31 +79,36 @@ def make_episode(episode: Episode, spec: PlantSpec = ROW_PLANT) -> TwinEpisode:
     # Single precision and in this order, as in the simulated task, so that both start from the same bits.
     target_position = (T_world_plant[:3, :3] @ centre[:, None])[:, 0] + T_world_plant[:3, 3]
     looked_at = (centre[None] @ T_world_plant[:3, :3].T + T_world_plant[:3, 3]).double()
-    ready = torch.tensor(READY_QPOS, dtype=torch.float64)[None]
+    ready = torch.tensor(model.ready_qpos, dtype=torch.float64)[None]
     position = torch.tensor([episode.camera_position], dtype=torch.float64)
-    look = LookAtMover().look_from(ready, position, looked_at, largest_joint_step=10.0)
+    look = LookAtMover(model=model).look_from(ready, position, looked_at, largest_joint_step=10.0)
     if int(look.reach[0]) != Reach.REACHABLE:
-        raise ProfileError(f"the arm cannot look at the target from {episode.camera_position} [m]")
+        raise ProfileError(
+            f"the {model.name} cannot look at the target from {episode.camera_position} [m], where the episode "
+            "begins; choose another --seed"
+        )
     start = look.qpos[0].float().double().numpy()
     return TwinEpisode(
         plant=plant,
         T_world_plant=T_world_plant,
         target=episode.target,
         target_position=target_position,
-        start_joints=_clear_start(start, position[0].numpy(), looked_at[0].numpy()),
+        start_joints=_clear_start(start, position[0].numpy(), looked_at[0].numpy(), model),
     )
 
 
-def _clear_start(start: Float64, position: Float64, target: Float64) -> Float64:
+def _clear_start(start: Float64, position: Float64, target: Float64, model: ArmModel) -> Float64:
     """The task's start posture, or if that touches the table or itself, the nearest other one that does not.
 
     The task moves joints without collisions; an operator would not leave a real arm there.
     """
-    checker = CollisionChecker()
-    inside = (start > JOINT_LOWER + START_MARGIN).all() and (start < JOINT_UPPER - START_MARGIN).all()
+    checker = CollisionChecker(model=model)
+    low, high = model.joint_lower + START_MARGIN, model.joint_upper - START_MARGIN
+    inside = (start > low).all() and (start < high).all()
     if inside and checker.nearest(start[None]) is None:
         return start
-    for posture in Postures(T_flange_camera_color_optical, START_MARGIN).at(position, target, start):
+    postures = Postures(T_flange_camera_color_optical, START_MARGIN, model)
+    for posture in postures.at(position, target, start):
         if checker.nearest(posture[None]) is None:
             return posture
     return start

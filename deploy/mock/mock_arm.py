@@ -32,6 +32,7 @@ class MockArm(Arm):
     can_stop = True
 
     def __init__(self, world: TwinWorld, faults: Faults) -> None:
+        self.model = world.model
         self._world = world
         self._faults = faults
         self._connected = False
@@ -49,7 +50,12 @@ class MockArm(Arm):
 
     def describe(self) -> dict[str, Any]:
         episode = self._world.episode
-        return {"driver": self.name, "plant_seed": episode.plant.seed, "target": episode.target}
+        return {
+            "driver": self.name,
+            "model": self.model.name,
+            "plant_seed": episode.plant.seed,
+            "target": episode.target,
+        }
 
     def read(self, max_age_s: float = 0.5) -> ArmState:
         self._check()
@@ -81,7 +87,7 @@ class MockArm(Arm):
         return move
 
     def move_seconds(self, turn: Float64, speed_fraction: float) -> float:
-        return duration(turn, speed_fraction)
+        return duration(turn, speed_fraction, self.model)
 
     def wait(self, timeout_s: float) -> bool:
         self._check()

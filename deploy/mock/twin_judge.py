@@ -40,7 +40,9 @@ def judge(
 
     judged = judge_fruits(fruits, plant, centres, fraction)
     ripe = [j for j, fruit in enumerate(plant.fruits) if fruit.ripeness == "ripe"]
-    reached = ViewLattice().in_reach(torch.as_tensor(centres[ripe], dtype=torch.float32)).tolist()
+    reached = (
+        ViewLattice(model=world.model).in_reach(torch.as_tensor(centres[ripe], dtype=torch.float32)).tolist()
+    )
     in_reach = {j for j, fits in zip(ripe, reached, strict=True) if fits}
     score = score_lists([(judged, in_reach)], threshold)
     recall, precision, error = score.recall, score.precision, score.position_error_median_m

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from maniskill_tomato.deploy.clock import Clock
-from maniskill_tomato.deploy.drivers import DriverContext
+from maniskill_tomato.deploy.drivers import DriverContext, arm_model
 from maniskill_tomato.deploy.interface import Float64, FrameTruth
 from maniskill_tomato.deploy.mock.dynamics import ArmDynamics
 from maniskill_tomato.deploy.mock.episode import TwinEpisode, load_episode
@@ -21,7 +21,9 @@ from maniskill_tomato.plants.episode_list import EPISODE_LISTS, episode_path
 from maniskill_tomato.plants.organs import SemanticClass
 from maniskill_tomato.raycast.images import FIRST_ORGAN_LABEL, Picture
 from maniskill_tomato.raycast.scene import RayScene
+from maniskill_tomato.robot.arm_model import ArmModel
 from maniskill_tomato.robot.d435 import CameraIntrinsics, T_flange_camera_color_optical, color_intrinsics
+from maniskill_tomato.robot.iiwa14 import IIWA14, LINK_NAMES
 from maniskill_tomato.robot.kinematics import link_transforms
 from maniskill_tomato.robot.robot_description import link_meshes
 
@@ -64,6 +66,8 @@ class TwinOptions:
     """Which list the plants come from: held_out, validation, or a `.json` file such as `benchmark --plants` writes."""
     plants: str | None = None
     """Mesh file or folder whose plants such a file names; None for our own."""
+    model: str = IIWA14.name
+    """Which arm MuJoCo moves: the name of a registered arm model (`drivers.arm_model`)."""
     width: int = 640
     """Of the colour picture, in [px]."""
     height: int = 480
@@ -102,20 +106,26 @@ COLORS: Final = {
 class TwinWorld:
     """Arm, plant and time. The arm moves when somebody asks for the time."""
 
-    def __init__(self, episode: TwinEpisode, intrinsics: CameraIntrinsics, clock: Clock) -> None:
+    def __init__(
+        self, episode: TwinEpisode, intrinsics: CameraIntrinsics, clock: Clock, model: ArmModel = IIWA14
+    ) -> None:
         """Puts everything in place.
 
         Args:
             episode: Which plant and start.
             intrinsics: The camera's.
             clock: Drives the arm.
+            model: Of the arm.
         """
+        self.model = model
         self.episode = episode
         self.intrinsics = intrinsics
         self.clock = clock
-        self.arm = ArmDynamics(episode.start_joints)
+        self.arm = ArmDynamics(episode.start_joints, model)
         self._began = clock.now()
-        self.scene = RayScene([episode.plant], intrinsics, robot_meshes=link_meshes())
+        # Rays call links by the names of the iiwa 14.
+        meshes = dict(zip(LINK_NAMES, link_meshes(model).values(), strict=True))
+        self.scene = RayScene([episode.plant], intrinsics, robot_meshes=meshes)
         self._mount = torch.tensor(T_flange_camera_color_optical, dtype=torch.float32)
         organs = [organ.semantic_class for organ in episode.plant.organs]
         classes = [SemanticClass.BACKGROUND, SemanticClass.ROBOT, *organs]
@@ -187,7 +197,7 @@ class TwinWorld:
 
     def _poses(self, joints: Float64) -> tuple[Tensor, Tensor]:
         """Poses of the optical frame and of the links, in single precision as in the simulated task."""
-        links = link_transforms(torch.tensor(joints[None], dtype=torch.float32))
+        links = link_transforms(torch.tensor(joints[None], dtype=torch.float32), self.model)
         return links[:, -1] @ self._mount, links
 
 
@@ -204,9 +214,8 @@ def twin_world(options: TwinOptions, context: DriverContext) -> TwinWorld:
     """The world of a run, made when arm or camera asks first."""
 
     def make() -> TwinWorld:
-        intrinsics = color_intrinsics(options.width, options.height)
-        return TwinWorld(
-            load_episode(options.episodes, context.seed, options.plants), intrinsics, context.clock
-        )
+        intrinsics, model = color_intrinsics(options.width, options.height), arm_model(options.model)
+        episode = load_episode(options.episodes, context.seed, options.plants, model)
+        return TwinWorld(episode, intrinsics, context.clock, model)
 
     return context.shared("twin", make)

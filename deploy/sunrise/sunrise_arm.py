@@ -23,10 +23,10 @@ from maniskill_tomato.deploy.deploy_errors import (
     RefusedError,
 )
 from maniskill_tomato.deploy.drivers import DriverContext
-from maniskill_tomato.deploy.iiwa_pieces import move_seconds, straight_pieces
 from maniskill_tomato.deploy.iiwa_readings import Reading, ReadingLog, pose_difference
 from maniskill_tomato.deploy.interface import Arm, ArmState, Float64, JointMove
 from maniskill_tomato.deploy.profile_bounds import relaxed
+from maniskill_tomato.deploy.straight_moves import move_seconds, straight_pieces
 from maniskill_tomato.deploy.sunrise.client import SunriseClient
 from maniskill_tomato.deploy.sunrise.line_connection import LineConnection
 from maniskill_tomato.deploy.sunrise.sunrise_config import SunriseConfig
@@ -48,6 +48,7 @@ class SunriseArm(Arm):
     """An iiwa 14 whose controller runs the Sunrise Toolbox server. Not for use from several threads, except `stop`."""
 
     name = "sunrise"
+    model = iiwa14.IIWA14
     simulated = False
     can_stop = False
 

@@ -11,7 +11,7 @@ from maniskill_tomato.robot.arm_urdf import read_arm_model
 
 MODEL: Final[ArmModel] = read_arm_model(
     Path(__file__).parent / "iiwa7.urdf",
-    name="KUKA LBR iiwa 7 R800",
+    name="iiwa7",
     flange_link="link_ee",
     # KUKA's data sheet has none. These are those of the iiwa 14, the heavier arm.
     acceleration_limits=(8.57, 8.57, 8.74, 11.36, 12.23, 15.72, 15.72),

@@ -49,7 +49,7 @@ class ArmModel:
     """
 
     name: str
-    """For messages and recordings."""
+    """By which profiles and recordings name it."""
     urdf: Path
     """The URDF, whose collision shapes the arm is held clear by."""
     joint_names: tuple[str, ...]
@@ -117,7 +117,7 @@ class ArmModel:
 
     @cached_property
     def symmetric_limits(self) -> Float64:
-        """How far joints turn to either side, as the inverse kinematics have it, in [rad]. Shape (7,)."""
+        """How far the inverse kinematics turn joints to either side: the nearer limit, in [rad]. Shape (7,)."""
         return np.minimum(np.minimum(-self.joint_lower, self.joint_upper), math.pi)
 
     @cached_property
@@ -171,8 +171,11 @@ class ArmModel:
                     f"{name} has the limits {low:g} and {high:g} rad; the lower must lie from -6.28 to -0.1, the upper "
                     "from 0.1 to 6.28"
                 )
-            if not low <= self.ready_qpos[j] <= high:
-                yield f"ready_qpos has {name} at {self.ready_qpos[j]:g} rad, outside its limits"
+            if abs(self.ready_qpos[j]) > self.symmetric_limits[j]:
+                yield (
+                    f"ready_qpos has {name} at {self.ready_qpos[j]:g} rad, but the kinematics turn it by at most "
+                    f"{self.symmetric_limits[j]:g} rad to either side, the nearer of its limits"
+                )
             for kind in ("velocity_limits", "acceleration_limits", "torque_limits"):
                 value = getattr(self, kind)[j]
                 if not 0.0 < value <= 1e4:

@@ -33,7 +33,7 @@ def read_arm_model(
 
     Args:
         urdf: Its joints need limits with `lower`, `upper`, `velocity` and `effort`.
-        name: For messages and recordings.
+        name: By which profiles and recordings name it.
         flange_link: The link that carries the camera, z out of the flange, fixed to what the last joint turns.
         acceleration_limits: Largest joint accelerations, in [rad/s^2]. Shape (7,).
         spheres: Spheres that cover the last links, as for `ArmModel`.

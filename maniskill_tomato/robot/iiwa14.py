@@ -142,7 +142,7 @@ LINK_SPHERES: Final[dict[str, tuple[Sphere, ...]]] = {
 of these links' meshes lies in one of their spheres. They reach 9 mm beyond the links in the mean (95 %: 25 mm)."""
 
 IIWA14: Final = ArmModel(
-    name="KUKA LBR iiwa 14 R820",
+    name="iiwa14",
     urdf=ASSETS_DIR / URDF_NAME,
     joint_names=JOINT_NAMES,
     link_names=LINK_NAMES,

@@ -57,6 +57,7 @@ from maniskill_tomato.deploy.stops import Stops
 from maniskill_tomato.errors import InvalidInputError
 from maniskill_tomato.robot import d435
 from maniskill_tomato.robot.d435 import CameraIntrinsics
+from maniskill_tomato.robot.iiwa14 import IIWA14
 from maniskill_tomato.robot.inverse_kinematics import InverseKinematics
 from maniskill_tomato.robot.look_at import look_at_pose
 
@@ -554,6 +555,7 @@ class StillArm(Arm):
     """An arm that stands where it was sent as soon as that is asked."""
 
     name = "still"
+    model = IIWA14
 
     def __init__(self, clock: Clock) -> None:
         self.joints, self.clock = START, clock

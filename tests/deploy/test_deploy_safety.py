@@ -21,7 +21,7 @@ from maniskill_tomato.deploy.plant_points import sphere_distances
 from maniskill_tomato.deploy.safety import Refusal, Safety, SafetyConfig
 from maniskill_tomato.errors import InvalidInputError
 from maniskill_tomato.robot.d435 import T_flange_camera_color_optical
-from maniskill_tomato.robot.iiwa14 import JOINT_AXES, JOINT_ORIGINS, JOINT_UPPER, READY_QPOS
+from maniskill_tomato.robot.iiwa14 import IIWA14, JOINT_AXES, JOINT_ORIGINS, JOINT_UPPER, READY_QPOS
 from maniskill_tomato.robot.kinematics import forward_kinematics
 from maniskill_tomato.robot.robot_description import urdf_path
 
@@ -106,7 +106,11 @@ def test_the_margin_holds_at_both_limits_of_a_joint_and_is_named_in_degrees(sign
     goal[2], start[2] = sign * (bound + 0.01), sign * (bound - 0.05)
     refusal = safety.check(move(goal), state(start), 10.0)
     assert refusal is not None and refusal.reason == "joint_limit"
-    assert f"+-{np.rad2deg(bound):.1f} deg, got {sign * np.rad2deg(bound + 0.01):.1f} deg" in refusal.detail
+    degrees = np.rad2deg(bound)
+    assert (
+        f"from -{degrees:.1f} to {degrees:.1f} deg, got {sign * np.rad2deg(bound + 0.01):.1f} deg"
+        in refusal.detail
+    )
 
 
 def test_an_arm_outside_the_workspace_may_come_in() -> None:
@@ -528,6 +532,7 @@ class SpyArm(Arm):
     """Goes at once where it is sent, and keeps what it was sent."""
 
     name = "spy"
+    model = IIWA14
     simulated = True
     can_stop = True
 

@@ -25,7 +25,7 @@ from maniskill_tomato.deploy.stops import Stops
 from maniskill_tomato.deploy.workcell import make_workcell
 from maniskill_tomato.policies.protocol import Planner
 from maniskill_tomato.robot.d435 import T_flange_camera_color_optical
-from maniskill_tomato.robot.iiwa14 import LINK_NAMES, READY_QPOS
+from maniskill_tomato.robot.iiwa14 import IIWA14, LINK_NAMES, READY_QPOS
 from maniskill_tomato.robot.kinematics import forward_kinematics, link_transforms
 from maniskill_tomato.robot.robot_description import link_meshes, urdf_path
 from maniskill_tomato.sensing.belief import Belief
@@ -155,6 +155,7 @@ class Instant(Arm):
     """An arm that is where it is sent at once."""
 
     name = "instant"
+    model = IIWA14
     simulated = True
     can_stop = True
 

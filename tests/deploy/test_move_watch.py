@@ -20,7 +20,7 @@ from maniskill_tomato.deploy.loopback_faults import Fault
 from maniskill_tomato.deploy.move_watch import Departure, MoveWatch
 from maniskill_tomato.deploy.safety import Safety, SafetyConfig
 from maniskill_tomato.deploy.sunrise.loopback import LoopbackController
-from maniskill_tomato.robot.iiwa14 import READY_QPOS
+from maniskill_tomato.robot.iiwa14 import IIWA14, READY_QPOS
 
 CONFIG = SafetyConfig(max_state_age=10.0, plant_clearance=None)
 AWAY = np.array([0.3, -0.1, 0.2, 0.1, 0.2, -0.1, 0.4])
@@ -130,7 +130,7 @@ def seen(
     path: Any, until: float, dt: float = 0.05, stamp_error: float = 0.0
 ) -> tuple[float, Departure | None]:
     """Looks at `path(t)`, joint positions over time, until something is noticed; when, and what."""
-    watch = MoveWatch(np.zeros(7), SLOW, SECONDS, 100.0)
+    watch = MoveWatch(np.zeros(7), SLOW, SECONDS, 100.0, IIWA14)
     for t in np.arange(dt, until, dt):
         departure = watch.see(path(t), 100.0 + t - stamp_error, 100.0 + t)
         if departure is not None:
@@ -182,7 +182,7 @@ def test_what_a_real_controller_may_do_is_not_held_against_it(path: Any) -> None
 
 
 def test_a_loop_that_was_held_up_blames_nothing_on_the_arm_and_late_answers_no_speed() -> None:
-    watch = MoveWatch(np.zeros(7), SLOW, SECONDS, 100.0)
+    watch = MoveWatch(np.zeros(7), SLOW, SECONDS, 100.0, IIWA14)
     assert watch.see(at(0.1), 100.3, 100.3) is None
     assert watch.see(at(0.1), 190.0, 190.0) is None
     # Measured right after an answer that was itself on its way for 0.5 s.
@@ -194,6 +194,7 @@ class StaleArm(Arm):
     """Answers with the state that it had before the move."""
 
     name = "stale"
+    model = IIWA14
     simulated = True
 
     def __init__(self, clock: SimulatedClock) -> None:

@@ -1,11 +1,12 @@
-"""Moves of an iiwa in pieces on a straight line in joint space, and how long these may take."""
+"""Moves in pieces on a straight line in joint space, and how long these may take."""
 
 import math
 
 import numpy as np
 from numpy.typing import NDArray
 
-from maniskill_tomato.robot import iiwa14
+from maniskill_tomato.robot.arm_model import ArmModel
+from maniskill_tomato.robot.iiwa14 import IIWA14
 
 Float64 = NDArray[np.float64]
 
@@ -25,9 +26,11 @@ def straight_pieces(start: Float64, target: Float64, largest: float) -> list[Flo
     return [start + (target - start) * (i / count) for i in range(1, count)] + [target]
 
 
-def move_seconds(start: Float64, target: Float64, speed: float, acceleration: float = 1.0) -> float:
+def move_seconds(
+    start: Float64, target: Float64, speed: float, acceleration: float = 1.0, model: ArmModel = IIWA14
+) -> float:
     """The longest that a point-to-point move takes at these shares of the largest joint speeds and accelerations, in
     [s]."""
-    cruise = float(np.max(np.abs(target - start) / (iiwa14.VELOCITY_LIMITS * speed)))
-    ramp = speed / acceleration * float(np.max(iiwa14.VELOCITY_LIMITS / iiwa14.ACCELERATION_LIMITS))
+    cruise = float(np.max(np.abs(target - start) / (model.velocity_limits * speed)))
+    ramp = speed / acceleration * float(np.max(model.velocity_limits / model.acceleration_limits))
     return cruise + ramp
