@@ -23,6 +23,7 @@ from maniskill_tomato.deploy.fault_state import STATES_KEPT
 from maniskill_tomato.deploy.interface import LIMIT_SLACK, Arm, ArmState, Float64, JointMove, declared_model
 from maniskill_tomato.deploy.move_watch import MoveWatch
 from maniskill_tomato.deploy.safety import Safety
+from maniskill_tomato.robot.arm_model import ArmModel
 
 _logger = logging.getLogger(__name__)
 
@@ -79,6 +80,11 @@ class GuardedArm:
             why_stop: Why the new one has to stop, None while it need not; asked before every move is sent and after.
         """
         self._stopped, self._why_stop = None, why_stop
+
+    @property
+    def model(self) -> ArmModel:
+        """What the arm's driver declares of it."""
+        return self._model
 
     @property
     def simulated(self) -> bool:

@@ -54,6 +54,7 @@ INFO: Final = _object(
         "version": _TEXT,
         "devices": {"type": "object"},
         "T_flange_camera": _POSE,
+        "arm_model": {**_TEXT, "description": "name of the arm's model"},
         "row_moves": _INTEGER,
     },
     *(
@@ -67,7 +68,7 @@ INFO: Final = _object(
         "simulated",
         "version",
     ),
-    *("devices", "T_flange_camera", "row_moves"),
+    *("devices", "T_flange_camera", "arm_model", "row_moves"),
 )
 """Of `/info`."""
 

@@ -27,6 +27,7 @@ from maniskill_tomato.deploy.interface import ArmState, Camera, Float64, JointMo
 from maniskill_tomato.deploy.rigid import transform
 from maniskill_tomato.deploy.stops import Stops
 from maniskill_tomato.errors import InvalidInputError, check_ranges
+from maniskill_tomato.robot.arm_model import ArmModel
 from maniskill_tomato.robot.d435 import T_flange_camera_color_optical
 from maniskill_tomato.robot.inverse_kinematics import InverseKinematics, Reach
 from maniskill_tomato.warp_runtime import load_kernels
@@ -137,7 +138,7 @@ def capture_views(
         DeployError: A device fails; what was taken so far is written.
     """
     plan, stops = plan or CapturePlan(), stops or Stops()
-    kinematics = InverseKinematics()
+    kinematics = InverseKinematics(model=arm.model)
     # Compiled before the first beat, from which on the heartbeat is watched.
     load_kernels()
     views: list[RecordedView] = []
@@ -162,6 +163,7 @@ def capture_views(
             color=frame.color,
             joint_positions=joints,
             taken=datetime.now(UTC).isoformat(timespec="seconds"),
+            model=arm.model,
         )
         seen = board_view(board, view)
         if len(seen.corner_ids) < MIN_CORNERS:
@@ -195,7 +197,7 @@ def capture_views(
         what = "back to the start" if going_back else f"view {len(views) + 1} of {plan.views}"
         confirmed = False
         with suppress(StoppedError), stops.waiting_for_a_person():
-            confirmed = confirm(f"{what}: {_in_words(move, state)}")
+            confirmed = confirm(f"{what}: {_in_words(move, state, arm.model)}")
         check_stops()
         if not confirmed:
             if going_back:
@@ -209,8 +211,8 @@ def capture_views(
     return views
 
 
-def _in_words(move: JointMove, state: ArmState) -> str:
-    x, y, z = flange_pose(move.joint_positions)[:3, 3]
+def _in_words(move: JointMove, state: ArmState, model: ArmModel) -> str:
+    x, y, z = flange_pose(move.joint_positions, model)[:3, 3]
     turn = np.degrees(np.abs(move.joint_positions - state.joint_positions).max())
     return (
         f"flange to x {x:.3f}, y {y:.3f}, z {z:.3f} m, largest joint turn {turn:.0f} degrees, "

@@ -14,11 +14,14 @@ from numpy.typing import NDArray
 
 from maniskill_tomato.deploy.calibration.board import CharucoBoard
 from maniskill_tomato.deploy.calibration.hand_eye import BoardView, CalibrationError
+from maniskill_tomato.deploy.deploy_errors import ProfileError
+from maniskill_tomato.deploy.drivers import arm_model
 from maniskill_tomato.deploy.interface import Float64
 from maniskill_tomato.errors import InvalidInputError
 from maniskill_tomato.files import write_atomically
+from maniskill_tomato.robot.arm_model import NUM_JOINTS, ArmModel
 from maniskill_tomato.robot.d435 import CameraIntrinsics
-from maniskill_tomato.robot.iiwa14 import JOINT_UPPER, NUM_JOINTS
+from maniskill_tomato.robot.iiwa14 import IIWA14
 from maniskill_tomato.robot.kinematics import forward_kinematics
 from maniskill_tomato.segmentation.datasets.picture_files import read_picture
 from maniskill_tomato.text_files import read_json
@@ -40,11 +43,15 @@ class RecordedView:
     """In [rad]. Shape (7,)."""
     taken: str = ""
     """When, in UTC as ISO 8601; empty if that is not known."""
+    model: ArmModel = IIWA14
+    """Of the arm."""
 
 
-def flange_pose(joint_positions: Float64) -> Float64:
-    """`link_ee` in the base frame at joint angles in [rad]. Shape (7,) to (4, 4)."""
-    return np.asarray(forward_kinematics(torch.from_numpy(np.array(joint_positions))).numpy(), np.float64)
+def flange_pose(joint_positions: Float64, model: ArmModel = IIWA14) -> Float64:
+    """The flange in the base frame at joint angles in [rad]. Shape (7,) to (4, 4)."""
+    return np.asarray(
+        forward_kinematics(torch.from_numpy(np.array(joint_positions)), model).numpy(), np.float64
+    )
 
 
 def board_view(board: CharucoBoard, view: RecordedView) -> BoardView:
@@ -52,7 +59,7 @@ def board_view(board: CharucoBoard, view: RecordedView) -> BoardView:
     ids, pixels = board.find(view.color)
     return BoardView(
         name=view.name,
-        T_base_flange=flange_pose(view.joint_positions),
+        T_base_flange=flange_pose(view.joint_positions, view.model),
         corner_ids=ids,
         corners_px=pixels,
     )
@@ -73,6 +80,7 @@ def write_views(
             write_atomically(path, png.tobytes())
     index = {
         "serial": serial,
+        "arm_model": views[0].model.name if views else IIWA14.name,
         "intrinsics": asdict(intrinsics),
         "views": [
             {"image": v.name, "joint_positions": v.joint_positions.tolist(), "taken": v.taken} for v in views
@@ -106,11 +114,17 @@ def read_views(folder: Path) -> tuple[list[RecordedView], CameraIntrinsics, str]
         raise CalibrationError(
             f"{path}: intrinsics must have width, height, fx, fy, cx, cy ({error})"
         ) from error
-    views = [_read_view(folder, entry, k, intrinsics) for k, entry in enumerate(index["views"])]
+    try:
+        model = arm_model(str(index.get("arm_model", IIWA14.name)))
+    except ProfileError as error:
+        raise CalibrationError(f"{path}: arm_model: {error}") from error
+    views = [_read_view(folder, entry, k, intrinsics, model) for k, entry in enumerate(index["views"])]
     return views, intrinsics, str(index.get("serial", ""))
 
 
-def _read_view(folder: Path, entry: Any, k: int, intrinsics: CameraIntrinsics) -> RecordedView:
+def _read_view(
+    folder: Path, entry: Any, k: int, intrinsics: CameraIntrinsics, model: ArmModel
+) -> RecordedView:
     where = f"{folder / INDEX_NAME}: views[{k}]"
     if not isinstance(entry, dict) or not isinstance(entry.get("image"), str):
         raise CalibrationError(f"{where} must have a string `image` and `joint_positions`")
@@ -118,7 +132,8 @@ def _read_view(folder: Path, entry: Any, k: int, intrinsics: CameraIntrinsics) -
         joints = np.array(entry["joint_positions"], dtype=np.float64)
     except (KeyError, TypeError, ValueError) as error:
         raise CalibrationError(f"{where}.joint_positions must be {NUM_JOINTS} numbers") from error
-    if joints.shape != (NUM_JOINTS,) or not np.all(np.abs(joints) <= JOINT_UPPER + 0.02):
+    low, high = model.joint_lower - 0.02, model.joint_upper + 0.02
+    if joints.shape != (NUM_JOINTS,) or not np.all((joints >= low) & (joints <= high)):
         raise CalibrationError(
             f"{where}.joint_positions must be {NUM_JOINTS} angles within the joint limits, in radians; got "
             f"{entry['joint_positions']}"
@@ -136,7 +151,7 @@ def _read_view(folder: Path, entry: Any, k: int, intrinsics: CameraIntrinsics) -
             f"{where}.image is {picture.shape[1]} x {picture.shape[0]} px, the intrinsics are of "
             f"{intrinsics.width} x {intrinsics.height}"
         )
-    return RecordedView(name=name, color=picture, joint_positions=joints, taken=taken)
+    return RecordedView(name=name, color=picture, joint_positions=joints, taken=taken, model=model)
 
 
 def _utc(text: Any, where: str) -> str:

@@ -4,6 +4,7 @@ The packages are real ones: a module and its `entry_points.txt` on the path, as 
 """
 
 import sys
+import tomllib
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -103,10 +104,8 @@ class Misdeclared(NarrowArm):
 '''
 
 
-def installed(folder: Path, monkeypatch: pytest.MonkeyPatch, module: str, code: str, entries: str) -> None:
-    """Puts a package on the path as pip would."""
-    folder.mkdir(exist_ok=True)
-    (folder / f"{module}.py").write_text(code)
+def installed(folder: Path, monkeypatch: pytest.MonkeyPatch, module: str, entries: str) -> None:
+    """Says that a package is there, as pip would."""
     facts = folder / f"{module}-1.0.dist-info"
     facts.mkdir()
     (facts / "METADATA").write_text(f"Metadata-Version: 2.1\nName: {module}\nVersion: 1.0\n")
@@ -119,7 +118,7 @@ def makers(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
     """Installs the drivers above; joint 4 of their arm bends from -110 to 100 degrees, at half its speed."""
     folder = tmp_path / "site"
     folder.mkdir()
-    urdf = (EXAMPLE / "iiwa7.urdf").read_text()
+    urdf = (EXAMPLE / "tomato_iiwa7" / "iiwa7.urdf").read_text()
     a4 = 'lower="-2.0943951" upper="2.0943951" effort="110" velocity="2.2689280"'
     assert urdf.count(a4) == 1
     urdf = urdf.replace(a4, 'lower="-1.9198622" upper="1.7453293" effort="110" velocity="1.1344640"')
@@ -134,24 +133,27 @@ def makers(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
             "model.stray": "NarrowArm",
         }.items()
     )
-    installed(folder, monkeypatch, "other_makers_arm", DRIVER, entries)
+    (folder / "other_makers_arm.py").write_text(DRIVER)
+    installed(folder, monkeypatch, "other_makers_arm", entries)
     yield folder
     sys.modules.pop("other_makers_arm", None)
 
 
 @pytest.fixture
 def example(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
-    """Installs the example's model."""
+    """Installs the example with the entry points of its `pyproject.toml`."""
     folder = tmp_path / "example"
     folder.mkdir()
-    (folder / "iiwa7.urdf").write_text((EXAMPLE / "iiwa7.urdf").read_text())
-    code = (EXAMPLE / "iiwa7_model.py").read_text()
-    installed(folder, monkeypatch, "iiwa7_model", code, "model.iiwa7 = iiwa7_model:MODEL")
+    project = tomllib.loads((EXAMPLE / "pyproject.toml").read_text())["project"]
+    entries = project["entry-points"]["maniskill_tomato.drivers"]
+    lines = "\n".join(f"{name} = {what}" for name, what in entries.items())
+    installed(folder, monkeypatch, "tomato_iiwa7", lines)
+    monkeypatch.syspath_prepend(str(EXAMPLE))
     yield
-    sys.modules.pop("iiwa7_model", None)
+    sys.modules.pop("tomato_iiwa7", None)
 
 
-def profile(driver: str, extra: str = "", twin: str = "") -> Profile:
+def profile(driver: str, extra: str = "") -> Profile:
     text = f"""
 description = "another arm"
 [arm]
@@ -163,14 +165,11 @@ driver = "mock"
 width = 160
 height = 120
 depth_noise = 0.0
-{twin}
 [perception]
 segmenter = "ground_truth"
 sight = "rays"
 [target]
 source = "twin"
-[loop]
-max_moves = 4
 """
     return parse_profile(text, Path("other.toml"))
 
@@ -355,8 +354,9 @@ def test_models_are_found_by_name(makers: Path, example: None) -> None:
 def test_the_twin_moves_another_arm_in_mujoco_from_a_profile_to_its_replay(
     example: None, tmp_path: Path
 ) -> None:
-    other = profile("mock", twin='model = "iiwa7"')
-    result = run(RunConfig(profile=other, out=tmp_path / "run", policy="nbv", seed=3))
+    file = EXAMPLE / "iiwa7_twin.toml"
+    short = parse_profile(file.read_text() + "\n[loop]\nmax_moves = 3\n", file)
+    result = run(RunConfig(profile=short, out=tmp_path / "run", policy="nbv", seed=3))
     assert not result.is_fault, result.detail
     assert result.moves >= 1
     recorded = load_recording(tmp_path / "run" / "run.mcap")

@@ -1,6 +1,11 @@
 """Another arm than the iiwa 14: the KUKA LBR iiwa 7 R800, as its drivers would declare it.
 
-A driver for it is a subclass of `maniskill_tomato.deploy.interface.Arm` with `model = MODEL`.
+The package registers the model by an entry point (`pyproject.toml`), so that the twin can move it in MuJoCo:
+
+    pip install ./examples/other_arm
+    maniskill-tomato deploy run --profile examples/other_arm/iiwa7_twin.toml --seed 3 --out runs/iiwa7
+
+A driver for the real arm is a subclass of `maniskill_tomato.deploy.interface.Arm` with `model = MODEL`.
 """
 
 from pathlib import Path
