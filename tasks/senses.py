@@ -17,6 +17,7 @@ from maniskill_tomato.errors import InvalidInputError
 from maniskill_tomato.raycast.view_rays import ViewRays
 from maniskill_tomato.robot.kinematics import link_transforms
 from maniskill_tomato.sensing.camera_perception import CameraPerception
+from maniskill_tomato.sensing.inspection import STALE_AFTER
 from maniskill_tomato.sensing.inspection_judge import NO_FRUIT
 from maniskill_tomato.sensing.observation import ViewpointObserver
 from maniskill_tomato.sensing.perception_kinds import MAP_NOISE, RENDERED, Association, Naming, Perception
@@ -276,7 +277,12 @@ class CameraSenses:
     """Measures what a camera sees; where the truth is needed only to be told beside it, rays are cast."""
 
     def __init__(
-        self, world: World, perception: Perception, config: CameraConfig, full_visibility: float
+        self,
+        world: World,
+        perception: Perception,
+        config: CameraConfig,
+        full_visibility: float,
+        keeps_target: bool = False,
     ) -> None:
         """Senses in a world.
 
@@ -285,6 +291,7 @@ class CameraSenses:
             perception: Which camera and estimator.
             config: How targets are named.
             full_visibility: V_f above which a fruit is fully visible.
+            keeps_target: Whether a robot that chose its target never gives it up for another.
         """
         made = make_camera(
             perception,
@@ -297,6 +304,7 @@ class CameraSenses:
         self._world = world
         self._config = config
         self._full_visibility = full_visibility
+        self._patience = None if keeps_target else STALE_AFTER
         self._camera, self._perception = made
         self._qpos = world.state.qpos
         self._pictures: NDArray[np.uint8] | None = None
@@ -335,6 +343,7 @@ class CameraSenses:
             place_error=config.map_noise,
             hidden_below=hidden_below or None,
             chooses=config.target == "any",
+            patience=self._patience,
             threshold=self._full_visibility,
         )
 

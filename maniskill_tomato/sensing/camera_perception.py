@@ -17,6 +17,7 @@ from maniskill_tomato.raycast.view_rays import RAYS_PER_SIDE, RayLabel, ViewRays
 from maniskill_tomato.segmentation.masks import BinaryMask
 from maniskill_tomato.sensing.fruit_detector import FruitDetector
 from maniskill_tomato.sensing.fruit_map import Fraction, FruitMap, MapConfig, MappedView, Track
+from maniskill_tomato.sensing.inspection import LEAST_GAIN
 from maniskill_tomato.sensing.measurement import Measurement, Position
 from maniskill_tomato.sensing.observation import ViewpointObserver
 from maniskill_tomato.sensing.occlusion_memory import CELL_SIZE
@@ -73,11 +74,17 @@ class _Search:
     hidden_below: float | None = None
     chooses: bool = False
     """Whether any ripe fruit that is not fully seen yet will do."""
+    patience: int | None = None
+    """Views in a row that show no more of such a fruit before another is chosen; None for no other."""
+    stale: int = 0
+    """How many these are."""
+    most: float = 0.0
+    """Largest V_f of the present target in any view."""
     threshold: float = 1.0
     """A fruit with a larger V_f is fully seen."""
     target: int | None = None
     ruled_out: frozenset[int] = frozenset()
-    """Tracks that cannot be the target."""
+    """Tracks that cannot be the target, or were given up."""
     looks_at: Position | None = None
     """Where the robot looks without a target, world frame, in [m]. Shape (3,)."""
     centre: Position | None = None
@@ -129,6 +136,7 @@ class CameraPerception:
         place_error: float = MAP_NOISE,
         hidden_below: float | None = None,
         chooses: bool = False,
+        patience: int | None = None,
         threshold: float = 1.0,
     ) -> None:
         """Forgets an environment's fruits and begins with a new target.
@@ -140,6 +148,8 @@ class CameraPerception:
             place_error: Standard deviation of its coordinates, in [m].
             hidden_below: The first view shows less of the target than this V_f; None if that is not known.
             chooses: Whether any ripe fruit that is not fully seen yet becomes the target.
+            patience: Views in a row that show no more of such a target before another is chosen, if the last of them
+                shows one; None to keep it.
             threshold: V_f above which it is fully seen.
         """
         self._searches[env_index] = _Search(
@@ -148,6 +158,7 @@ class CameraPerception:
             place_error=place_error,
             hidden_below=hidden_below,
             chooses=chooses,
+            patience=patience,
             threshold=threshold,
             centre=None if place_w is None else np.array(place_w, dtype=np.float64),
         )
@@ -186,7 +197,7 @@ class CameraPerception:
         search = self._searches[env_index]
         if search.views:
             search.threshold = threshold
-            self._choose(search, search.views[-1])
+            search.target = self._choice(search, search.views[-1])
         return self._aim(search)
 
     def look(self, frames: Sequence[PosedFrame | None]) -> Tensor:
@@ -231,8 +242,8 @@ class CameraPerception:
             search.target = search.map.current(search.target)
         if search.place is not None:
             self._find(search, view, first)
-        elif search.chooses and search.target is None:
-            self._choose(search, view)
+        elif search.chooses:
+            self._choose_anew(search, view)
         return self._aim(search)
 
     def views(self, env_index: int) -> Sequence[Measurement]:
@@ -353,17 +364,36 @@ class CameraPerception:
         elif search.target is not None and best is not None and weights[best] <= unseen:
             search.target = None
 
-    def _choose(self, search: _Search, view: MappedView) -> None:
-        """The largest ripe, sure fruit of the picture that is not fully visible in it becomes the target."""
+    def _choose_anew(self, search: _Search, view: MappedView) -> None:
+        """Chooses a target where there is none, or where views have long shown no more of it."""
+        if search.target is not None:
+            index = view.detection(search.target)
+            fraction = search.map.fraction(view.measurement, index, search.target).value
+            search.stale = 0 if fraction > search.most + LEAST_GAIN else search.stale + 1
+            search.most = max(search.most, fraction)
+            if search.patience is None or search.stale < search.patience:
+                return
+        before, ruled_out = search.target, search.ruled_out
+        if before is not None:
+            search.ruled_out = ruled_out | {before}
+        chosen = self._choice(search, view)
+        if chosen is None and before is not None:
+            search.ruled_out = ruled_out
+            return
+        search.target, search.stale, search.most = chosen, 0, 0.0
+
+    def _choice(self, search: _Search, view: MappedView) -> int | None:
+        """The largest ripe, sure fruit of the picture that is not fully visible in it and was not given up."""
         best, pixels = None, 0
+        given_up = {search.map.current(number) for number in search.ruled_out}
         for index, (fruit, number) in enumerate(zip(view.measurement.fruits, view.tracks, strict=True)):
             track = search.map.tracks.get(number)
             if track is None or not track.is_ripe or fruit.score < SURE_SCORE or not fruit.is_depth_measured:
                 continue
             seen = search.map.fraction(view.measurement, index, number)
-            if seen.value <= search.threshold and fruit.pixels > pixels:
+            if seen.value <= search.threshold and fruit.pixels > pixels and number not in given_up:
                 best, pixels = number, fruit.pixels
-        search.target = best
+        return best
 
     def _aim(self, search: _Search) -> bool:
         """Works out V_f and where to look; whether that is elsewhere."""

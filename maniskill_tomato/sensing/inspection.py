@@ -37,6 +37,9 @@ LOST_AFTER: Final = 6
 STALE_AFTER: Final = 6
 """It is given up, too, after so many views in a row that do not show more of it than those before."""
 
+LEAST_GAIN: Final = 0.02
+"""A view shows more of a fruit when its V_f is larger by more than this."""
+
 LITTLE: Final = 0.15
 """One of which no view has shown more than this V_f is given up after half as many views: it may be none."""
 
@@ -212,7 +215,7 @@ class Inspection:
         target = None if self.aim is None else self.aim.track
         self._lost = 0 if target is None or target in view.tracks else self._lost + 1
         shown = 0.0 if target is None or target not in self._best else self._best[target].fraction
-        self._stale = 0 if shown > self._most + 0.02 else self._stale + 1
+        self._stale = 0 if shown > self._most + LEAST_GAIN else self._stale + 1
         self._most = max(self._most, shown)
 
     def is_full(self, number: int) -> bool:

@@ -55,7 +55,7 @@ class ThesisGame:
         if perception != "ground_truth":
             assert camera is not None
             check_pictures(perception, world)
-            self._camera = CameraSenses(world, perception, camera, full_visibility=1.0)
+            self._camera = CameraSenses(world, perception, camera, 1.0, keeps_target=True)
             self.saved_columns += (
                 "views",
                 "view_count",

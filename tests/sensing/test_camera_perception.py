@@ -15,6 +15,7 @@ from maniskill_tomato.robot.kinematics import link_transforms
 from maniskill_tomato.segmentation.instances import Instances
 from maniskill_tomato.sensing.camera_perception import CameraPerception
 from maniskill_tomato.sensing.fruit_detector import FruitDetector
+from maniskill_tomato.sensing.inspection import STALE_AFTER
 from maniskill_tomato.sensing.simulated_camera import IMAGE_SIZE, SimulatedCamera
 from maniskill_tomato.tasks.making import make_world
 
@@ -109,6 +110,26 @@ def test_a_robot_that_chooses_is_judged_by_the_fruit_that_it_chose() -> None:
             assert float(true) == float(of_chosen)
     assert chosen >= 2
     env.close()
+
+
+def test_a_chosen_fruit_of_which_no_view_shows_more_is_given_up_for_another_one() -> None:
+    world, again = (
+        make_world("TomatoViewpoint-v1", episodes="validation", perception="occlusion_model", target="any")
+        for _ in range(2)
+    )
+    world.reset([0])
+    targets, beliefs = [], []
+    for _ in range(STALE_AFTER + 2):
+        world.step(torch.zeros(1, 3))
+        targets.append(int(world.state.target[0]))
+        beliefs.append(world.belief.target_position[0].clone())
+    # The first move's view is compared with nothing; the six after it show no more.
+    first, second = targets[0], targets[-1]
+    assert targets == [first] * STALE_AFTER + [second] * 2 and first != second
+    for fruit, belief in ((first, beliefs[0]), (second, beliefs[-1])):
+        assert float((belief - world.fruit_position_w(0, fruit)).norm()) < 0.02
+    again.restore(world.save())
+    assert torch.equal(again.belief.target_position[0], beliefs[-1])
 
 
 def test_success_goes_by_the_lower_bound_and_the_policy_is_told_the_estimate() -> None:

@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from maniskill_tomato.errors import InvalidInputError
+from maniskill_tomato.sensing.inspection import STALE_AFTER
 from maniskill_tomato.tasks.making import make_world
 from maniskill_tomato.tasks.thesis.thesis_rewards import guided_visual_reward
 from maniskill_tomato.tasks.world import World
@@ -49,6 +50,17 @@ def test_a_camera_chooses_its_target_when_it_first_sees_one_and_measures_it_near
                 assert sure < told if told > 0.0 else sure == 0.0
     assert len(offsets) >= 4
     assert np.median(offsets) < 0.015 and np.abs(errors).mean() < 0.1
+
+
+def test_in_the_thesis_tasks_the_first_target_stays_the_target() -> None:
+    world = make_world(SPARSE, perception="occlusion_model")
+    world.reset(21)
+    targets = set()
+    for _ in range(STALE_AFTER + 2):
+        world.step(torch.zeros(1, 6))
+        assert bool(world.info()["target_named"][0])
+        targets.add(int(world.target_fruit[0]))
+    assert len(targets) == 1
 
 
 def test_reward_and_success_follow_from_what_the_camera_measures() -> None:
