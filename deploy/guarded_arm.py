@@ -22,7 +22,9 @@ from maniskill_tomato.deploy.deploy_errors import (
 from maniskill_tomato.deploy.fault_state import STATES_KEPT
 from maniskill_tomato.deploy.interface import LIMIT_SLACK, Arm, ArmState, Float64, JointMove, declared_model
 from maniskill_tomato.deploy.move_watch import MoveWatch
+from maniskill_tomato.deploy.profile_bounds import check_envelope
 from maniskill_tomato.deploy.safety import Safety
+from maniskill_tomato.errors import InvalidInputError
 from maniskill_tomato.robot.arm_model import ArmModel
 
 _logger = logging.getLogger(__name__)
@@ -49,7 +51,8 @@ class GuardedArm:
             why_forbidden: Why no move may be sent at all, None while moves may be sent; asked before every move.
 
         Raises:
-            ProfileError: The arm declares no model, or the envelope is of another one.
+            ProfileError: The arm declares no model, or the envelope is of another one, or the arm is real and its
+                envelope goes beyond what a profile may choose.
         """
         self._model = declared_model(arm)
         if safety.model is not self._model:
@@ -57,6 +60,11 @@ class GuardedArm:
                 f"the driver {arm.name} moves a {self._model.name!r}, but the safety checks are those of a "
                 f"{safety.model.name!r}; make Safety with model=arm.model"
             )
+        if not arm.simulated:
+            try:
+                check_envelope(safety.config)
+            except InvalidInputError as error:
+                raise ProfileError(f"the guard of a real arm: {error}") from error
         self._why_forbidden: Callable[[], str | None] = why_forbidden or _nobody
         self._stopped: str | None = None
         self._why_stop: Callable[[], str | None] = _nobody

@@ -1,7 +1,7 @@
 """How far a profile may go: every number has a floor and a ceiling with a reason, and what a profile relaxes is told.
 
-The dataclasses check that a number means something; what is here is what a lab may choose. The base of the arm stays a
-forbidden zone whatever a profile says. `docs/deploy.md` has the table.
+The dataclasses check that a number means something; what is here is what a lab may choose, in a profile or, for a real
+arm, in a program. The base of the arm stays a forbidden zone. `docs/deploy.md` has the table.
 """
 
 from collections.abc import Iterator, Mapping
@@ -104,6 +104,20 @@ def _check_workspace(box: Box) -> None:
                     f"safety.workspace.{name} must have {axis} from {least:g} to {most:g} m, got {value:g} (the arm "
                     "reaches no farther, so that the limit would be none)"
                 )
+
+
+def check_envelope(config: SafetyConfig) -> None:
+    """Accepts an envelope that a real arm may have, whoever made it.
+
+    Raises:
+        InvalidInputError: A number is outside its bounds, or the zone around the base is missing.
+    """
+    check_bounds("safety", config)
+    if BASE_ZONE not in config.forbidden:
+        raise InvalidInputError(
+            f"safety.forbidden must keep the zone around the base, {BASE_ZONE}, got {config.forbidden}; "
+            "`with_base_zone` adds it"
+        )
 
 
 def with_base_zone(config: SafetyConfig) -> SafetyConfig:

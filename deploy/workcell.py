@@ -20,9 +20,11 @@ from maniskill_tomato.deploy.drivers import DriverContext, make_arm, make_camera
 from maniskill_tomato.deploy.guarded_arm import GuardedArm
 from maniskill_tomato.deploy.interface import Arm, Camera, Float64
 from maniskill_tomato.deploy.profile import Profile
+from maniskill_tomato.deploy.profile_bounds import BOUNDS, check_bounds
 from maniskill_tomato.deploy.robot_perception import Perception, open_perception
 from maniskill_tomato.deploy.safety import Safety
 from maniskill_tomato.deploy.stops import Stops
+from maniskill_tomato.errors import InvalidInputError
 
 _logger = logging.getLogger(__name__)
 
@@ -141,6 +143,19 @@ def _problems(profile: Profile, camera: Camera, calibrates: bool) -> list[str]:
     return problems
 
 
+def _check_bounds(profile: Profile) -> None:
+    """Accepts a profile that a program made, as if it had been read from a file.
+
+    Raises:
+        ProfileError: A number is outside its bounds.
+    """
+    try:
+        for table in BOUNDS:
+            check_bounds(table, getattr(profile, table))
+    except InvalidInputError as error:
+        raise ProfileError(f"{profile.name}: {error}") from error
+
+
 def in_words(problems: Sequence[str]) -> str:
     """What speaks against a calibration, as one message."""
     return (
@@ -161,7 +176,8 @@ def make_workcell(
             other one needs a calibration of the camera that is connected.
 
     Raises:
-        ProfileError: A driver or an option is wrong, or a simulated camera would guide a real arm.
+        ProfileError: A driver or an option is wrong, a number of a real arm's profile is outside its bounds, or a
+            simulated camera would guide a real arm.
     """
     if clock is None:
         # A recording that plays by the simulated clock loses no picture to a busy machine.
@@ -173,6 +189,8 @@ def make_workcell(
     context = DriverContext(clock=checked, seed=seed)
     arm = make_arm(profile.arm_driver, profile.arm_options, context)
     camera = make_camera(profile.camera_driver, profile.camera_options, context)
+    if not arm.simulated:
+        _check_bounds(profile)
     for line in (*profile.relaxations(), *arm.relaxations()):
         _logger.warning("the profile relaxes %s", line)
     if not arm.simulated and profile.calibration is not None:

@@ -33,6 +33,7 @@ def sunrise(*faults: Fault, **options: Any) -> Iterator[tuple[LoopbackController
         host, port = controller.address
         patient = {"connect_pause_s": 0.0, "reply_timeout_s": 30.0, "move_margin_s": 30.0, **options}
         arm = make_arm("sunrise", {"host": host, "port": port, **patient}, DriverContext(clock=clock))
+        arm.simulated = True  # Nothing real moves; a busy machine needs the patience of CONFIG.
         with arm:
             yield controller, GuardedArm(arm, Safety(CONFIG), clock)
 
@@ -90,6 +91,7 @@ def libiiwa(**robot: Any) -> Iterator[tuple[LoopbackRobot, GuardedArm]]:
     clock = MonotonicClock()
     with LoopbackRobot(port=port, qpos=READY_QPOS.tolist(), tries_for_s=20.0, **robot) as loopback:
         arm = make_arm("libiiwa", {**options, "move_margin_s": 30.0}, DriverContext(clock=clock))
+        arm.simulated = True
         with arm:
             yield loopback, GuardedArm(arm, Safety(CONFIG), clock)
 

@@ -2,7 +2,7 @@
 
 import logging
 import math
-from dataclasses import fields
+from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -12,11 +12,24 @@ from maniskill_tomato.deploy.capture import CaptureConfig
 from maniskill_tomato.deploy.clock import MonotonicClock
 from maniskill_tomato.deploy.deploy_errors import ProfileError
 from maniskill_tomato.deploy.drivers import DriverContext, make_arm
+from maniskill_tomato.deploy.guarded_arm import GuardedArm
 from maniskill_tomato.deploy.profile import Profile, StopConfig, parse_profile
 from maniskill_tomato.deploy.profile_bounds import BASE_ZONE, BOUNDS, LARGEST_WORKSPACE
 from maniskill_tomato.deploy.run_records import LoopConfig
-from maniskill_tomato.deploy.safety import SafetyConfig
+from maniskill_tomato.deploy.safety import Safety, SafetyConfig
 from maniskill_tomato.deploy.workcell import make_workcell
+from maniskill_tomato.errors import InvalidInputError
+
+
+class EnvelopeOf(Safety):
+    """The checks without their collision model, which takes a while to build."""
+
+    def __init__(self, config: SafetyConfig) -> None:
+        self.config = config
+
+
+TAKEN_BY_THE_DATACLASS = {("safety", "max_speed_fraction"), ("loop", "settle"), ("capture", "pause")}
+"""Whose bounds the dataclass has already."""
 
 DEVICES = '[arm]\ndriver = "mock"\n[camera]\ndriver = "mock"\n'
 TABLES: dict[str, Any] = {
@@ -133,6 +146,36 @@ def test_options_of_an_iiwa_have_ceilings_too_and_are_told() -> None:
             make_arm(driver, {"torque_margin": [161.0, *margins[1:]]}, context)
         with pytest.raises(ProfileError, match="rest_tolerance must be from 1e-05 to 0.05, got 1000000000.0"):
             make_arm(driver, {"rest_tolerance": 1e9}, context)
+
+
+@pytest.mark.parametrize(("name", "key"), EACH)
+def test_a_program_gives_a_real_arm_no_number_beyond_its_bounds_either(name: str, key: str) -> None:
+    bound = BOUNDS[name][key]
+    real = parse_profile('[arm]\ndriver = "sunrise"\n[camera]\ndriver = "realsense"\n', Path("lab.toml"))
+    refused = 0
+    step = 1 if isinstance(bound.low, int) else 1e-6
+    for value in (bound.low - step, bound.high + step):
+        try:
+            wide = replace(getattr(real, name), **{key: value})
+        except InvalidInputError:
+            continue  # Its own dataclass does not take it.
+        with pytest.raises(ProfileError, match=rf"lab: {name}.{key} must be from"):
+            make_workcell(replace(real, **{name: wide}))
+        refused += 1
+        if name == "safety":
+            arm = make_arm("sunrise", {}, DriverContext(clock=MonotonicClock()))
+            with pytest.raises(ProfileError, match=rf"the guard of a real arm: safety.{key} must be from"):
+                GuardedArm(arm, EnvelopeOf(wide), MonotonicClock())
+    assert refused or (name, key) in TAKEN_BY_THE_DATACLASS
+
+
+def test_the_guard_of_a_real_arm_keeps_the_zone_around_the_base() -> None:
+    arm = make_arm("sunrise", {}, DriverContext(clock=MonotonicClock()))
+    with pytest.raises(ProfileError, match="must keep the zone around the base"):
+        GuardedArm(arm, EnvelopeOf(SafetyConfig(forbidden=())), MonotonicClock())
+    GuardedArm(arm, EnvelopeOf(SafetyConfig()), MonotonicClock())
+    arm.simulated = True
+    GuardedArm(arm, EnvelopeOf(SafetyConfig(forbidden=(), max_state_age=10.0)), MonotonicClock())
 
 
 def test_the_table_of_the_documentation_is_what_is_checked() -> None:
