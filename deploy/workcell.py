@@ -60,7 +60,7 @@ class Workcell:
     def calibration_problems(self) -> list[str]:
         """What speaks against moving a real arm by the profile's calibration, a sentence each; more once the camera is
         connected. Nothing speaks against it where nothing real moves."""
-        return [] if self.simulated else _problems(self.profile, self.camera, self.calibrates)
+        return [] if self.simulated else _problems(self.profile, self.arm, self.camera, self.calibrates)
 
     def check_calibration(self) -> None:
         """Accepts a calibration by which the arm may move.
@@ -132,12 +132,14 @@ NOT_CONNECTED = (
 """Why a real arm does not move without its camera."""
 
 
-def _problems(profile: Profile, camera: Camera, calibrates: bool) -> list[str]:
+def _problems(profile: Profile, arm: Arm, camera: Camera, calibrates: bool) -> list[str]:
     if calibrates:
         return [*pose_problems(profile.T_flange_camera, profile.T_drawing)]
     if profile.calibration is None:
         return [NOT_CALIBRATED]
-    problems = [*file_problems(profile.T_flange_camera, profile.calibration, profile.T_drawing)]
+    problems = [
+        *file_problems(profile.T_flange_camera, profile.calibration, profile.T_drawing, arm.model.name)
+    ]
     if camera.is_connected:
         problems += camera_problems(profile.calibration, camera.serial, camera.intrinsics)
     return problems
@@ -201,7 +203,7 @@ def make_workcell(
     def why_forbidden() -> str | None:
         if arm.simulated:
             return None
-        problems = _problems(profile, camera, calibrates)
+        problems = _problems(profile, arm, camera, calibrates)
         if not problems and not camera.is_connected:
             return NOT_CONNECTED
         return in_words(problems) if problems else None

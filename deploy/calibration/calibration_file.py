@@ -27,6 +27,8 @@ class Calibration:
 
     serial: str = ""
     """Of the camera."""
+    arm_model: str = ""
+    """Name of the arm whose kinematics told where the flange was."""
     taken: str | None = None
     """When the oldest view was taken, ISO 8601 with a time zone."""
     intrinsics: CameraIntrinsics | None = None
@@ -77,6 +79,7 @@ def write_calibration(
     dates = [view.taken for view in views]
     calibration = Calibration(
         serial=serial,
+        arm_model=views[0].model.name,
         taken=min(dates) if all(dates) else None,
         intrinsics=intrinsics,
         view_count=len(result.views),

@@ -99,7 +99,11 @@ def residual_problems(errors: Mapping[str, float | None]) -> Iterator[str]:
 
 
 def file_problems(
-    pose: Float64, calibration: Calibration, drawing: Float64, now: datetime | None = None
+    pose: Float64,
+    calibration: Calibration,
+    drawing: Float64,
+    arm_model: str,
+    now: datetime | None = None,
 ) -> Iterator[str]:
     """What speaks against moving a real arm by a calibration, as far as its file tells.
 
@@ -107,12 +111,18 @@ def file_problems(
         pose: The camera's optical frame in `link_ee`, as calibrated. Shape (4, 4).
         calibration: What the file says beside.
         drawing: The same frame by the mount's drawing. Shape (4, 4).
+        arm_model: Name of the arm's model.
         now: The date; None for the computer's.
 
     Yields:
         A sentence each, with value, limit and what to do.
     """
     yield from pose_problems(pose, drawing)
+    if calibration.arm_model != arm_model:
+        yield (
+            f"it is of an arm {calibration.arm_model or 'without a name'}, this one is {arm_model} and has other "
+            f"kinematics; {AGAIN}"
+        )
     yield from residual_problems({c.key: getattr(calibration, c.key) for c in CEILINGS})
     views = calibration.view_count
     if views is None or views < LEAST_VIEWS:

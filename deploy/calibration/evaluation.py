@@ -66,6 +66,11 @@ def evaluate(
             or too much alike to tell anything.
     """
     problems = list(camera_problems(calibration, serial, intrinsics))
+    models = {view.model.name for view in views} - {calibration.arm_model}
+    if models:
+        problems.append(
+            f"it is of an arm {calibration.arm_model or 'without a name'}, these are of {', '.join(models)}"
+        )
     if problems:
         raise CalibrationError(f"the calibration does not go with these views: {'; '.join(problems)}")
     if not calibration.pictures:

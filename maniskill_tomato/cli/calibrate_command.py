@@ -116,7 +116,8 @@ class DeployCalibrate:
             T_flange_camera_color_optical if self.profile is None else load_profile(self.profile).T_drawing
         )
         _end_with(
-            [*file_problems(result.T_flange_camera, calibration, drawing)], "a real arm would not move by it"
+            [*file_problems(result.T_flange_camera, calibration, drawing, calibration.arm_model)],
+            "a real arm would not move by it",
         )
 
     def _measure(

@@ -36,13 +36,14 @@ from maniskill_tomato.deploy.sunrise.loopback import LoopbackController
 from maniskill_tomato.deploy.workcell import make_workcell
 from maniskill_tomato.robot import d435
 from maniskill_tomato.robot.d435 import CameraIntrinsics
-from maniskill_tomato.robot.iiwa14 import READY_QPOS
+from maniskill_tomato.robot.iiwa14 import IIWA14, READY_QPOS
 
 NOW = datetime(2026, 11, 29, 12, 0, tzinfo=UTC)
 COLOR = d435.color_intrinsics(640, 480, "measured")
 DRAWING = d435.T_flange_camera_color_optical
 GOOD = Calibration(
     serial="0123",
+    arm_model=IIWA14.name,
     taken=(NOW - timedelta(days=3)).isoformat(),
     intrinsics=COLOR,
     view_count=15,
@@ -65,7 +66,7 @@ def days(count: float) -> str:
 
 
 def problems(change: dict[str, Any] | None = None, pose: Float64 = DRAWING) -> list[str]:
-    return [*file_problems(pose, replace(GOOD, **(change or {})), DRAWING, NOW)]
+    return [*file_problems(pose, replace(GOOD, **(change or {})), DRAWING, IIWA14.name, NOW)]
 
 
 def test_a_good_calibration_has_no_problems_and_neither_has_one_at_each_limit() -> None:
@@ -92,6 +93,8 @@ def test_a_good_calibration_has_no_problems_and_neither_has_one_at_each_limit() 
         ({"board_turn_rms": math.radians(2.0)}, "board_turn_rms is 2 deg, 1.5 deg at most"),
         ({"position_std": 0.004}, "position_std is 4 mm, 1 mm at most"),
         ({"rotation_std": math.inf}, "rotation_std is inf deg, 0.5 deg at most"),
+        ({"arm_model": "iiwa7"}, "it is of an arm iiwa7, this one is iiwa14"),
+        ({"arm_model": ""}, "it is of an arm without a name"),
         ({"view_count": 9}, "it tells of 9 views, 10 are needed"),
         ({"view_count": None}, "it tells of no number of views"),
         ({"taken": days(OLDEST_DAYS + 1)}, "its views are 181 days old, 180 at most are allowed"),

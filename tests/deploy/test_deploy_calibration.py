@@ -505,6 +505,8 @@ def test_views_that_the_calibration_was_made_from_say_nothing_of_it(
         evaluate(BOARD, pose, replace(facts, pictures=()), new_views, COLOR, "42")
     with pytest.raises(CalibrationError, match="it is of camera 42, the connected one is 43"):
         evaluate(BOARD, pose, facts, new_views, COLOR, "43")
+    with pytest.raises(CalibrationError, match=f"it is of an arm iiwa7, these are of {IIWA14.name}"):
+        evaluate(BOARD, pose, replace(facts, arm_model="iiwa7"), new_views, COLOR, "42")
     other = replace(COLOR, fx=COLOR.fx + 4.0)
     with pytest.raises(CalibrationError, match=r"differ by 2\.1 px at a corner"):
         evaluate(BOARD, pose, facts, new_views, other, "42")

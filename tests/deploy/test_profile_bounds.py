@@ -19,13 +19,14 @@ from maniskill_tomato.deploy.run_records import LoopConfig
 from maniskill_tomato.deploy.safety import Safety, SafetyConfig
 from maniskill_tomato.deploy.workcell import make_workcell
 from maniskill_tomato.errors import InvalidInputError
+from maniskill_tomato.robot.iiwa14 import IIWA14
 
 
 class EnvelopeOf(Safety):
     """The checks without their collision model, which takes a while to build."""
 
     def __init__(self, config: SafetyConfig) -> None:
-        self.config = config
+        self.config, self.model = config, IIWA14
 
 
 TAKEN_BY_THE_DATACLASS = {("safety", "max_speed_fraction"), ("loop", "settle"), ("capture", "pause")}
