@@ -87,6 +87,6 @@ def rehearsal(
         clock=clock,
         arm=arm,
         camera=camera,
-        guarded_arm=GuardedArm(arm, Safety(profile.safety), clock),
+        guarded_arm=GuardedArm(arm, Safety(profile.safety, model=arm.model), clock),
         perception=TruthPerception(),
     )

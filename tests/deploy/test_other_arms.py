@@ -3,6 +3,7 @@
 The packages are real ones: a module and its `entry_points.txt` on the path, as pip leaves them.
 """
 
+import ast
 import sys
 import tomllib
 from collections.abc import Callable, Iterator
@@ -305,6 +306,12 @@ UNSERVED: dict[str, tuple[Callable[[str], str], str]] = {
         "MuJoCo cannot",
     ),
     "no spheres": (lambda t: t, "no spheres cover link_5"),
+    "spheres that miss their link": (
+        lambda t: t.replace(
+            'xyz="0 0.0621 0" rpy="1.5707963267948966 0 0"', 'xyz="0 0.1621 0" rpy="1.5708 0 0"'
+        ),
+        "the spheres of link_6 leave a corner of its collision shapes",
+    ),
 }
 
 
@@ -369,3 +376,58 @@ def test_the_twin_moves_another_arm_in_mujoco_from_a_profile_to_its_replay(
         np.testing.assert_allclose(np.array(step.facts["T_world_camera"])[:3, 3], camera[:3, 3], atol=1e-5)
     again = replay(recorded)
     assert again.differences == ()
+
+
+MODEL_PLACE = {
+    "ArmDynamics": 1,
+    "CollisionChecker": 0,
+    "InverseKinematics": 2,
+    "LookAtMover": 2,
+    "McapRecorder": 4,
+    "MoveWatch": 4,
+    "PlantPoints": 2,
+    "Postures": 2,
+    "RobotBelief": 3,
+    "Safety": 2,
+    "TransitPlanner": 1,
+    "ViewLattice": 1,
+    "WholeRow": 3,
+    "arm_spec": 3,
+    "cut_way": 3,
+    "flange_pose": 1,
+    "forward_kinematics": 1,
+    "link_frames": 2,
+    "link_meshes": 0,
+    "link_transforms": 1,
+    "load_episode": 3,
+    "make_episode": 2,
+    "simple_urdf": 0,
+    "sphere_distances": 3,
+    "sphere_table": 1,
+    "swept_distances": 5,
+}
+"""What is an iiwa 14's unless a model is given, and after how many other arguments it may be given."""
+
+OF_THE_IIWA = ("iiwa_readings.py", "libiiwa", "sunrise")
+"""The drivers of the iiwa in `deploy`, which may take its numbers as they are."""
+
+
+def test_nothing_in_deploy_but_the_iiwas_drivers_forgets_which_arm_it_is_about() -> None:
+    deploy = Path(__file__).parents[2] / "deploy"
+    calls, forgot = set(), []
+    for path in sorted(deploy.rglob("*.py")):
+        where = path.relative_to(deploy)
+        if where.parts[0] in OF_THE_IIWA:
+            continue
+        for node in ast.walk(ast.parse(path.read_text())):
+            if isinstance(node, ast.ImportFrom) and node.module == "maniskill_tomato.robot.iiwa14":
+                forgot += [f"{where}: {a.name}" for a in node.names if a.name not in ("IIWA14", "LINK_NAMES")]
+            if not isinstance(node, ast.Call) or not isinstance(node.func, ast.Name):
+                continue
+            name = node.func.id
+            if name in MODEL_PLACE:
+                calls.add(name)
+                has_model = len(node.args) > MODEL_PLACE[name] or any(k.arg == "model" for k in node.keywords)
+                forgot += [] if has_model else [f"{where}:{node.lineno}: {name}"]
+    assert forgot == []
+    assert calls == set(MODEL_PLACE)
