@@ -214,6 +214,21 @@ class CollisionChecker:
             following = min(share + ahead, 1.0)
             share = leaves if share < leaves < following else following
 
+    def smallest(self, contact: Contact, joint_positions: Float64) -> float:
+        """Smallest distance of two things at some postures, or that of the contact itself, in [m].
+
+        Args:
+            contact: Between which.
+            joint_positions: In [rad]. Shape (N, 7).
+        """
+        names, found = {contact.first, contact.second}, contact.distance
+        for joints in joint_positions:
+            near = self._near(joints)
+            for pair, distance in zip(near.pairs, near.distances, strict=True):
+                if {self._names[g] for g in pair} == names:
+                    found = min(found, float(distance))
+        return found
+
     def _near(self, joints: Float64) -> "_Near":
         """The pairs of shapes that are not far from each other."""
         data = self._data

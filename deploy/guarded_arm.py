@@ -23,6 +23,7 @@ from maniskill_tomato.deploy.fault_state import STATES_KEPT
 from maniskill_tomato.deploy.interface import LIMIT_SLACK, Arm, ArmState, Float64, JointMove, declared_model
 from maniskill_tomato.deploy.move_watch import MoveWatch
 from maniskill_tomato.deploy.profile_bounds import check_envelope
+from maniskill_tomato.deploy.refusals import Refusal
 from maniskill_tomato.deploy.safety import Safety
 from maniskill_tomato.errors import InvalidInputError
 from maniskill_tomato.robot.arm_model import ArmModel
@@ -31,6 +32,9 @@ _logger = logging.getLogger(__name__)
 
 JUMP_SLACK: Final = 0.02
 """A joint may seem to turn this much beyond what its largest speed allows between two states, in [rad]."""
+
+SENT_TOLERANCE: Final = 1e-3
+"""What a driver sends may be rounded by this much, in [rad]."""
 
 
 class GuardedArm:
@@ -74,8 +78,8 @@ class GuardedArm:
         self._last: ArmState | None = None
         self.recent: deque[ArmState] = deque(maxlen=STATES_KEPT)
         """The last readings, as the arm gave them, wrong ones too; the newest last."""
-        self.refused = ""
-        """What the last command that was refused was told."""
+        self.refused: Refusal | None = None
+        """Why the last command that was refused was refused."""
         self._under_way: JointMove | None = None
         self.watch: MoveWatch | None = None
         """Of the move under way, or of the last one."""
@@ -130,9 +134,11 @@ class GuardedArm:
         beyond = np.maximum(self._model.joint_lower - joints, joints - self._model.joint_upper)
         if (beyond > LIMIT_SLACK).any():
             k = int(beyond.argmax())
+            low, high = np.rad2deg(self._model.joint_lower[k]), np.rad2deg(self._model.joint_upper[k])
             raise FaultError(
-                f"the arm reports {self._model.joint_names[k]} at {np.rad2deg(joints[k]):.1f} deg, outside its limits; "
-                "check which unit it sends"
+                f"the arm reports {self._model.joint_names[k]} at {np.rad2deg(joints[k]):.1f} deg, "
+                f"{np.rad2deg(beyond[k]):.2f} deg outside its limits of {low:.1f} to {high:.1f} deg; check which unit "
+                "it sends"
             )
         if self._last is not None:
             self._check_jump(self._last, state)
@@ -148,7 +154,8 @@ class GuardedArm:
         if (turned > allowed).any():
             k = int((turned - allowed).argmax())
             raise FaultError(
-                f"{self._model.joint_names[k]} jumped by {turned[k]:.3f} rad in {elapsed:.3f} s, more than it can turn"
+                f"{self._model.joint_names[k]} jumped by {turned[k]:.3f} rad in {elapsed:.3f} s: "
+                f"{turned[k] - allowed[k]:.3f} rad more than the {allowed[k]:.3f} rad that it can turn"
             )
 
     def command(
@@ -176,10 +183,11 @@ class GuardedArm:
         state = self.read()
         refusal = self.safety.check(move, state, self._clock.now(), frame_stamp, points_w)
         if refusal is not None:
-            self.refused = str(refusal)
-            raise RefusedError(self.refused)
+            self.refused = refusal
+            # Its words are worked out when somebody asks for them.
+            raise RefusedError(refusal)
         if self._under_way is not None:
-            raise RefusedError("busy: the last move has not ended")
+            raise RefusedError("busy: the last move has not ended; wait for its end, or stop it")
         self._check_stopped()
         start = state.joint_positions
         seconds = self._arm.move_seconds(move.joint_positions - start, move.speed_fraction)
@@ -196,9 +204,13 @@ class GuardedArm:
         if self._asked_to_stop() is not None:
             # Asked while it was sent.
             self.stop()
-        if not np.abs(sent.joint_positions - move.joint_positions).max() <= 1e-3:
+        off = float(np.abs(sent.joint_positions - move.joint_positions).max())
+        if not off <= SENT_TOLERANCE:
             self.stop()
-            raise FaultError("the driver sent other joint positions than the checked ones")
+            raise FaultError(
+                f"the driver sent joint positions that are {off:.4f} rad off the checked ones, allowed are "
+                f"{SENT_TOLERANCE:g} rad"
+            )
         return sent
 
     def wait(self, timeout_s: float) -> bool:
@@ -221,8 +233,8 @@ class GuardedArm:
             if off.max() > self.safety.config.arrival_tolerance:
                 k = int(off.argmax())
                 raise FaultError(
-                    f"the arm stands {off[k]:.3f} rad from where {self._model.joint_names[k]} was sent; something "
-                    "holds it back"
+                    f"the arm stands {off[k]:.3f} rad from where {self._model.joint_names[k]} was sent, allowed are "
+                    f"{self.safety.config.arrival_tolerance:g} rad; something holds it back"
                 )
         return True
 

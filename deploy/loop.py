@@ -43,9 +43,9 @@ from maniskill_tomato.deploy.goal import Goal, Look, OneFruit
 from maniskill_tomato.deploy.interface import Float64, Frame, JointMove
 from maniskill_tomato.deploy.move_choice import Choice, MoveChooser, MoveRequest
 from maniskill_tomato.deploy.plant_points import PlantPoints
+from maniskill_tomato.deploy.refusals import Refusal
 from maniskill_tomato.deploy.robot_perception import RobotBelief
 from maniskill_tomato.deploy.run_records import Mode, Proposal, Recorder, RunResult, Step
-from maniskill_tomato.deploy.safety import Refusal
 from maniskill_tomato.deploy.stops import Stops
 from maniskill_tomato.deploy.way import Way, WayPlanner
 from maniskill_tomato.deploy.workcell import Workcell
@@ -434,7 +434,7 @@ class Loop:
     def _send(self, step: Step, chosen: Choice) -> None:
         """Has a move carried out, or counts it as refused."""
         if chosen.move is None:
-            self._refuse(step, "out of reach")
+            self._refuse(step, chosen.out_of_reach)
             return
         if self._mode != "unattended":
             self._ask(step, chosen.move, chosen.refusal)
@@ -563,7 +563,7 @@ class Loop:
             stamp=stamp,
             arm_states=tuple(state_facts(state) for state in arm.recent),
             plan=None if arm.watch is None else plan_facts(arm.watch, arm.is_under_way),
-            refused=arm.refused,
+            refused="" if arm.refused is None else str(arm.refused),
             stop=arm.why_stopped or self._stops.reason,
             memory={
                 "looks": len(self._fractions),

@@ -18,7 +18,8 @@ from torch import Tensor
 
 from maniskill_tomato.deploy.detour import DetourPlanner
 from maniskill_tomato.deploy.interface import ArmState, Float64, JointMove
-from maniskill_tomato.deploy.safety import COLLISIONS, Refusal, Safety
+from maniskill_tomato.deploy.refusals import COLLISIONS, Refusal
+from maniskill_tomato.deploy.safety import Safety
 from maniskill_tomato.robot.arm_model import NUM_JOINTS, ArmModel
 from maniskill_tomato.robot.iiwa14 import IIWA14
 from maniskill_tomato.robot.inverse_kinematics import IkConfig, InverseKinematics, Reach
@@ -30,6 +31,7 @@ from maniskill_tomato.robot.look_at_move import (
     keeps_clear,
     moved_position,
 )
+from maniskill_tomato.robot.out_of_reach import out_of_reach
 
 SWIVELS: Final = (0.0, 0.5, -0.5, 1.0, -1.0, 1.6, -1.6)
 """Turns of joint 3 from a reference posture that lead the elbow elsewhere, in [rad]."""
@@ -70,6 +72,8 @@ class Choice:
     """The safe move, or if there is none the task's own; None where the arm cannot reach that either."""
     refusal: Refusal | None
     """Why `safety` refuses the task's own; None if `move` may go out or there is none."""
+    out_of_reach: str = ""
+    """Why there is no move, if there is none."""
     then: tuple[JointMove, ...] = ()
     """What follows `move` on a way round an obstacle; each is checked again before it goes out."""
 
@@ -85,8 +89,8 @@ class MoveChooser:
             T_flange_camera: The camera's optical frame in `link_ee`. Shape (4, 4).
         """
         self._safety = safety
-        mount = np.array(T_flange_camera, dtype=np.float64)
-        self._mover = LookAtMover(T_flange_camera=mount, model=safety.model)
+        self._mount = np.array(T_flange_camera, dtype=np.float64)
+        self._mover = LookAtMover(T_flange_camera=self._mount, model=safety.model)
         self._postures = Postures(T_flange_camera, safety.config.joint_margin, safety.model)
         self._detours = DetourPlanner(safety, T_flange_camera)
 
@@ -142,17 +146,28 @@ class MoveChooser:
             request.target_position,
             config.max_joint_step,
         )
+        why = "it is out of reach" if refusal is None else f"{refusal.reason}: {refusal.detail}"
         for posture in islice(others, OTHERS_TRIED):
             move = JointMove(joint_positions=posture, speed_fraction=config.speed_fraction)
             if self._safety.check(move, state, now, frame_stamp, points_w) is None:
-                _logger.info("the move is made in another posture, because %s", refusal or "out of reach")
+                _logger.info("the move is made in another posture, because %s", why)
                 return Choice(move=move, refusal=None)
         if own is not None and refusal is not None and refusal.reason in COLLISIONS:
             way = self._detours.plan(state, own.joint_positions, now, frame_stamp, points_w)
             if way is not None:
-                _logger.info("the move is made in %d parts, because %s", len(way), refusal)
+                _logger.info("the move is made in %d parts, because %s", len(way), why)
                 return Choice(move=way[0], refusal=None, then=tuple(way[1:]))
-        return Choice(move=own, refusal=refusal)
+        if own is not None:
+            return Choice(move=own, refusal=refusal)
+        reach = out_of_reach(
+            self._mover,
+            self._mount,
+            np.array(request.joint_positions),
+            aim.numpy(),
+            np.array(request.target_position),
+            self._safety.model,
+        )
+        return Choice(move=None, refusal=None, out_of_reach=str(reach))
 
 
 class Postures:

@@ -126,7 +126,7 @@ class MoveWatch:
         return Departure(
             kind="off_path",
             detail=f"{self._joint_names[k]} is {off[k]:.3f} rad beside the planned line, allowed are "
-            f"{PATH_TOLERANCE} rad",
+            f"{PATH_TOLERANCE} rad: {off[k] - PATH_TOLERANCE:.3f} rad too far",
         )
 
     def _back(self, done: float) -> Departure | None:
@@ -136,7 +136,8 @@ class MoveWatch:
             return None
         return Departure(
             kind="back",
-            detail=f"the arm went back on its way by {back:.3f} rad, allowed are {PATH_TOLERANCE} rad",
+            detail=f"the arm went back on its way by {back:.3f} rad, allowed are {PATH_TOLERANCE} rad: "
+            f"{back - PATH_TOLERANCE:.3f} rad too far",
         )
 
     def _fast(self, joints: Float64, earliest: float, stamp: float) -> Departure | None:
@@ -152,7 +153,8 @@ class MoveWatch:
         return Departure(
             kind="fast",
             detail=f"{self._joint_names[int(k)]} is faster than asked: {worst:.3f} rad ahead of {limit[k]:.3f} rad/s, "
-            f"{SPEED_TOLERANCE} times the speed fraction {self.speed_fraction:g}; allowed are {PATH_TOLERANCE} rad",
+            f"{SPEED_TOLERANCE} times the speed fraction {self.speed_fraction:g}; allowed are {PATH_TOLERANCE} rad: "
+            f"{worst - PATH_TOLERANCE:.3f} rad too far",
         )
 
     def _slow(self, share: float, done: float, gap: float) -> Departure | None:
@@ -167,7 +169,8 @@ class MoveWatch:
                 return None
             return Departure(
                 kind="unended",
-                detail=f"the arm is there, but the driver has not said so for {self._since_there:.1f} s; it may be "
+                detail=f"the arm is there, but the driver has not said so for {self._since_there:.1f} s, allowed are "
+                f"{ENDS_WITHIN_S:g} s; it may be "
                 "blocked just before its end",
             )
         allowed = LATE_FACTOR * self.seconds * share + LATE_S
@@ -176,7 +179,8 @@ class MoveWatch:
         if self._since_turn > STILL_S:
             return Departure(
                 kind="still",
-                detail=f"no joint has turned for {self._since_turn:.1f} s, {left:.3f} rad before the end: the arm may "
+                detail=f"no joint has turned for {self._since_turn:.1f} s, allowed are {STILL_S:g} s, "
+                f"{left:.3f} rad before the end: the arm may "
                 "be blocked, or its readings are frozen",
             )
         if self._watched > allowed:

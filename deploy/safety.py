@@ -9,8 +9,8 @@ follows.
 """
 
 import math
-from dataclasses import dataclass
-from typing import Final, Literal
+from dataclasses import dataclass, replace
+from typing import Final
 
 import numpy as np
 import torch
@@ -21,11 +21,13 @@ from maniskill_tomato.deploy.interface import ArmState, Float64, JointMove
 from maniskill_tomato.deploy.motion_bounds import (
     chord_error,
     chords_meet,
+    joint_path,
     lever_arms,
     pieces_for,
     straight_line,
 )
 from maniskill_tomato.deploy.plant_points import sphere_distances, swept_distances
+from maniskill_tomato.deploy.refusals import Reason, Refusal, words
 from maniskill_tomato.errors import InvalidInputError, check_positive, check_ranges
 from maniskill_tomato.robot.arm_model import ArmModel
 from maniskill_tomato.robot.d435 import T_flange_camera_color_optical
@@ -38,26 +40,10 @@ LARGEST_SPEED_FRACTION: Final = 0.3
 CHORD_ERROR: Final = 1e-4
 """Flange and camera leave the chords between the postures that are looked at by less than this, in [m]."""
 
+WORST_STEP: Final = 0.01
+"""How near a refused move gets to something is told by postures this far apart, in [rad]."""
+
 DEGREES = 180.0 / math.pi
-
-Reason = Literal[
-    "not_finite",
-    "speed",
-    "joint_limit",
-    "joint_step",
-    "stale_state",
-    "stale_frame",
-    "workspace",
-    "forbidden_zone",
-    "flange_step",
-    "self_collision",
-    "table",
-    "obstacle",
-    "plant",
-]
-
-COLLISIONS: Final[tuple[Reason, ...]] = ("self_collision", "table", "obstacle", "plant")
-"""Those that another way to the same posture may avoid."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -135,19 +121,6 @@ class SafetyConfig:
             check_ranges(self, plant_clearance=(-0.05, 0.3))
 
 
-@dataclass(frozen=True, kw_only=True)
-class Refusal:
-    """Why a command does not go out."""
-
-    reason: Reason
-    """Which check speaks against it."""
-    detail: str
-    """With numbers, for people."""
-
-    def __str__(self) -> str:
-        return f"{self.reason}: {self.detail}"
-
-
 class Safety:
     """The checks of one envelope."""
 
@@ -210,7 +183,39 @@ class Safety:
         if refusal is not None:
             return refusal
         start, goal = state.joint_positions, move.joint_positions
-        return self._way(start, goal) or self._contacts(start, goal) or self._plant(start, goal, points_w)
+        refusal = self._way(start, goal) or self._contacts(start, goal) or self._plant(start, goal, points_w)
+        if refusal is None:
+            return None
+        more = refusal.nearest
+
+        def nearest() -> str:
+            part = self._part(move, state, now, frame_stamp, points_w)
+            return "; ".join(filter(None, (more(), part)))
+
+        return replace(refusal, nearest=nearest)
+
+    def _part(
+        self,
+        move: JointMove,
+        state: ArmState,
+        now: float,
+        frame_stamp: float | None,
+        points_w: Float64 | None,
+    ) -> str:
+        """How much of a refused move is allowed, in whole percent."""
+        start, turn = state.joint_positions, move.joint_positions - state.joint_positions
+        allowed, refused = 0, 100
+        while refused - allowed > 1:
+            middle = (allowed + refused) // 2
+            part = replace(move, joint_positions=start + middle / 100 * turn)
+            if self.check(part, state, now, frame_stamp, points_w) is None:
+                allowed = middle
+            else:
+                refused = middle
+        if not allowed:
+            return "no part of the move is allowed"
+        goal = ", ".join(f"{v:.1f}" for v in np.rad2deg(start + allowed / 100 * turn))
+        return f"the first {allowed} % of the move are allowed, to joints at ({goal}) deg"
 
     def stands_in_collision(self, joint_positions: Float64, points_w: Float64 | None) -> bool:
         """Whether a posture touches something wherever the arm comes from.
@@ -241,7 +246,11 @@ class Safety:
             ("the time stamps", np.array([state.stamp, now, now if frame_stamp is None else frame_stamp])),
         ):
             if not np.isfinite(values).all():
-                return Refusal(reason="not_finite", detail=f"{name} are not finite: {values.tolist()}")
+                return Refusal(
+                    reason="not_finite",
+                    detail=f"{name} are not finite: {values.tolist()}",
+                    nearest=words("any finite number within the limits is allowed"),
+                )
         return None
 
     def _seen(self, points_w: Float64 | None) -> Refusal | None:
@@ -254,41 +263,63 @@ class Safety:
         return Refusal(
             reason="not_finite",
             detail=f"{bad} of the {len(points_w)} points that were seen of the plant are not finite",
+            nearest=words("none may be"),
         )
 
     def _limits(self, move: JointMove, state: ArmState) -> Refusal | None:
         c, joints = self.config, move.joint_positions
-        if not 0.0 < move.speed_fraction <= c.max_speed_fraction:
-            detail = f"the speed fraction must be above 0 and at most {c.max_speed_fraction}, got {move.speed_fraction}"
-            return Refusal(reason="speed", detail=detail)
+        fraction = move.speed_fraction
+        if not 0.0 < fraction <= c.max_speed_fraction:
+            over = max(fraction - c.max_speed_fraction, 0.0)
+            nearest = f"{c.max_speed_fraction:g}" if over else "the smallest number above 0"
+            return Refusal(
+                reason="speed",
+                detail=f"the speed fraction must be above 0 and at most {c.max_speed_fraction:g}, got {fraction:g}: "
+                f"{over or -fraction:.6g} too {'fast' if over else 'slow'}",
+                nearest=words(f"the nearest allowed is {nearest}"),
+            )
         low, high = self.model.joint_lower + c.joint_margin, self.model.joint_upper - c.joint_margin
-        over = np.maximum(low - joints, joints - high)
-        if (over > 0.0).any():
-            k = int(over.argmax())
+        over_limit = np.maximum(low - joints, joints - high)
+        if (over_limit > 0.0).any():
+            k = int(over_limit.argmax())
+            # Rounded inwards: what is told is allowed.
+            least, most = math.ceil(low[k] * DEGREES * 100) / 100, math.floor(high[k] * DEGREES * 100) / 100
+            bound = least if joints[k] < low[k] else most
             return Refusal(
                 reason="joint_limit",
-                detail=f"{self.model.joint_names[k]} must stay from {low[k] * DEGREES:.1f} to {high[k] * DEGREES:.1f} "
-                f"deg, got {float(joints[k]) * DEGREES:.1f} deg",
+                detail=f"{self.model.joint_names[k]} must stay from {least:.2f} to {most:.2f} deg, got "
+                f"{float(joints[k]) * DEGREES:.2f} deg: {over_limit[k] * DEGREES:.2f} deg too far",
+                nearest=words(f"the nearest allowed is {bound:.2f} deg"),
             )
         step = np.abs(joints - state.joint_positions)
         if (step > c.max_joint_step).any():
             k = int(step.argmax())
+            way = math.floor(c.max_joint_step * 1e4) / 1e4
+            start = float(state.joint_positions[k])
+            to = start + math.copysign(way - 1e-4, float(joints[k]) - start)
             return Refusal(
                 reason="joint_step",
-                detail=f"{self.model.joint_names[k]} would turn {step[k]:.2f} rad in one move, allowed are "
-                f"{c.max_joint_step}",
+                detail=f"{self.model.joint_names[k]} would turn {step[k]:.4f} rad in one move, allowed are "
+                f"{c.max_joint_step:g} rad: {step[k] - c.max_joint_step:.4f} rad too far",
+                nearest=words(f"the nearest allowed is {to:.4f} rad"),
             )
         return None
 
     def _ages(self, state: ArmState, now: float, frame_stamp: float | None) -> Refusal | None:
         c = self.config
-        age = now - state.stamp
-        if not 0.0 <= age <= c.max_state_age:
-            detail = f"the arm's state is {age:.3f} s old, it must be from 0 to {c.max_state_age} s"
-            return Refusal(reason="stale_state", detail=detail)
-        if frame_stamp is not None and not 0.0 <= now - frame_stamp <= c.max_frame_age:
-            detail = f"the picture is {now - frame_stamp:.3f} s old, it must be from 0 to {c.max_frame_age} s"
-            return Refusal(reason="stale_frame", detail=detail)
+        picture_age = 0.0 if frame_stamp is None else now - frame_stamp
+        ages: tuple[tuple[Reason, str, float, float], ...] = (
+            ("stale_state", "the arm's state", now - state.stamp, c.max_state_age),
+            ("stale_frame", "the picture", picture_age, c.max_frame_age),
+        )
+        for reason, what, age, oldest in ages:
+            if not 0.0 <= age <= oldest:
+                off = f"{age - oldest:.3f} s too old" if age > oldest else f"{-age:.3f} s in the future"
+                return Refusal(
+                    reason=reason,
+                    detail=f"{what} is {age:.3f} s old, it must be from 0 to {oldest:g} s: {off}",
+                    nearest=words(f"the nearest allowed is {oldest if age > oldest else 0.0:g} s"),
+                )
         return None
 
     def _way(self, start: Float64, goal: Float64) -> Refusal | None:
@@ -305,9 +336,15 @@ class Safety:
         outside[: 1 if _within(flange[0], c.workspace) else leaving] = False
         if outside.any():
             k = int(outside.argmax())
+            low, high = np.array(c.workspace.low), np.array(c.workspace.high)
+            beyond = np.maximum(low - flange, flange - high).max(
+                axis=0, where=outside[:, None], initial=-np.inf
+            )
+            axis = int(beyond.argmax())
             return Refusal(
                 reason="workspace",
-                detail=f"the flange would be at {_metres(flange[k])}, outside {c.workspace}",
+                detail=f"the flange would be at {_metres(flange[k])}, outside {c.workspace}: up to "
+                f"{1e3 * max(float(beyond[axis]), 0.0):.1f} mm too far along {'xyz'[axis]}",
             )
         for name, positions in (("flange", flange), ("camera", camera)):
             for box in c.forbidden:
@@ -317,15 +354,19 @@ class Safety:
                     meets[leaving - 1] = _within(positions[leaving], box)
                 if meets.any():
                     k = int(meets.argmax()) + 1
+                    ends = np.minimum(positions - box.low, np.array(box.high) - positions).min(axis=-1)
+                    deep = max(float(ends[1:].max(where=meets, initial=0.0)), 0.0)
                     return Refusal(
                         reason="forbidden_zone",
-                        detail=f"the {name} would be at {_metres(positions[k])}, inside {box}",
+                        detail=f"the {name} would be at {_metres(positions[k])}, inside {box}: at least "
+                        f"{1e3 * deep:.1f} mm deep",
                     )
         away = np.linalg.norm(flange - flange[0], axis=-1)
         if (away + error > c.max_flange_step).any():
             return Refusal(
                 reason="flange_step",
-                detail=f"the flange would get {away.max():.3f} m away in one move, allowed are {c.max_flange_step} m",
+                detail=f"the flange would get {away.max():.4f} m away in one move, allowed are {c.max_flange_step:g} "
+                f"m: {1e3 * (away.max() + error - c.max_flange_step):.1f} mm too far",
             )
         return None
 
@@ -338,10 +379,16 @@ class Safety:
             reason = "table"
         elif contact.second.startswith("obstacle"):
             reason = "obstacle"
+
+        def worst() -> str:
+            nearest = self._collisions.smallest(contact, joint_path(start, goal, WORST_STEP))
+            return f"at the nearest {nearest * 1e3:.1f} mm, {(contact.clearance - nearest) * 1e3:.1f} mm too near"
+
         return Refusal(
             reason=reason,
-            detail=f"{contact.first} would come within {contact.distance * 1e3:.0f} mm of {contact.second} after "
-            f"{contact.share:.0%} of the move",
+            detail=f"{contact.first} would come within {contact.distance * 1e3:.1f} mm of {contact.second} after "
+            f"{contact.share:.0%} of the move, {contact.clearance * 1e3:g} mm must be left",
+            nearest=worst,
         )
 
     def _plant(self, start: Float64, goal: Float64, points_w: Float64 | None) -> Refusal | None:
@@ -356,8 +403,10 @@ class Safety:
             return None
         return Refusal(
             reason="plant",
-            detail=f"{int(touched.sum())} points of the plant would be nearer than {c.plant_clearance * 1e3:.0f} mm to "
-            f"the arm's spheres, the nearest {nearest[touched].min() * 1e3:.0f} mm",
+            detail=f"{int(touched.sum())} points of the plant would be nearer than {c.plant_clearance * 1e3:.1f} mm "
+            f"to the arm's spheres, the nearest {nearest[touched].min() * 1e3:.1f} mm: "
+            f"{(c.plant_clearance - nearest[touched].min()) * 1e3:.1f} mm too near; fewer than "
+            f"{c.plant_points_needed} such points are taken for noise",
         )
 
 
