@@ -8,11 +8,16 @@ without spending moves on it.
 from typing import Final
 
 import torch
+import warp as wp
 from torch import Tensor
 
-from maniskill_tomato.policies.moves import LEAST_MOVE, move_towards, moves_needed
-from maniskill_tomato.robot.inverse_kinematics import Reach
+from maniskill_tomato.policies.moves import LEAST_MOVE, moves_needed
+from maniskill_tomato.robot import look_at_kernels
+from maniskill_tomato.robot.arm_model import NUM_JOINTS, ArmModel
+from maniskill_tomato.robot.iiwa14 import IIWA14
+from maniskill_tomato.robot.ik_chain import vec7d
 from maniskill_tomato.robot.look_at_move import MAX_MOVE, LookAtMover
+from maniskill_tomato.warp_runtime import BatchKernel
 
 SAME_PLACE: Final = 0.25 * MAX_MOVE
 """Cameras this near to each other have the same view, in [m]: a way ends this near to its goal."""
@@ -21,34 +26,37 @@ MOST_MOVES: Final = 10
 """Of longer ways the rest is taken to be free."""
 
 
-def moves_along(mover: LookAtMover, qpos: Tensor, position: Tensor, target: Tensor, goal: Tensor) -> Tensor:
-    """How many moves straight towards their goals arms make until they are there.
+class WayFollower:
+    """Follows ways on one device; not for use from several threads at once."""
 
-    Args:
-        mover: Makes the moves.
-        qpos: Joint positions, in [rad]. Shape (M, 7).
-        position: Where the cameras stand, in the base frame, in [m]. Shape (M, 3).
-        target: What they look at. Shape (M, 3).
-        goal: Where they are to go. Shape (M, 3).
+    def __init__(self, device: str | torch.device = "cpu", model: ArmModel = IIWA14) -> None:
+        """Prepares the kinematics of the moves.
 
-    Returns:
-        Infinite where a move is refused on the way. Shape (M,).
-    """
-    qpos, position = qpos.double().clone(), position.double().clone()
-    target, goal = target.double(), goal.double()
-    moves = torch.full((len(goal),), torch.inf, device=goal.device)
-    open_rows = torch.arange(len(goal), device=goal.device)
-    for count in range(1, MOST_MOVES + 1):
-        if not len(open_rows):
-            break
-        before, about = position[open_rows], target[open_rows]
-        move = mover.move(qpos[open_rows], before, about, move_towards(before, about, goal[open_rows]))
-        after = move.T_world_camera[:, :3, 3]
-        is_made = (move.reach != int(Reach.UNREACHABLE)) & ((after - before).norm(dim=-1) >= LEAST_MOVE)
-        is_there = is_made & ((goal[open_rows] - after).norm(dim=-1) < SAME_PLACE)
-        qpos[open_rows], position[open_rows] = move.qpos, after
-        moves[open_rows[is_there]] = float(count)
-        open_rows = open_rows[is_made & ~is_there]
-    rest = (goal[open_rows] - position[open_rows]).norm(dim=-1)
-    moves[open_rows] = MOST_MOVES + moves_needed(rest).to(moves)
-    return moves
+        Args:
+            device: Where tensors live.
+            model: Of the arm.
+        """
+        self._mover = LookAtMover(device, model=model)
+        joints, vector = ((NUM_JOINTS,), torch.float64, vec7d), ((3,), torch.float64, wp.vec3d)
+        self._follow = BatchKernel(
+            look_at_kernels.way_kernel,
+            inputs=[joints, vector, vector, vector],
+            constants=[self._mover.rules, LEAST_MOVE, SAME_PLACE, MOST_MOVES],
+            outputs=[((), torch.int64, wp.int64), ((), torch.float64, wp.float64)],
+        )
+
+    def moves_along(self, qpos: Tensor, position: Tensor, target: Tensor, goal: Tensor) -> Tensor:
+        """How many moves straight towards their goals arms make until they are there.
+
+        Args:
+            qpos: Joint positions, in [rad]. Shape (M, 7).
+            position: Where the cameras stand, in the base frame, in [m]. Shape (M, 3).
+            target: What they look at. Shape (M, 3).
+            goal: Where they are to go. Shape (M, 3).
+
+        Returns:
+            Infinite where a move is refused on the way. Shape (M,).
+        """
+        moves, rest = self._follow(self._mover.chain_joints(qpos), position, target, goal)
+        more = torch.where(rest > 0.0, moves_needed(rest), 0.0)
+        return torch.where(moves < 0, torch.inf, (moves + more).float())

@@ -6,10 +6,9 @@ from abc import abstractmethod
 import torch
 from torch import Tensor
 
-from maniskill_tomato.policies.followed_ways import SAME_PLACE, moves_along
+from maniskill_tomato.policies.followed_ways import SAME_PLACE, WayFollower
 from maniskill_tomato.policies.moves import LEAST_MOVE, move_towards, moves_needed
 from maniskill_tomato.policies.protocol import Planner
-from maniskill_tomato.robot.look_at_move import LookAtMover
 from maniskill_tomato.sensing.belief import Belief
 
 REFUSED_ANGLE = math.radians(30.0)
@@ -124,7 +123,7 @@ class LatticePlanner(Planner):
 
     def __init__(self) -> None:
         self.tried = Candidates()
-        self._mover: LookAtMover | None = None
+        self._ways: WayFollower | None = None
 
     def begin(self, belief: Belief, rows: Tensor) -> None:
         self.tried.begin(belief, rows)
@@ -145,8 +144,8 @@ class LatticePlanner(Planner):
         """
         if belief.qpos is None:
             return worth
-        if self._mover is None:
-            self._mover = LookAtMover(worth.device, model=belief.lattice.model)
+        if self._ways is None:
+            self._ways = WayFollower(worth.device, belief.lattice.model)
         straight = moves_needed(way_to(belief, views))
         followed, rest = torch.full_like(worth, -math.inf), worth.clone()
         for _ in range(FOLLOWED):
@@ -155,8 +154,7 @@ class LatticePlanner(Planner):
             if not len(rows):
                 break
             chosen = best[rows]
-            moves = moves_along(
-                self._mover,
+            moves = self._ways.moves_along(
                 belief.qpos[rows],
                 belief.camera_position[rows],
                 belief.target_position[rows],

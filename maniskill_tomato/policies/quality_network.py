@@ -1,10 +1,23 @@
-"""The network: maps over candidate directions in, the visible fraction to expect at every candidate out."""
+"""The network: maps over candidate directions in, what to expect at every candidate out."""
+
+from typing import NamedTuple
 
 import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
 from maniskill_tomato.errors import InvalidInputError
+
+
+class Judgement(NamedTuple):
+    """What the network says of every candidate; each of shape (B, azimuths, elevations, distances)."""
+
+    full: Tensor
+    """Logits of the target being fully visible."""
+    fraction: Tensor
+    """Visible fraction to expect, in [0, 1]."""
+    touch: Tensor
+    """Logits of the arm touching the plant on the move that ends there."""
 
 
 class _DirectionBlock(nn.Module):
@@ -63,22 +76,17 @@ class ViewQualityNetwork(nn.Module):
         self.entry = nn.Conv2d(map_channels, width, 3, padding=1)
         self.entry_scalars = nn.Linear(scalars, width)
         self.blocks = nn.ModuleList(_DirectionBlock(width) for _ in range(blocks))
-        self.exit = nn.Conv2d(width, 2 * distances, 1)
+        self.exit = nn.Conv2d(width, 3 * distances, 1)
 
-    def forward(self, maps: Tensor, scalars: Tensor) -> tuple[Tensor, Tensor]:
+    def forward(self, maps: Tensor, scalars: Tensor) -> Judgement:
         """Judges every candidate.
 
         Args:
             maps: Shape (B, map_channels, azimuths, elevations).
             scalars: Shape (B, scalars).
-
-        Returns:
-            Logits of the target being fully visible, and the expected visible fraction in [0, 1]; each of shape
-            (B, azimuths, elevations, distances).
         """
         x = self.entry(maps) + self.entry_scalars(scalars)[..., None, None]
         for block in self.blocks:
             x = block(x)
-        out = self.exit(functional.relu(x))
-        success, fraction = out.chunk(2, dim=1)
-        return success.permute(0, 2, 3, 1), fraction.sigmoid().permute(0, 2, 3, 1)
+        full, fraction, touch = self.exit(functional.relu(x)).permute(0, 2, 3, 1).chunk(3, dim=-1)
+        return Judgement(full, fraction.sigmoid(), touch)

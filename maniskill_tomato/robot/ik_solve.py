@@ -29,6 +29,16 @@ LARGEST_SKEW = wp.constant(wp.float64(1.0e-3))
 
 
 @wp.struct
+class Solver:
+    """An arm, and how its joint angles are chosen."""
+
+    chain: Chain
+    weights: Weights
+    tolerance: wp.float64
+    """How far outside the workspace a pose may be, in [m] and [rad]."""
+
+
+@wp.struct
 class ExactSolution:
     found: wp.int32
     stretched: wp.int32
@@ -88,13 +98,41 @@ def is_rigid(m: wp.mat33d, bottom: wp.vec4d) -> wp.bool:
     return largest < LARGEST_SKEW and wp.determinant(m) > ZERO
 
 
+@wp.func
+def rotation_of(pose: wp.mat44d) -> wp.mat33d:
+    return wp.mat33d(
+        pose[0, 0], pose[0, 1], pose[0, 2],
+        pose[1, 0], pose[1, 1], pose[1, 2],
+        pose[2, 0], pose[2, 1], pose[2, 2],
+    )  # fmt: skip
+
+
+@wp.func
+def position_of(pose: wp.mat44d) -> wp.vec3d:
+    return wp.vec3d(pose[0, 3], pose[1, 3], pose[2, 3])
+
+
+@wp.func
+def best_solution(solver: Solver, position: wp.vec3d, rotation: wp.mat33d, q_ref: vec7d) -> ExactSolution:
+    """The cheapest joint angles that reach a pose, as exactly as it can be reached."""
+    chain = solver.chain
+    weights = solver.weights
+    tolerance = solver.tolerance
+    solution = exact_solution(chain, position, rotation, q_ref, weights, STRICT, ROUNDING)
+    if solution.found == 0 and solution.stretched == 1:
+        solution = exact_solution(chain, position, rotation, q_ref, weights, STRICT, ZERO)
+    if solution.found == 0:
+        solution = exact_solution(chain, position, rotation, q_ref, weights, tolerance, tolerance)
+    if solution.found == 0 and solution.stretched == 1:
+        solution = exact_solution(chain, position, rotation, q_ref, weights, tolerance, ZERO)
+    return solution
+
+
 @wp.kernel
 def solve_kernel(
     poses: wp.array[wp.mat44d],
     references: wp.array[vec7d],
-    chain: Chain,
-    weights: Weights,
-    tolerance: wp.float64,
+    solver: Solver,
     neighbours: wp.int32,
     allowed: Allowed,
     qpos: wp.array[vec7d],
@@ -104,12 +142,9 @@ def solve_kernel(
     i = wp.tid()
     pose = poses[i]
     q_ref = references[i]
-    rotation = wp.mat33d(
-        pose[0, 0], pose[0, 1], pose[0, 2],
-        pose[1, 0], pose[1, 1], pose[1, 2],
-        pose[2, 0], pose[2, 1], pose[2, 2],
-    )  # fmt: skip
-    position = wp.vec3d(pose[0, 3], pose[1, 3], pose[2, 3])
+    rotation = rotation_of(pose)
+    position = position_of(pose)
+    chain = solver.chain
     outcome = UNREACHABLE
     q = q_ref
     finite = wp.isfinite(wp.length(position)) and wp.isfinite(wp.length(q_ref))
@@ -117,13 +152,7 @@ def solve_kernel(
         outcome = INVALID
     else:
         rotation = nearest_rotation(rotation)
-        solution = exact_solution(chain, position, rotation, q_ref, weights, STRICT, ROUNDING)
-        if solution.found == 0 and solution.stretched == 1:
-            solution = exact_solution(chain, position, rotation, q_ref, weights, STRICT, ZERO)
-        if solution.found == 0:
-            solution = exact_solution(chain, position, rotation, q_ref, weights, tolerance, tolerance)
-        if solution.found == 0 and solution.stretched == 1:
-            solution = exact_solution(chain, position, rotation, q_ref, weights, tolerance, ZERO)
+        solution = best_solution(solver, position, rotation, q_ref)
         if solution.found == 1:
             outcome = REACHABLE
             q = solution.q
@@ -139,7 +168,7 @@ def solve_kernel(
                     near = hand_of(chain, q)
                     # The pose found is reachable, maybe also nearer to the reference.
                     solution = exact_solution(
-                        chain, near.position, near.rotation, q_ref, weights, STRICT, ZERO
+                        chain, near.position, near.rotation, q_ref, solver.weights, STRICT, ZERO
                     )
                     if solution.found == 1:
                         q = solution.q

@@ -105,6 +105,11 @@ class InverseKinematics:
         weights: Any = ik_select.Weights()
         weights.margin = self.config.limit_margin
         weights.limit_weight = self.config.limit_weight
+        solver: Any = ik_solve.Solver()
+        solver.chain, solver.weights = chain_of(model), weights
+        solver.tolerance = self.config.tolerance
+        self.solver = solver
+        """The same as kernels see it. They turn joints as the chain does: see `chain_joints`."""
         allowed: Any = ik_neighbour.Allowed()
         allowed.distance = self.config.neighbour_distance
         allowed.angle = self.config.neighbour_angle
@@ -113,7 +118,7 @@ class InverseKinematics:
             neighbour: BatchKernel(
                 ik_solve.solve_kernel,
                 inputs=[pose, joints],
-                constants=[chain_of(model), weights, self.config.tolerance, int(neighbour), allowed],
+                constants=[solver, int(neighbour), allowed],
                 outputs=[joints, ((), torch.int64, wp.int64), pose],
             )
             for neighbour in (False, True)
@@ -158,8 +163,7 @@ class InverseKinematics:
         if batch == 0:
             reach = torch.zeros(0, dtype=torch.int64, device=self.device)
             return IkSolution(qpos_ref.double(), reach, T_base_ee.double())
-        given = qpos_ref if self._flips is None else qpos_ref * self._flips
-        qpos, reach, reached = self._kernels[neighbour](T_base_ee, given)
+        qpos, reach, reached = self._kernels[neighbour](T_base_ee, self.chain_joints(qpos_ref))
         if int(reach.min()) < 0:
             row = int(reach.argmin())
             raise InvalidInputError(
@@ -167,5 +171,8 @@ class InverseKinematics:
                 f"qpos_ref finite angles; row {row} has T_base_ee = {T_base_ee[row].tolist()}, "
                 f"qpos_ref = {qpos_ref[row].tolist()}"
             )
-        solved = qpos.clone() if self._flips is None else qpos * self._flips
-        return IkSolution(solved, reach.clone(), reached.clone())
+        return IkSolution(self.chain_joints(qpos.clone()), reach.clone(), reached.clone())
+
+    def chain_joints(self, qpos: torch.Tensor) -> torch.Tensor:
+        """Joint angles of the arm as the chain counts them, and the reverse. Shape (B, 7)."""
+        return qpos if self._flips is None else qpos * self._flips

@@ -23,8 +23,9 @@ from maniskill_tomato.robot import look_at_kernels
 from maniskill_tomato.robot.arm_model import NUM_JOINTS, ArmModel
 from maniskill_tomato.robot.d435 import T_flange_camera_color_optical
 from maniskill_tomato.robot.iiwa14 import IIWA14
-from maniskill_tomato.robot.inverse_kinematics import InverseKinematics, Reach
-from maniskill_tomato.robot.look_at import CAMERA_ROLLS, look_at_pose, look_frame
+from maniskill_tomato.robot.ik_chain import vec7d
+from maniskill_tomato.robot.inverse_kinematics import InverseKinematics
+from maniskill_tomato.robot.look_at import CAMERA_ROLLS, look_frame
 from maniskill_tomato.warp_runtime import BatchKernel
 
 MAX_MOVE: Final = 0.12
@@ -103,21 +104,28 @@ class LookAtMover:
             model: Of the arm.
         """
         self._inverse_kinematics = InverseKinematics(device=device, model=model)
-        device = self._inverse_kinematics.device
-        inverse = np.asarray(np.linalg.inv(T_flange_camera), dtype=np.float64)
-        self._T_camera_flange = torch.as_tensor(inverse, dtype=torch.float64, device=device)
-        self._rolls = torch.tensor(CAMERA_ROLLS, dtype=torch.float64, device=device)
-        # Upright first, then 30 degrees to either side, 60, ...; between the two sides the joints decide.
-        self._rank = (self._rolls.abs() * (180.0 / torch.pi / 30.0)).round()
-        vector, pose = ((3,), torch.float64, wp.vec3d), ((4, 4), torch.float64, wp.mat44d)
-        mount: Any = wp.mat44d(*inverse.ravel())
-        self._upright_move = BatchKernel(
-            look_at_kernels.upright_move,
-            inputs=[vector, vector, vector],
-            constants=[wp.float64(MAX_MOVE), wp.float64(MIN_DISTANCE), mount],
-            outputs=[pose, pose],
+        rules: Any = look_at_kernels.Rules()
+        rules.solver = self._inverse_kinematics.solver
+        rules.T_camera_flange = wp.mat44d(*np.linalg.inv(T_flange_camera).ravel())
+        rules.max_move, rules.min_distance = MAX_MOVE, MIN_DISTANCE
+        rules.lowest_flange, rules.base_box = LOWEST_FLANGE, wp.vec3d(*BASE_BOX)
+        rules.rolls, rules.largest_joint_step = len(CAMERA_ROLLS), LARGEST_JOINT_STEP
+        self.rules = rules
+        """The same as kernels see it."""
+        joints, vector = ((NUM_JOINTS,), torch.float64, vec7d), ((3,), torch.float64, wp.vec3d)
+        whole, pose = ((), torch.int64, wp.int64), ((4, 4), torch.float64, wp.mat44d)
+        self._move = BatchKernel(
+            look_at_kernels.move_kernel,
+            inputs=[joints, vector, vector, vector],
+            constants=[rules],
+            outputs=[joints, whole, pose],
         )
-        self._shares = torch.tensor(MOVE_SHARES, dtype=torch.float64, device=device)
+        self._look = BatchKernel(
+            look_at_kernels.look_kernel,
+            inputs=[joints, vector, vector, ((), torch.float64, wp.float64), ((), torch.int32, wp.int32)],
+            constants=[rules],
+            outputs=[joints, whole, pose],
+        )
 
     def move(self, qpos: Tensor, position: Tensor, target: Tensor, action: Tensor) -> LookAtMove:
         """Moves the camera and looks at the target.
@@ -129,36 +137,10 @@ class LookAtMover:
             action: As for `moved_position`. Shape (B, 3).
 
         Raises:
-            InvalidInputError: A tensor has the wrong shape.
+            InvalidInputError: A tensor has the wrong shape, or a number is not finite.
         """
         _check_rows(qpos=(qpos, NUM_JOINTS), position=(position, 3), target=(target, 3), action=(action, 3))
-        qpos, position, target = qpos.double(), position.double(), target.double()
-        T_world_camera, T_world_flange = (T.clone() for T in self._upright_move(position, target, action))
-        solution = self._inverse_kinematics.solve(T_world_flange, qpos, neighbour=False)
-        near = (solution.qpos - qpos).abs().amax(-1) <= LARGEST_JOINT_STEP
-        fits = (solution.reach == int(Reach.REACHABLE)) & near & keeps_clear(T_world_flange)
-        if bool(fits.all()):
-            return LookAtMove(solution.qpos, solution.reach, T_world_camera)
-        goal = T_world_camera[:, :3, 3]
-        upright = self.look_from(qpos, goal, target, rolls=1)
-        rows = (upright.reach != Reach.REACHABLE).nonzero()[:, 0]
-        shares = self._shares[:, None, None]
-        goals = torch.lerp(position[rows], goal[rows], shares)
-        away = goals - target[rows]
-        # The straight way between two positions outside the smallest distance may lead through it.
-        distance = away.norm(dim=-1, keepdim=True).clamp_min(1e-6)
-        goals = target[rows] + away / distance * distance.clamp_min(MIN_DISTANCE)
-        out, reach, T = upright.qpos.clone(), upright.reach.clone(), upright.T_world_camera.clone()
-        open_rows = torch.ones(len(rows), dtype=torch.bool, device=qpos.device)
-        for k in range(len(MOVE_SHARES)):
-            tried = self.look_from(qpos[rows], goals[k], target[rows])
-            new = open_rows & (tried.reach == Reach.REACHABLE)
-            out[rows[new]], T[rows[new]] = tried.qpos[new], tried.T_world_camera[new]
-            reach[rows[new]] = int(Reach.REACHABLE if k == 0 else Reach.NEIGHBOUR)
-            open_rows = open_rows & ~new
-            if not bool(open_rows.any()):
-                break
-        return LookAtMove(out, reach, T)
+        return self._made(self._move(self.chain_joints(qpos), position, target, action))
 
     def look_from(
         self,
@@ -180,27 +162,25 @@ class LookAtMover:
         Returns:
             REACHABLE or UNREACHABLE; where unreachable, `T_world_camera` is the pose asked for, upright.
         """
+        _check_rows(qpos=(qpos, NUM_JOINTS), position=(position, 3), target=(target, 3))
         rolls = len(CAMERA_ROLLS) if rolls is None else rolls
-        b = len(qpos)
-        T_world_camera = look_at_pose(position[:, None], target[:, None], self._rolls[:rolls])
-        T_world_flange = (T_world_camera @ self._T_camera_flange).reshape(-1, 4, 4)
-        reference = qpos.double()[:, None].expand(b, rolls, NUM_JOINTS)
-        solution = self._inverse_kinematics.solve(
-            T_world_flange, reference.reshape(-1, NUM_JOINTS), neighbour=False
+        steps = torch.full((len(qpos),), largest_joint_step, dtype=torch.float64, device=qpos.device)
+        return self._made(
+            self._look(self.chain_joints(qpos), position, target, steps, torch.full_like(steps, rolls))
         )
-        solved = solution.qpos.reshape(b, rolls, NUM_JOINTS)
-        step = (solved - reference).abs()
-        fits = (solution.reach == int(Reach.REACHABLE)) & keeps_clear(T_world_flange)
-        fits = fits.reshape(b, rolls) & (step.amax(-1) <= largest_joint_step)
-        # The joints' share of the cost stays below 1, so that it decides between the two sides only.
-        cost = self._rank[:rolls] + step.sum(-1) / 100.0
-        best = torch.where(fits, cost, torch.inf).argmin(-1)
-        every = torch.arange(b, device=qpos.device)
-        found = fits[every, best]
-        reach = torch.where(found, int(Reach.REACHABLE), int(Reach.UNREACHABLE))
-        taken = torch.where(found[:, None], solved[every, best], qpos.double())
-        T = torch.where(found[:, None, None], T_world_camera[every, best], T_world_camera[:, 0])
-        return LookAtMove(taken, reach, T)
+
+    def chain_joints(self, qpos: Tensor) -> Tensor:
+        """Joint positions as kernels count them, and the reverse. Shape (B, 7)."""
+        return self._inverse_kinematics.chain_joints(qpos)
+
+    def _made(self, outputs: tuple[Tensor, ...]) -> LookAtMove:
+        qpos, reach, T_world_camera = outputs
+        if bool((reach < 0).any()):
+            row = int(reach.argmin())
+            raise InvalidInputError(
+                f"joints, positions and actions must be finite; row {row} holds one that is not"
+            )
+        return LookAtMove(self.chain_joints(qpos.clone()), reach.clone(), T_world_camera.clone())
 
 
 def _check_rows(**tensors: tuple[Tensor, int]) -> None:

@@ -3,6 +3,7 @@
 import json
 import math
 from collections.abc import Iterator
+from dataclasses import astuple
 from pathlib import Path
 from typing import Any
 
@@ -17,15 +18,16 @@ from maniskill_tomato.experiments.rollout import run_episode, run_episodes
 from maniskill_tomato.learning.rl.envs import make_env
 from maniskill_tomato.learning.view_quality.quality_config import FitConfig, QualityTrainConfig
 from maniskill_tomato.learning.view_quality.quality_episodes import QualityData, collect_episodes
-from maniskill_tomato.learning.view_quality.quality_fit import fit, judge, mirrored
+from maniskill_tomato.learning.view_quality.quality_fit import fit, fit_blend, judge, mirrored
 from maniskill_tomato.learning.view_quality.quality_training import train_view_quality
 from maniskill_tomato.policies.adapters import as_state_policy
-from maniskill_tomato.policies.followed_ways import moves_along
+from maniskill_tomato.policies.followed_ways import WayFollower
 from maniskill_tomato.policies.moves import move_towards, moves_needed
 from maniskill_tomato.policies.next_best_view import NextBestView
 from maniskill_tomato.policies.opening import open_policy
+from maniskill_tomato.policies.quality_blend import Blend, blend_terms
 from maniskill_tomato.policies.quality_features import FEATURES, MAP_CHANNELS, SCALARS, quality_features
-from maniskill_tomato.policies.quality_network import ViewQualityNetwork
+from maniskill_tomato.policies.quality_network import Judgement, ViewQualityNetwork
 from maniskill_tomato.policies.view_quality import (
     ViewQuality,
     ViewQualityConfig,
@@ -34,7 +36,6 @@ from maniskill_tomato.policies.view_quality import (
     save_view_quality,
 )
 from maniskill_tomato.robot.look_at import look_at_pose
-from maniskill_tomato.robot.look_at_move import LookAtMover
 from maniskill_tomato.sensing.belief import Belief
 from maniskill_tomato.sensing.view_lattice import AZIMUTHS, DISTANCES, ELEVATIONS
 
@@ -59,20 +60,29 @@ def belief(env: Any) -> Belief:
 class Oracle(ViewQualityNetwork):
     """Says what it is told."""
 
-    def __init__(self, probability: Tensor) -> None:
+    def __init__(self, full: Tensor, touch: Tensor) -> None:
         super().__init__(MAP_CHANNELS, SCALARS, DISTANCES, width=4, blocks=1)
-        self._logits = torch.logit(probability, eps=1e-6).view(1, AZIMUTHS, ELEVATIONS, DISTANCES)
+        shape = (1, AZIMUTHS, ELEVATIONS, DISTANCES)
+        self._full, self._touch = (torch.logit(p, eps=1e-6).view(shape) for p in (full, touch))
 
-    def forward(self, maps: Tensor, scalars: Tensor) -> tuple[Tensor, Tensor]:
-        return self._logits, self._logits.sigmoid()
+    def forward(self, maps: Tensor, scalars: Tensor) -> Judgement:
+        return Judgement(self._full, self._full.sigmoid(), self._touch)
 
 
-def told(belief: Belief, probability: dict[int, float], **settings: float) -> ViewQuality:
-    """A policy that believes these candidates to be good, and no other."""
-    values = torch.zeros(belief.lattice.size)
-    for k, p in probability.items():
-        values[k] = p
-    policy = ViewQuality(Oracle(values), ViewQualityConfig(**settings))
+def told(
+    belief: Belief,
+    full: dict[int, float],
+    touch: dict[int, float] | None = None,
+    *,
+    patience: float = 16.0,
+    touch_cost: float = 0.0,
+) -> ViewQuality:
+    """A policy that believes these candidates to be good, and no other; and that the arm touches the plant at these."""
+    values = torch.zeros(2, belief.lattice.size)
+    for row, probability in zip(values, (full, touch or {}), strict=True):
+        for k, p in probability.items():
+            row[k] = p
+    policy = ViewQuality(Oracle(*values), ViewQualityConfig(patience=patience, touch_cost=touch_cost))
     policy.begin(belief, ONE)
     return policy
 
@@ -83,7 +93,7 @@ def by_distance(belief: Belief) -> list[int]:
     goals = belief.lattice.positions(belief.target_position)[0]
     now = (belief.qpos, belief.camera_position, belief.target_position)
     qpos, position, target = (row.expand(len(goals), -1) for row in now)
-    moves = moves_along(LookAtMover(), qpos, position, target, goals)
+    moves = WayFollower().moves_along(qpos, position, target, goals)
     way = (goals - belief.camera_position).norm(dim=-1)
     gets_there = belief.reachable[0] & (moves == moves_needed(way))
     return [k for k in way.argsort().tolist() if bool(gets_there[k]) and float(way[k]) > 0.13]
@@ -177,6 +187,42 @@ def test_patience_decides_between_a_near_guess_and_a_far_certainty(belief: Belie
         torch.testing.assert_close(action, wanted)
 
 
+def test_the_cost_of_a_touch_decides_between_a_near_view_and_one_that_touches_nothing(belief: Belief) -> None:
+    order = by_distance(belief)
+    near, far = order[0], order[-1]
+    goals = belief.lattice.positions(belief.target_position)[0]
+    way = (goals - belief.camera_position).norm(dim=-1)
+    more = float(moves_needed(way[far]) - moves_needed(way[near]))
+    for cost, chosen in (
+        (2.0 * more - 0.2, near),
+        (2.0 * more + 0.2, far),
+    ):  # Of a touch that is half certain.
+        action = told(belief, {near: 0.9, far: 0.9}, {near: 0.5}, touch_cost=cost).act(belief)
+        wanted = move_towards(belief.camera_position, belief.target_position, goals[None, chosen])
+        torch.testing.assert_close(action, wanted)
+
+
+def test_log_odds_of_network_and_memory_are_weighed_term_by_term(belief: Belief) -> None:
+    maps, scalars = quality_features(belief)
+    network = new_network(8, 1)
+    full = network(maps, scalars).full.detach()
+    blended = Blend(0.5, 0.4, -0.3, -2.0, 0.1).log_odds(maps, full)[0]
+    table = maps.view(len(FEATURES), DISTANCES, AZIMUTHS, ELEVATIONS)
+    for a, e, d in ((0, 0, 0), (6, 4, 1), (12, 8, 3), (3, 5, 2)):
+        feature = {name: float(table[i, d, a, e]) for i, name in enumerate(FEATURES)}
+        expected = (1.0 - feature["alike"]) * feature["expected"] + feature["measured"]
+        expected = min(max(expected, 0.01), 0.99)
+        wanted = (
+            0.5 * float(full[0, a, e, d])
+            + 0.4 * math.log(expected / (1.0 - expected))
+            - 0.3 * feature["unknown"]
+            - 2.0 * feature["alike"]
+            + 0.1
+        )
+        assert float(blended[int(belief.lattice.index(a, e, d))]) == pytest.approx(wanted, abs=1e-4)
+    torch.testing.assert_close(Blend().log_odds(maps, full), full.flatten(1))
+
+
 def test_views_out_of_reach_are_not_chosen(belief: Belief) -> None:
     outside = int((~belief.reachable[0]).nonzero()[0, 0])
     k = by_distance(belief)[5]
@@ -199,6 +245,11 @@ def test_settings_out_of_range_are_refused() -> None:
     for value in (0.0, -1.0, math.inf, math.nan):
         with pytest.raises(InvalidInputError, match="patience"):
             ViewQualityConfig(patience=value)
+    for value in (-1.0, math.inf, math.nan):
+        with pytest.raises(InvalidInputError, match="touch_cost"):
+            ViewQualityConfig(touch_cost=value)
+    with pytest.raises(InvalidInputError, match="blend"):
+        ViewQualityConfig(blend=Blend(network=math.nan))
     with pytest.raises(InvalidInputError, match="blocks"):
         ViewQualityNetwork(4, 4, 4, blocks=0)
     with pytest.raises(InvalidInputError, match="learning_rate"):
@@ -224,7 +275,15 @@ def test_what_is_collected_is_the_truth(env: Any) -> None:
         assert float(data.visible_fraction[1, k]) == pytest.approx(truth, abs=1e-3)
     first = data.scalars[data.episode == 1][0]
     torch.testing.assert_close(first, quality_features(belief)[1][0])
+    env.reset(seed=5)
+    for look in range(int((data.episode == 0).sum())):
+        # The scalars tell where the camera stood, and so where it came by the move before.
+        if look:
+            offset = data.scalars[look, 1] * data.scalars[look, 2:5]
+            gaps = (env.unwrapped.belief.lattice.offsets - offset).norm(dim=-1)
+            assert data.came_to[look - 1] in (-1, int(gaps.argmin()))
     again = collect_episodes(env, range(5, 7))
+    assert torch.equal(again.touched, data.touched) and torch.equal(again.came_to, data.came_to)
     torch.testing.assert_close(again.maps, data.maps, rtol=0.0, atol=0.0)
     joined = QualityData.join([data, again])
     assert joined.episode.max() == 3 and len(joined.maps) == 2 * len(data.maps)
@@ -248,12 +307,17 @@ def test_a_camera_that_corrects_the_target_moves_the_candidates_that_are_judged(
 
 
 def test_the_network_learns_what_the_maps_tell() -> None:
-    """V_f of a candidate is the first feature at it; full views are those above the threshold."""
+    """V_f of a candidate is the first feature at it, full views are those above the threshold, and the arm touches
+    where the second feature is above 1."""
     generator = torch.Generator().manual_seed(0)
     truth = torch.rand(400, AZIMUTHS, ELEVATIONS, DISTANCES, generator=generator)
     maps = torch.randn(400, MAP_CHANNELS, AZIMUTHS, ELEVATIONS, generator=generator)
     maps[:, :DISTANCES] = truth.permute(0, 3, 1, 2)
+    came_to = torch.randint(truth[0].numel(), (400,), generator=generator)
+    second = maps[:, DISTANCES : 2 * DISTANCES].permute(0, 2, 3, 1).flatten(1)
     data = QualityData(
+        came_to=came_to,
+        touched=second.gather(1, came_to[:, None])[:, 0] > 1.0,
         maps=maps.half(),
         scalars=torch.randn(400, SCALARS, generator=generator),
         episode=torch.arange(400),
@@ -267,6 +331,40 @@ def test_the_network_learns_what_the_maps_tell() -> None:
     assert told == [200, 300]
     assert errors["squared_error"] < 0.25 / 12  # A quarter of the variance of a uniform number.
     assert errors["cross_entropy"] < 0.5 * 0.5004  # Half the entropy of a fifth: -0.2 ln 0.2 - 0.8 ln 0.8.
+    assert errors["touch_entropy"] < 0.8 * 0.438  # Of the 0.159 of a normal number above 1.
+
+
+def test_the_blend_finds_the_weights_that_made_the_truth(belief: Belief) -> None:
+    torch.manual_seed(0)
+    generator = torch.Generator().manual_seed(0)
+    maps = quality_features(belief)[0].expand(60, -1, -1, -1).clone()
+    maps += 0.3 * torch.rand(maps.shape, generator=generator)
+    scalars = torch.randn(60, SCALARS, generator=generator)
+    network = new_network(8, 1)
+    for parameter in network.parameters():
+        parameter.data *= 3.0
+    wanted = Blend(0.6, 0.3, -0.5, -1.4, -0.2)
+    maps = maps.half()
+    with torch.no_grad():
+        odds = wanted.log_odds(maps.float(), network(maps.float(), scalars).full)
+    full = torch.rand(odds.shape, generator=generator) < odds.sigmoid()
+    data = QualityData(
+        maps=maps,
+        scalars=scalars,
+        episode=torch.arange(60),
+        visible_fraction=full.half(),
+        reachable=torch.ones(full.shape, dtype=torch.bool),
+        came_to=torch.zeros(60, dtype=torch.int64),
+        touched=torch.zeros(60, dtype=torch.bool),
+    )
+    found = fit_blend(network, data, 0.8)
+    # 28,080 candidates; twice the standard error of each weight, by the curvature of the likelihood.
+    terms = blend_terms(maps.float(), network(maps.float(), scalars).full).detach().flatten(0, 1).double()
+    chance = odds.sigmoid().flatten().double()
+    information = terms.T @ (terms * (chance * (1.0 - chance))[:, None])
+    errors = information.inverse().diagonal().sqrt()
+    gaps = torch.tensor(astuple(found)).double() - torch.tensor(astuple(wanted)).double()
+    assert bool((gaps.abs() < 4.0 * errors + 0.02).all()), (found, errors)
 
 
 def test_a_training_goes_on_where_it_was(tmp_path: Path) -> None:
@@ -329,7 +427,8 @@ def test_the_command_offers_every_setting(verb: str, capsys: pytest.CaptureFixtu
 
 def test_a_saved_policy_says_the_same(belief: Belief, tmp_path: Path) -> None:
     torch.manual_seed(0)
-    policy = ViewQuality(new_network(8, 1), ViewQualityConfig(patience=5.0), {"env_id": "TomatoViewpoint-v1"})
+    config = ViewQualityConfig(patience=5.0, touch_cost=2.0, blend=Blend(0.5, 0.4, -0.3, -2.0, 0.1))
+    policy = ViewQuality(new_network(8, 1), config, {"env_id": "TomatoViewpoint-v1"})
     save_view_quality(tmp_path / "p.pt", policy)
     loaded = load_view_quality(tmp_path / "p.pt")
     assert loaded.config == policy.config and loaded.facts == policy.facts

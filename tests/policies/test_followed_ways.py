@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 import torch
 
-from maniskill_tomato.policies.followed_ways import SAME_PLACE, moves_along
+from maniskill_tomato.policies.followed_ways import SAME_PLACE, WayFollower
 from maniskill_tomato.policies.lattice_planner import LatticePlanner, way_to
 from maniskill_tomato.policies.moves import move_towards, moves_needed
 from maniskill_tomato.robot.inverse_kinematics import Reach
-from maniskill_tomato.robot.look_at_move import MAX_MOVE, LookAtMover
+from maniskill_tomato.robot.look_at_move import MAX_MOVE
 from maniskill_tomato.sensing.belief import Belief
 from maniskill_tomato.tasks.making import make_world
 from maniskill_tomato.tasks.world import World
@@ -46,7 +46,7 @@ def test_ways_are_those_that_the_arm_makes(world: World, seed: int) -> None:
     picked = near[torch.as_tensor(np.random.default_rng(seed).permutation(len(near))[:14])]
     goals = belief.lattice.positions(target)[0, picked]
     qpos, position, target = (tensor.expand(len(goals), -1) for tensor in (qpos, position, target))
-    moves = moves_along(LookAtMover(), qpos, position, target, goals).tolist()
+    moves = WayFollower().moves_along(qpos, position, target, goals).tolist()
     assert moves == [really_made(world, seed, goal) for goal in goals]
     assert any(math.isinf(count) for count in moves) and any(math.isfinite(count) for count in moves)
 
@@ -73,7 +73,7 @@ def test_a_planner_spends_no_move_on_a_way_that_the_arm_cannot_go(world: World) 
     count = belief.lattice.size
     now = (world.state.qpos, belief.camera_position, belief.target_position)
     qpos, position, target = (tensor.expand(count, -1) for tensor in now)
-    moves = moves_along(LookAtMover(), qpos, position, target, views[0])
+    moves = WayFollower().moves_along(qpos, position, target, views[0])
     blocked = (belief.reachable[0] & moves.isinf() & (way_to(belief, views)[0] > 0.06)).nonzero()[:, 0]
     free = (belief.reachable[0] & moves.isfinite() & (way_to(belief, views)[0] > 0.06)).nonzero()[:, 0]
     for wish, is_taken in ((int(blocked[0]), False), (int(free[0]), True)):

@@ -144,7 +144,7 @@ def test_files_for_other_tasks_and_damaged_ones_are_refused(tmp_path: Path) -> N
     for file, env_id, words in (
         (asset_path(f"policies/{GUIDED}.pt"), THESIS_IDS[1], f"trained on {GUIDED}, not on {THESIS_IDS[1]}"),
         (asset_path("policies/deep_3dmts.pt"), GUIDED, f"a policy for {GENERAL}.*not for {GUIDED}"),
-        (tmp_path / "newer.pt", None, "has format 'view-quality-99'; this version reads .*view-quality-2"),
+        (tmp_path / "newer.pt", None, "has format 'view-quality-99'; this version reads .*view-quality-3"),
         (tmp_path / "list.pt", None, "not a checkpoint of this package"),
         (tmp_path / "cut.pt", None, "not a readable checkpoint"),
         (tmp_path / "alone.onnx", None, "must stay together"),

@@ -17,9 +17,11 @@ SEEDS_A_PLANT = 10
 class FitConfig(DescentConfig):
     """How the network is trained."""
 
+    steps: int = 2500
+    """Batches."""
     batch_size: int = 128
     """Looks in each batch."""
-    learning_rate: float = 2e-3
+    learning_rate: float = 4e-3
     """Of AdamW at the start; it falls to nothing along half a cosine."""
     width: int = 32
     """Channels of the network's maps."""
@@ -29,6 +31,8 @@ class FitConfig(DescentConfig):
     """V_f above which a view is a full one."""
     fraction_weight: float = 2.0
     """Weight of the squared error of V_f beside the cross entropy of full views."""
+    touch_weight: float = 0.25
+    """Weight of the cross entropy of touches beside it."""
     mirror: bool = True
     """Also learn from the mirror images of the looks, left and right exchanged."""
 
@@ -43,13 +47,14 @@ class FitConfig(DescentConfig):
 class QualityTrainConfig(RoundsConfig):
     """A training."""
 
-    rounds: tuple[int, ...] = (3000, 3000)
+    rounds: tuple[int, ...] = (2000, 4000, 4000)
     """Episodes of each round. The first is led by the planner on the occupancy map, the later ones mostly by the
     network of the round before."""
     episodes_a_plant: int = 4
     """Episodes on each plant, which is grown for them and not met again."""
     validation_episodes: int = 200
-    """Episodes on the validation plants, for the losses in the log."""
+    """Episodes on validation plants of `other_kind`, on which the network's log-odds and the memory's are weighed; the
+    log tells the losses there."""
     fit: FitConfig = field(default_factory=FitConfig)
     """How each round's network is trained, the first from scratch, the others going on from the one before."""
 

@@ -8,7 +8,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from maniskill_tomato.policies.moves import Goals
+from maniskill_tomato.policies.moves import LEAST_MOVE, Goals
 from maniskill_tomato.policies.next_best_view import NextBestView
 from maniskill_tomato.policies.protocol import Planner
 from maniskill_tomato.policies.quality_features import quality_features
@@ -33,6 +33,11 @@ class QualityData:
     """True V_f from every candidate. Shape (M, K), float16."""
     reachable: Tensor
     """Shape (M, K), bool."""
+    came_to: Tensor
+    """The candidate nearest to where the camera came by the move after each look; -1 where it was refused. Shape
+    (N,), int64."""
+    touched: Tensor
+    """Whether the arm touched the plant on that move. Shape (N,), bool."""
 
     @classmethod
     def join(cls, parts: list["QualityData"]) -> "QualityData":
@@ -44,6 +49,8 @@ class QualityData:
             episode=torch.cat([p.episode + int(o) for p, o in zip(parts, offsets, strict=True)]),
             visible_fraction=torch.cat([p.visible_fraction for p in parts]),
             reachable=torch.cat([p.reachable for p in parts]),
+            came_to=torch.cat([p.came_to for p in parts]),
+            touched=torch.cat([p.touched for p in parts]),
         )
 
 
@@ -103,6 +110,8 @@ def collect_episodes(
     episode: list[int] = []
     fractions: list[Tensor] = []
     reachable: list[Tensor] = []
+    came_to: list[int] = []
+    touched: list[bool] = []
     first = torch.zeros(1, dtype=torch.int64)
     for seed in seeds:
         env.reset(seed=seed)
@@ -123,7 +132,12 @@ def collect_episodes(
             maps.append(seen[0][0].half())
             scalars.append(seen[1][0])
             episode.append(len(fractions) - 1)
-            _, _, terminated, truncated, _ = env.step(policy.act(belief))
+            candidates, before = belief.lattice.positions(target[None])[0], belief.camera_position[0]
+            _, _, terminated, truncated, info = env.step(policy.act(belief))
+            now = world.belief.camera_position[0]
+            nearest = int((candidates - now).norm(dim=-1).argmin())
+            came_to.append(nearest if float((now - before).norm()) >= LEAST_MOVE else -1)
+            touched.append(bool(info["plant_contact"]))
             done = bool(terminated) or bool(truncated)
     return QualityData(
         maps=torch.stack(maps),
@@ -131,4 +145,6 @@ def collect_episodes(
         episode=torch.tensor(episode),
         visible_fraction=torch.stack(fractions),
         reachable=torch.stack(reachable),
+        came_to=torch.tensor(came_to),
+        touched=torch.tensor(touched),
     )

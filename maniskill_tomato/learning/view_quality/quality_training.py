@@ -22,10 +22,15 @@ from maniskill_tomato.learning.view_quality.quality_config import (
     QualityTrainConfig,
 )
 from maniskill_tomato.learning.view_quality.quality_episodes import QualityData, collect_episodes
-from maniskill_tomato.learning.view_quality.quality_fit import fit
+from maniskill_tomato.learning.view_quality.quality_fit import fit, fit_blend
 from maniskill_tomato.plants.seed_splits import SEED_SPLITS
 from maniskill_tomato.policies.quality_network import ViewQualityNetwork
-from maniskill_tomato.policies.view_quality import ViewQuality, load_view_quality, save_view_quality
+from maniskill_tomato.policies.view_quality import (
+    ViewQuality,
+    ViewQualityConfig,
+    load_view_quality,
+    save_view_quality,
+)
 
 ENV_ID = "TomatoViewpoint-v1"
 
@@ -75,7 +80,7 @@ def _train(
     begin_training(out, settings)
     start = time.perf_counter()
     validation_plan = _blocks(
-        out / "validation", config, 0, config.validation_episodes, "validation", options
+        out / "validation", config, 0, config.validation_episodes, "validation", _of_other_kind(options)
     )
     plan: list[Block] = []
     for number, episodes in enumerate(config.rounds):
@@ -107,10 +112,18 @@ def _train(
             "seconds": round(time.perf_counter() - start, 1),
             "seed": config.seed,
         }
-        save_view_quality(policy_path, ViewQuality(network, facts=facts))
+        blend = fit_blend(network, validation, config.fit.full_visibility)
+        report(f"round {number}: {blend}")
+        save_view_quality(policy_path, ViewQuality(network, ViewQualityConfig(blend=blend), facts))
     path = out / "policy.pt"
     write_atomically(path, (out / f"round-{len(config.rounds) - 1}.pt").read_bytes())
     return path
+
+
+def _of_other_kind(options: dict[str, Any]) -> dict[str, Any]:
+    """The same task with plants of other kinds than those that are learned from; meshes stay what they are."""
+    plant = dict(options.get("plant", {}))
+    return options if "mesh" in plant else {**options, "plant": {**plant, "preset": "other_kind"}}
 
 
 def _blocks(
