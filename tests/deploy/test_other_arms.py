@@ -16,7 +16,7 @@ import torch
 
 from maniskill_tomato.deploy.check import check, print_findings
 from maniskill_tomato.deploy.clock import SimulatedClock
-from maniskill_tomato.deploy.collision import Box
+from maniskill_tomato.deploy.collision import Box, CollisionChecker
 from maniskill_tomato.deploy.deploy_errors import FaultError, ProfileError, RefusedError
 from maniskill_tomato.deploy.drivers import DriverContext, arm_model, driver_names, make_arm
 from maniskill_tomato.deploy.guarded_arm import GuardedArm
@@ -198,7 +198,7 @@ def test_the_guard_holds_another_arm_to_its_own_limits(makers: Path) -> None:
     within_the_iiwas = posture(arm.model, j4=np.deg2rad(-112.0))
     assert (np.abs(within_the_iiwas) < IIWA14.joint_upper - 0.03).all()
     with pytest.raises(
-        RefusedError, match=r"joint_limit: A4 must stay from -108\.3 to 98\.3 deg, got -112\.0 deg"
+        RefusedError, match=r"joint_limit: A4 must stay from -108\.28 to 98\.28 deg, got -112\.00 deg"
     ):
         guard.command(to(within_the_iiwas))
     assert arm.sent == []
@@ -206,7 +206,9 @@ def test_the_guard_holds_another_arm_to_its_own_limits(makers: Path) -> None:
     assert len(arm.sent) == 1 and guard.wait(0.1)
     arm.joints = posture(arm.model, j4=np.deg2rad(102.0))
     arm.clock.sleep(100.0)
-    with pytest.raises(FaultError, match=r"A4 at 102\.0 deg, outside its limits"):
+    with pytest.raises(
+        FaultError, match=r"A4 at 102\.0 deg, 2\.00 deg outside its limits of -110\.0 to 100\.0 deg"
+    ):
         guard.read()
 
 
@@ -245,6 +247,23 @@ def test_collisions_and_zones_are_those_of_the_other_arms_geometry(makers: Path)
     wall = Safety(SafetyConfig(obstacles=(box(ours, 0.02),), obstacle_clearance=0.01), model=arm.model)
     refusal = wall.check(to(goal), state, 100.0)
     assert refusal is not None and refusal.reason == "obstacle" and "link" in refusal.detail
+
+
+def test_mujoco_has_the_shapes_of_the_other_arm_where_they_are(makers: Path) -> None:
+    upright, level = np.zeros(7), np.zeros(7)
+    level[1] = np.pi / 2
+    # Upright the iiwa 14 ends 40 mm higher; level its upper arm is 20 mm higher and 8 mm thicker.
+    above = Box(low=(-0.1, -0.1, 1.345), high=(0.1, 0.1, 1.5))
+    below = Box(low=(0.13, -0.02, 0.2), high=(0.2, 0.02, 0.272))
+    for joints, box, hits_ours, hits_theirs in ((upright, above, True, False), (level, below, False, True)):
+        for model, hits in ((IIWA14, hits_ours), (arm_model("narrow"), hits_theirs)):
+            checker = CollisionChecker(obstacles=(box,), obstacle_clearance=0.001, model=model)
+            contact = checker.nearest(joints[None])
+            assert (contact is not None and contact.second == "obstacle 0") is hits, (
+                model.name,
+                box,
+                contact,
+            )
 
 
 def test_moves_of_the_policy_are_solved_by_the_other_arms_kinematics(makers: Path) -> None:
@@ -344,7 +363,7 @@ def test_deploy_check_judges_another_arm_by_its_own_limits(makers: Path) -> None
     outside = next(
         f for f in check(profile("narrow", f"start = {start}"), "random", 3, None) if f.what == "limits"
     )
-    assert not outside.good and "A4 must stay from -108.3 to 98.3 deg, got -109.4 deg" in outside.detail
+    assert not outside.good and "A4 must stay from -108.28 to 98.28 deg, got -109.43 deg" in outside.detail
 
 
 def test_models_are_found_by_name(makers: Path, example: None) -> None:
