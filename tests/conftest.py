@@ -25,6 +25,9 @@ ALLOWED_SKIPS = {
     "tests/deploy/test_deploy_calibration.py::test_the_closed_form_is_that_of_opencv": (
         "this OpenCV hides its own solution from Python"
     ),
+    "tests/deploy/test_recording_viewers.py::test_rerun_reads_the_recording_as_arm_pictures_and_points": (
+        "no rerun on PATH"  # With what it needs it takes 800 MB.
+    ),
 }
 """What may be skipped with CI=true, and the reason that it gives."""
 

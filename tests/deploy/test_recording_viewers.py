@@ -1,6 +1,9 @@
 """What viewers find in a recording: the mcap library reads it back as arm, pictures and points at their places."""
 
 import json
+import re
+import shutil
+import subprocess
 import time
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -28,6 +31,7 @@ from maniskill_tomato.robot.d435 import T_flange_camera_color_optical
 from maniskill_tomato.robot.iiwa14 import JOINT_NAMES
 
 Floats = NDArray[np.float64]
+RERUN = shutil.which("rerun")
 mj: Any = mujoco
 
 TEXT = """
@@ -279,3 +283,32 @@ def test_depth_comes_back_to_the_last_bit(recorded: Recorded, tmp_path: Path, ki
         recorder.step(replace(step, frame=replace(step.frame, depth=depth)))
     np.testing.assert_array_equal(load_recording(tmp_path / "run.mcap").steps[0].frame.depth, depth)
     assert ("/camera/depth_m" in read(tmp_path / "run.mcap")) == (kind != "millimetres")
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(RERUN is None, reason="no rerun on PATH")
+def test_rerun_reads_the_recording_as_arm_pictures_and_points(recorded: Recorded, tmp_path: Path) -> None:
+    assert RERUN is not None
+    converted = tmp_path / "run.rrd"
+    for words in (
+        ["mcap", "convert", str(recorded.path), "-o", str(converted)],
+        ["rrd", "verify", str(converted)],
+    ):
+        subprocess.run([RERUN, *words], check=True, capture_output=True, timeout=120)
+    printed = subprocess.run(
+        [RERUN, "rrd", "print", str(converted)], check=True, capture_output=True, text=True, timeout=120
+    ).stdout
+    found: dict[str, list[str]] = {}
+    for entity, columns in re.findall(r" - (/\S*) - data columns: \[(.*)\]", printed):
+        found.setdefault(entity, []).append(columns)
+    looks = len(recorded.steps)
+    for topic, columns in (
+        ("/camera/color", "EncodedImage:blob"),
+        ("/camera/depth", "Image:buffer"),
+        ("/camera/points", "Points3D:positions"),
+        ("/camera/calibration", "Pinhole:image_from_camera"),
+        ("/tf", "Transform3D:translation"),
+    ):
+        assert sum(columns in chunk for chunk in found[topic]) >= looks, topic
+    drawn = {entity.split("/")[3] for entity in found if "/visual_geometries/" in entity}
+    assert {f"link_{k}" for k in range(8)} <= drawn
