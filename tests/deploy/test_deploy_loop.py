@@ -320,7 +320,12 @@ def test_a_neighbour_does_not_pass_for_a_target_that_is_not_found(seed: int) -> 
         result = Loop(workcell, open_policy(default_policy(), env_id=TASK), stops, "unattended", [kept]).run()
     assert not result.success and not result.is_fault
     assert max(step.view.fruits_seen for step in kept.steps) > 0
-    assert result.best_visible_fraction < 0.3, "a sliver at most, where a fruit can hardly be located"
+    # The target's place is known to 3 cm, so that a neighbour may be taken for it in a view that hardly locates it;
+    # what decides is the lower bound.
+    assert max(step.view.sure_fraction for step in kept.steps) < 0.3, "a sliver at most"
+    assert sum(step.view.visible_fraction > 0.3 for step in kept.steps) <= 1, (
+        "and the next view tells them apart"
+    )
 
 
 def test_a_robot_whose_first_pictures_show_no_fruit_looks_round_for_one() -> None:
