@@ -1,5 +1,6 @@
 """The view-quality policy: features, network, search, data, training, files, and its evaluation."""
 
+import itertools
 import json
 import math
 from collections.abc import Iterator
@@ -208,7 +209,8 @@ def test_log_odds_of_network_and_memory_are_weighed_term_by_term(belief: Belief)
     full = network(maps, scalars).full.detach()
     blended = Blend(0.5, 0.4, -0.3, -2.0, 0.1).log_odds(maps, full)[0]
     table = maps.view(len(FEATURES), DISTANCES, AZIMUTHS, ELEVATIONS)
-    for a, e, d in ((0, 0, 0), (6, 4, 1), (12, 8, 3), (3, 5, 2)):
+    assert float(table[FEATURES.index("alike")].max()) > 0.4
+    for a, e, d in itertools.product(range(AZIMUTHS), range(ELEVATIONS), range(DISTANCES)):
         feature = {name: float(table[i, d, a, e]) for i, name in enumerate(FEATURES)}
         expected = (1.0 - feature["alike"]) * feature["expected"] + feature["measured"]
         expected = min(max(expected, 0.01), 0.99)
