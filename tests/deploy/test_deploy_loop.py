@@ -309,23 +309,37 @@ def test_fruits_that_change_places_in_the_list_change_nothing() -> None:
     assert swapped.reason == plain.reason
 
 
-@pytest.mark.parametrize("seed", [7, 9])
-def test_a_neighbour_does_not_pass_for_a_target_that_is_not_found(seed: int) -> None:
-    """Fruits of one truss, and the segmenter never finds the one that is looked for: no success on another one."""
+@pytest.mark.parametrize(
+    ("policy", "seed"),
+    [
+        ("nbv", 7),
+        ("nbv", 9),
+        (None, 7),
+        pytest.param(
+            None,
+            9,
+            marks=pytest.mark.xfail(
+                strict=True,
+                reason="a known fault: in one view a neighbour 26 mm from the place told is taken for the target",
+            ),
+        ),
+    ],
+)
+def test_a_neighbour_does_not_pass_for_a_target_that_is_not_found(policy: str | None, seed: int) -> None:
+    """Fruits of one truss, and the segmenter never finds the one that is looked for: no success on another one.
+
+    Once by a planner, whose views stay the same, and once by the policy that ships.
+    """
     of = profile(loop="").text.replace("max_moves = 6", "max_moves = 11")
     workcell = make_workcell(parse_profile(of, Path("longer.toml")), seed)
     workcell = replace(workcell, perception=Withheld())
     kept = KeptSteps()
+    looks_by = open_policy(policy or default_policy(), env_id=TASK)
     with workcell.arm, workcell.camera, Stops() as stops:
-        result = Loop(workcell, open_policy(default_policy(), env_id=TASK), stops, "unattended", [kept]).run()
+        result = Loop(workcell, looks_by, stops, "unattended", [kept]).run()
     assert not result.success and not result.is_fault
     assert max(step.view.fruits_seen for step in kept.steps) > 0
-    # The target's place is known to 3 cm, so that a neighbour may be taken for it in a view that hardly locates it;
-    # what decides is the lower bound.
-    assert max(step.view.sure_fraction for step in kept.steps) < 0.3, "a sliver at most"
-    assert sum(step.view.visible_fraction > 0.3 for step in kept.steps) <= 1, (
-        "and the next view tells them apart"
-    )
+    assert result.best_visible_fraction < 0.3, "a sliver at most, where a fruit can hardly be located"
 
 
 def test_a_robot_whose_first_pictures_show_no_fruit_looks_round_for_one() -> None:
