@@ -9,9 +9,9 @@ import cv2
 import numpy as np
 
 from maniskill_tomato.deploy.capture import Capture
+from maniskill_tomato.deploy.decision import TASK, decide, default_policy
 from maniskill_tomato.deploy.deploy_errors import DeployError, RecordingError
 from maniskill_tomato.deploy.interface import JointMove
-from maniskill_tomato.deploy.loop import TASK, decide, default_policy
 from maniskill_tomato.deploy.profile import Profile
 from maniskill_tomato.deploy.robot_perception import RobotBelief
 from maniskill_tomato.deploy.workcell import Workcell, make_workcell

@@ -1,4 +1,4 @@
-"""What drivers of an iiwa check: joint angles that can be true, a flange where our kinematics put it."""
+"""What drivers of an iiwa check: moves, joint angles that can be true, a flange where our kinematics put it."""
 
 import math
 from dataclasses import dataclass
@@ -8,8 +8,8 @@ import numpy as np
 import torch
 from scipy.spatial.transform import Rotation
 
-from maniskill_tomato.deploy.deploy_errors import FaultError
-from maniskill_tomato.deploy.interface import LIMIT_SLACK, ArmState, Float64
+from maniskill_tomato.deploy.deploy_errors import FaultError, RefusedError
+from maniskill_tomato.deploy.interface import LIMIT_SLACK, ArmState, Float64, JointMove
 from maniskill_tomato.deploy.profile_bounds import Laxer
 from maniskill_tomato.deploy.rigid import difference, transform
 from maniskill_tomato.errors import InvalidInputError, check_ranges
@@ -82,6 +82,24 @@ class IiwaConfig:
             arrival_tolerance=(1e-5, 0.02),
             rest_tolerance=(1e-5, 0.05),
         )
+
+
+def check_move(move: JointMove, margin: float = 0.0) -> None:
+    """What a driver asks of a move before anything is sent.
+
+    Args:
+        move: Any numbers.
+        margin: How far inside the joints' limits it must end, in [rad].
+
+    Raises:
+        RefusedError: It is not finite, ends outside the limits, or its speed is none.
+    """
+    target = move.joint_positions
+    if not np.all(np.isfinite(target)) or np.any(np.abs(target) > iiwa14.JOINT_UPPER - margin):
+        within = f"{margin:g} rad within" if margin else "within"
+        raise RefusedError(f"joint positions must be finite and {within} the limits, got {target}")
+    if not 0.0 < move.speed_fraction <= 1.0:
+        raise RefusedError(f"speed_fraction must be above 0 and at most 1, got {move.speed_fraction}")
 
 
 class Reading(NamedTuple):
@@ -167,16 +185,30 @@ class ReadingLog:
         )
 
 
-def pose_difference(told: Float64, joint_positions: Float64, config: IiwaConfig) -> tuple[float, float]:
+class FlangeDifference(NamedTuple):
+    """How far the controller's flange is from ours."""
+
+    distance: float
+    """In [m]."""
+    angle: float
+    """In [rad]."""
+
+    @property
+    def facts(self) -> dict[str, float]:
+        """For `Arm.describe`."""
+        return {
+            "flange_difference_mm": round(1000.0 * self.distance, 3),
+            "flange_difference_deg": round(math.degrees(self.angle), 4),
+        }
+
+
+def pose_difference(told: Float64, joint_positions: Float64, config: IiwaConfig) -> FlangeDifference:
     """How far the controller's tool, or flange, is from ours.
 
     Args:
         told: What the controller says: x, y, z, in [m], A, B, C, in [rad], base frame. Shape (6,).
         joint_positions: At the same time, in [rad]. Shape (7,).
         config: Flange, tool and tolerances.
-
-    Returns:
-        In [m] and [rad].
 
     Raises:
         FaultError: Farther than the tolerances.
@@ -189,7 +221,7 @@ def pose_difference(told: Float64, joint_positions: Float64, config: IiwaConfig)
     actual = _transform((told[0], told[1], told[2]), (told[5], told[4], told[3]))
     distance, angle = difference(expected, actual)
     if distance <= config.pose_tolerance_m and angle <= config.pose_tolerance_rad:
-        return distance, angle
+        return FlangeDifference(distance, angle)
     apart = [round(1000.0 * float(v), 1) for v in (np.linalg.inv(expected) @ actual)[:3, 3]]
     raise FaultError(
         f"the controller's flange is {1000 * distance:.1f} mm and {math.degrees(angle):.2f} degrees from where our "

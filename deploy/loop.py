@@ -10,19 +10,18 @@ may take it in.
 """
 
 import logging
-import math
 import time
-from collections import defaultdict, deque
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager, suppress
+from collections import deque
+from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 
 from maniskill_tomato.deploy.capture import Capture
+from maniskill_tomato.deploy.decision import decide
 from maniskill_tomato.deploy.deploy_errors import (
     DeployError,
     FaultError,
@@ -44,37 +43,24 @@ from maniskill_tomato.deploy.interface import Float64, Frame, JointMove
 from maniskill_tomato.deploy.move_choice import Choice, MoveChooser, MoveRequest
 from maniskill_tomato.deploy.plant_points import PlantPoints
 from maniskill_tomato.deploy.refusals import Refusal
+from maniskill_tomato.deploy.rest import come_to_rest
 from maniskill_tomato.deploy.robot_perception import RobotBelief
 from maniskill_tomato.deploy.run_records import Mode, Proposal, Recorder, RunResult, Step
+from maniskill_tomato.deploy.stage_times import StageTimes
 from maniskill_tomato.deploy.stops import Stops
 from maniskill_tomato.deploy.way import Way, WayPlanner
 from maniskill_tomato.deploy.workcell import Workcell
-from maniskill_tomato.errors import PolicyError
 from maniskill_tomato.policies.lattice_planner import LatticePlanner
 from maniskill_tomato.policies.next_best_view import NextBestView
-from maniskill_tomato.policies.opening import shipped_policy
 from maniskill_tomato.policies.protocol import Policy
 from maniskill_tomato.robot.look_at_move import MAX_MOVE
 from maniskill_tomato.robot.transit import TRANSIT_MOVES
-from maniskill_tomato.sensing.belief import Belief
-
-TASK: Final = "TomatoViewpoint-v1"
-"""The task whose observations and actions the loop has."""
-
-BOUND_SLACK: Final = 1e-4
-"""An action's entries may exceed 1 by this much: rounding."""
 
 WAIT_SLICE: Final = 0.02
 """While an arm moves that can be stopped, stops are looked for this often, in [s]."""
 
 LONG_SLICE: Final = 0.1
 """The same for one that cannot."""
-
-STOP_TIME: Final = 2.0
-"""An arm that was told to stop stands after so long, in [s]."""
-
-AT_REST: Final = 0.01
-"""An arm whose joints all turn more slowly stands, in [rad/s]."""
 
 STANDS: Final = 0.005
 """Joints that have turned by less than this have not moved, in [rad]."""
@@ -86,35 +72,6 @@ REPLANS: Final = 2
 """A way of which new pictures show that it is not safe is planned anew so often."""
 
 _logger = logging.getLogger(__name__)
-
-
-def default_policy() -> str:
-    """The policy that ships with the package."""
-    return str(shipped_policy(TASK))
-
-
-def decide(policy: Policy, belief: Belief) -> NDArray[np.float64]:
-    """The policy's next move, checked.
-
-    Returns:
-        Right, up, forward in [-1, 1]. Shape (3,).
-
-    Raises:
-        PolicyError: It is not three finite numbers within the bounds.
-    """
-    action = np.asarray(policy.act(belief).detach().double())
-    if action.shape != (1, 3):
-        raise PolicyError(
-            f"the policy answered with shape {action.shape}, not (1, 3); is it for another task?"
-        )
-    if not np.isfinite(action).all():
-        raise PolicyError(
-            f"the policy answered {action[0].tolist()}, which is not finite; the arm does not move"
-        )
-    if np.abs(action).max() > 1.0 + BOUND_SLACK:
-        raise PolicyError(f"the policy answered {action[0].tolist()}, outside [-1, 1]; the arm does not move")
-    move: NDArray[np.float64] = action[0].clip(-1.0, 1.0)
-    return move
 
 
 class _End(Exception):
@@ -190,7 +147,7 @@ class Loop:
         self._no_way_from: Float64 | None = None
         self._last: Step | None = None
         self._true_fraction: float | None = None
-        self._times = _StageTimes()
+        self._times = StageTimes()
         self._not_finite: FaultState | None = None
 
     def run(self) -> RunResult:
@@ -209,7 +166,7 @@ class Loop:
             fault = self._fault_state(reason, detail, error)
         fault = fault or self._not_finite
         try:
-            end_state = self._come_to_rest()
+            end_state = come_to_rest(self._arm)
         except Exception as error:
             end_state = f"what the arm does nobody knows ({detail_of(error)}); use the emergency stop"
         try:
@@ -576,29 +533,6 @@ class Loop:
             traceback="" if error is None else lines_of(error),
         )
 
-    def _come_to_rest(self) -> str:
-        """Leaves the arm without a command, whatever fails; says what it does then."""
-        with suppress(Exception):
-            if self._arm.wait(0.0) and self._speed() < AT_REST:
-                return "the arm stands and holds its position"
-        if self._arm.stop():
-            with suppress(Exception):
-                self._arm.wait(STOP_TIME)
-            speed = self._speed()
-            if speed < AT_REST:
-                return "the arm was stopped and holds its position"
-            if math.isinf(speed):
-                return "the arm was told to stop; whether it stands nobody knows, for it does not answer"
-            return f"the arm was told to stop and still moves at {speed:.3f} rad/s; use the emergency stop"
-        return "a move may still be under way and goes on to its end; only the smartPAD or the emergency stop halts it"
-
-    def _speed(self) -> float:
-        """Of the fastest joint as it is read, in [rad/s]; infinite where the arm does not answer."""
-        try:
-            return float(np.abs(self._arm.read().joint_velocities).max())
-        except Exception:
-            return math.inf
-
     def _record(self, step: Step) -> None:
         for recorder in self._recorders:
             recorder.step(replace(step, timing_ms=self._times.step_ms))
@@ -610,36 +544,3 @@ class Loop:
                 recorder.event(self._clock.now(), text)
             except DeployError as error:
                 _logger.warning("%s", error)
-
-
-class _StageTimes:
-    """Wall times by stage, of the step under way and of all."""
-
-    def __init__(self) -> None:
-        self._all: dict[str, list[float]] = defaultdict(list)
-        self._step: dict[str, float] = {}
-
-    def begin_step(self) -> None:
-        """A new step begins; `step_ms` is empty again."""
-        self._step = {}
-
-    @contextmanager
-    def timed(self, stage: str) -> Iterator[None]:
-        """Measures what is inside, also where it raises."""
-        began = time.perf_counter()
-        try:
-            yield
-        finally:
-            taken = 1e3 * (time.perf_counter() - began)
-            self._all[stage].append(taken)
-            self._step[stage] = round(taken, 3)
-
-    @property
-    def step_ms(self) -> dict[str, float]:
-        """Of the step under way, in [ms]."""
-        return dict(self._step)
-
-    @property
-    def mean_ms(self) -> dict[str, float]:
-        """Means over all steps, in [ms]."""
-        return {stage: round(float(np.mean(values)), 2) for stage, values in self._all.items()}

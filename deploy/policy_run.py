@@ -15,11 +15,12 @@ from numpy.typing import NDArray
 
 from maniskill_tomato import __version__
 from maniskill_tomato.deploy.clock import Clock
+from maniskill_tomato.deploy.decision import TASK, default_policy
 from maniskill_tomato.deploy.deploy_errors import RecordingError
 from maniskill_tomato.deploy.fault_state import FaultState, early_fault
 from maniskill_tomato.deploy.goal import Goal
 from maniskill_tomato.deploy.interface import Float64
-from maniskill_tomato.deploy.loop import TASK, Loop, default_policy
+from maniskill_tomato.deploy.loop import Loop
 from maniskill_tomato.deploy.profile import Profile
 from maniskill_tomato.deploy.recording import McapRecorder
 from maniskill_tomato.deploy.run_records import Mode, Proposal, Recorder, RunResult, Step

@@ -17,7 +17,7 @@ from maniskill_tomato.deploy.profile_bounds import BOUNDS, check_bounds, relaxed
 from maniskill_tomato.deploy.profile_files import profile_names, profile_path
 from maniskill_tomato.deploy.robot_perception import TRUE_MASKS, Sight
 from maniskill_tomato.deploy.run_records import LoopConfig
-from maniskill_tomato.deploy.safety import SafetyConfig
+from maniskill_tomato.deploy.safety_config import SafetyConfig
 from maniskill_tomato.deploy.toml_tables import parse_table
 from maniskill_tomato.errors import InvalidInputError, check_ranges
 from maniskill_tomato.robot.d435 import T_flange_camera_color_optical

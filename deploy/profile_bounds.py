@@ -9,7 +9,7 @@ from dataclasses import MISSING, dataclass, fields, replace
 from typing import Any, Final, Literal
 
 from maniskill_tomato.deploy.collision import Box
-from maniskill_tomato.deploy.safety import LARGEST_SPEED_FRACTION, SafetyConfig
+from maniskill_tomato.deploy.safety_config import LARGEST_SPEED_FRACTION, SafetyConfig
 from maniskill_tomato.errors import InvalidInputError
 
 Laxer = Literal["more", "less"]

@@ -14,13 +14,14 @@ import numpy as np
 import torch
 
 from maniskill_tomato.deploy.clock import SimulatedClock
+from maniskill_tomato.deploy.decision import TASK
 from maniskill_tomato.deploy.deploy_errors import CutOffError, NotConnectedError, RecordingError
 from maniskill_tomato.deploy.drivers import arm_model
 from maniskill_tomato.deploy.fault_state import FaultState
 from maniskill_tomato.deploy.guarded_arm import GuardedArm
 from maniskill_tomato.deploy.inspection_run import whole_row
 from maniskill_tomato.deploy.interface import Arm, ArmState, Camera, Float64, Frame, FrameTruth, JointMove
-from maniskill_tomato.deploy.loop import TASK, Loop
+from maniskill_tomato.deploy.loop import Loop
 from maniskill_tomato.deploy.profile import Profile, TargetConfig, parse_profile
 from maniskill_tomato.deploy.recording_reader import (
     FORMATS,

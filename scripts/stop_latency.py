@@ -23,8 +23,9 @@ from typing import Final
 import numpy as np
 import tyro
 
+from maniskill_tomato.deploy.decision import TASK
 from maniskill_tomato.deploy.libiiwa.loopback import LoopbackRobot
-from maniskill_tomato.deploy.loop import TASK, Loop
+from maniskill_tomato.deploy.loop import Loop
 from maniskill_tomato.deploy.mock.episode import load_episode
 from maniskill_tomato.deploy.mock.rehearsal import rehearsal
 from maniskill_tomato.deploy.stops import Stops

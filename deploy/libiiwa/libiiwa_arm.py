@@ -25,7 +25,13 @@ from maniskill_tomato.deploy.deploy_errors import (
     RefusedError,
 )
 from maniskill_tomato.deploy.drivers import DriverContext
-from maniskill_tomato.deploy.iiwa_readings import Reading, ReadingLog, pose_difference
+from maniskill_tomato.deploy.iiwa_readings import (
+    FlangeDifference,
+    Reading,
+    ReadingLog,
+    check_move,
+    pose_difference,
+)
 from maniskill_tomato.deploy.interface import Arm, ArmState, Float64, JointMove
 from maniskill_tomato.deploy.libiiwa.client import TOLD_TO_STOP, LibiiwaClient
 from maniskill_tomato.deploy.libiiwa.libiiwa_config import LibiiwaConfig
@@ -93,7 +99,7 @@ class LibiiwaArm(Arm):
         self._torque_before = np.zeros(iiwa14.NUM_JOINTS)
         self._stop_asked = threading.Event()
         self._stopped_at = math.inf
-        self._pose_error: tuple[float, float] | None = None
+        self._pose_error: FlangeDifference | None = None
 
     @property
     def is_connected(self) -> bool:
@@ -153,10 +159,7 @@ class LibiiwaArm(Arm):
             "address": f"{self._config.controller}, to port {self._config.port} here",
             "stopping": "a stop cancels the move under way; with the cable pulled, it goes on to the end of its piece",
         }
-        if self._pose_error is not None:
-            facts["flange_difference_mm"] = round(1000.0 * self._pose_error[0], 3)
-            facts["flange_difference_deg"] = round(math.degrees(self._pose_error[1]), 4)
-        return facts
+        return facts if self._pose_error is None else facts | self._pose_error.facts
 
     def read(self, max_age_s: float = 0.5) -> ArmState:
         # Every reading is asked for, and so is never old; two of them tell the velocity.
@@ -176,19 +179,13 @@ class LibiiwaArm(Arm):
             raise RefusedError(TOLD_TO_STOP)
         if self._piece is not None and client.is_open:
             raise RefusedError("another move is under way")
-        target = move.joint_positions
-        if not np.all(np.isfinite(target)) or np.any(np.abs(target) > iiwa14.JOINT_UPPER - LIMIT_MARGIN):
-            raise RefusedError(
-                f"joint positions must be finite and {LIMIT_MARGIN} rad within the limits, got {target}"
-            )
-        if not 0.0 < move.speed_fraction <= 1.0:
-            raise RefusedError(f"speed_fraction must be above 0 and at most 1, got {move.speed_fraction}")
+        check_move(move, LIMIT_MARGIN)
         with self._telling_of_a_move():
             state = self._look()
             if not state.is_ready or state.is_active:
                 why = "it has a move already" if state.is_active else "a stop, or a released enabling switch"
                 raise RefusedError(f"the robot is not ready to move: {why}; look at the smartPAD")
-            target = client.rounded(target.tolist())
+            target = client.rounded(move.joint_positions.tolist())
             self._pieces = straight_pieces(state.joint_positions, target, self._config.largest_segment)
             self._speed = float(client.rounded([move.speed_fraction])[0])
             self._torque_before = state.external_torque

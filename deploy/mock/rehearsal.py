@@ -14,7 +14,8 @@ from maniskill_tomato.deploy.mock.twin_world import twin_options, twin_world
 from maniskill_tomato.deploy.profile import Profile, TargetConfig
 from maniskill_tomato.deploy.robot_perception import TruthPerception
 from maniskill_tomato.deploy.run_records import LoopConfig
-from maniskill_tomato.deploy.safety import Safety, SafetyConfig
+from maniskill_tomato.deploy.safety import Safety
+from maniskill_tomato.deploy.safety_config import SafetyConfig
 from maniskill_tomato.deploy.workcell import Workcell
 from maniskill_tomato.robot.d435 import T_flange_camera_color_optical
 

@@ -23,7 +23,13 @@ from maniskill_tomato.deploy.deploy_errors import (
     RefusedError,
 )
 from maniskill_tomato.deploy.drivers import DriverContext
-from maniskill_tomato.deploy.iiwa_readings import Reading, ReadingLog, pose_difference
+from maniskill_tomato.deploy.iiwa_readings import (
+    FlangeDifference,
+    Reading,
+    ReadingLog,
+    check_move,
+    pose_difference,
+)
 from maniskill_tomato.deploy.interface import Arm, ArmState, Float64, JointMove
 from maniskill_tomato.deploy.profile_bounds import relaxed
 from maniskill_tomato.deploy.straight_moves import move_seconds, straight_pieces
@@ -68,7 +74,7 @@ class SunriseArm(Arm):
         self._piece: Float64 | None = None
         self._piece_deadline = 0.0
         self._stop_asked = False
-        self._pose_error: tuple[float, float] | None = None
+        self._pose_error: FlangeDifference | None = None
 
     @property
     def is_connected(self) -> bool:
@@ -115,10 +121,7 @@ class SunriseArm(Arm):
             "address": f"{self._config.host}:{self._config.port}",
             "stopping": f"a stop takes effect at the end of a piece of a move; within one {ONLY_SMARTPAD}",
         }
-        if self._pose_error is not None:
-            facts["flange_difference_mm"] = round(1000.0 * self._pose_error[0], 3)
-            facts["flange_difference_deg"] = round(math.degrees(self._pose_error[1]), 4)
-        return facts
+        return facts if self._pose_error is None else facts | self._pose_error.facts
 
     def read(self, max_age_s: float = 0.5) -> ArmState:
         # Every reading is asked for, and so is never old; two of them tell the velocity.
@@ -146,15 +149,11 @@ class SunriseArm(Arm):
         client = self._connected()
         if self._piece is not None and client.is_open:
             raise RefusedError("another move is under way")
-        target = move.joint_positions
-        if not np.all(np.isfinite(target)) or np.any(np.abs(target) > iiwa14.JOINT_UPPER):
-            raise RefusedError(f"joint positions must be finite and within the limits, got {target}")
-        if not 0.0 < move.speed_fraction <= 1.0:
-            raise RefusedError(f"speed_fraction must be above 0 and at most 1, got {move.speed_fraction}")
+        check_move(move)
         if self._stop_asked:
             raise RefusedError("the arm was told to stop; connect anew before it moves again")
         start = self._measure().positions
-        target = np.round(target, 9)
+        target = np.round(move.joint_positions, 9)
         self._pieces = straight_pieces(start, target, self._config.largest_segment)
         self._speed = move.speed_fraction
         with self._telling_of_a_move():

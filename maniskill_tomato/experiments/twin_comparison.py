@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 import maniskill_tomato
-from maniskill_tomato.deploy.loop import TASK, default_policy
+from maniskill_tomato.deploy.decision import TASK, default_policy
 from maniskill_tomato.deploy.policy_run import RunConfig, run
 from maniskill_tomato.deploy.profile import Profile, load_profile
 from maniskill_tomato.errors import TomatoError

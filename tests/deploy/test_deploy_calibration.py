@@ -52,7 +52,8 @@ from maniskill_tomato.deploy.guarded_arm import GuardedArm
 from maniskill_tomato.deploy.interface import Arm, ArmState, Camera, Float64, Frame, JointMove
 from maniskill_tomato.deploy.profile import Profile, parse_profile
 from maniskill_tomato.deploy.rigid import difference, transform
-from maniskill_tomato.deploy.safety import Safety, SafetyConfig
+from maniskill_tomato.deploy.safety import Safety
+from maniskill_tomato.deploy.safety_config import SafetyConfig
 from maniskill_tomato.deploy.stops import Stops
 from maniskill_tomato.errors import InvalidInputError
 from maniskill_tomato.robot import d435

@@ -10,10 +10,11 @@ import pytest
 import torch
 
 from maniskill_tomato.deploy.clock import SimulatedClock
+from maniskill_tomato.deploy.decision import TASK, default_policy
 from maniskill_tomato.deploy.deploy_errors import ProfileError
 from maniskill_tomato.deploy.inspection_run import inspect_row, whole_row
 from maniskill_tomato.deploy.interface import ArmState, Float64
-from maniskill_tomato.deploy.loop import REPLANS, TASK, Loop, default_policy
+from maniskill_tomato.deploy.loop import REPLANS, Loop
 from maniskill_tomato.deploy.mock.episode import load_episode
 from maniskill_tomato.deploy.policy_run import RunConfig
 from maniskill_tomato.deploy.profile import Profile, load_profile, parse_profile

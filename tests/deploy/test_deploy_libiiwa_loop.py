@@ -13,8 +13,9 @@ import numpy as np
 import pytest
 
 from maniskill_tomato.deploy.check import check
+from maniskill_tomato.deploy.decision import TASK
 from maniskill_tomato.deploy.libiiwa.loopback import LoopbackRobot
-from maniskill_tomato.deploy.loop import TASK, Loop
+from maniskill_tomato.deploy.loop import Loop
 from maniskill_tomato.deploy.loopback_faults import Fault
 from maniskill_tomato.deploy.mock.episode import load_episode
 from maniskill_tomato.deploy.mock.rehearsal import rehearsal

@@ -17,10 +17,11 @@ from torch import Tensor
 
 from maniskill_tomato.assets import asset_path
 from maniskill_tomato.deploy.clock import SimulatedClock
+from maniskill_tomato.deploy.decision import TASK, default_policy
 from maniskill_tomato.deploy.deploy_errors import DeployError, ProfileError, RefusedError
 from maniskill_tomato.deploy.guarded_arm import GuardedArm
 from maniskill_tomato.deploy.interface import Frame, JointMove
-from maniskill_tomato.deploy.loop import TASK, Loop, default_policy
+from maniskill_tomato.deploy.loop import Loop
 from maniskill_tomato.deploy.mock.episode import load_episode
 from maniskill_tomato.deploy.move_choice import Choice, MoveChooser, MoveRequest
 from maniskill_tomato.deploy.profile import Profile, load_profile, parse_profile

@@ -20,7 +20,8 @@ from maniskill_tomato.deploy.loop import Loop
 from maniskill_tomato.deploy.move_choice import MoveChooser, MoveRequest
 from maniskill_tomato.deploy.profile import parse_profile
 from maniskill_tomato.deploy.run_records import KeptSteps
-from maniskill_tomato.deploy.safety import Safety, SafetyConfig
+from maniskill_tomato.deploy.safety import Safety
+from maniskill_tomato.deploy.safety_config import SafetyConfig
 from maniskill_tomato.deploy.stops import Stops
 from maniskill_tomato.deploy.workcell import make_workcell
 from maniskill_tomato.policies.protocol import Planner

@@ -18,7 +18,8 @@ from maniskill_tomato.deploy.interface import Arm, ArmState, Float64, JointMove
 from maniskill_tomato.deploy.libiiwa.loopback import LoopbackRobot
 from maniskill_tomato.deploy.loopback_faults import Fault
 from maniskill_tomato.deploy.move_watch import Departure, MoveWatch
-from maniskill_tomato.deploy.safety import Safety, SafetyConfig
+from maniskill_tomato.deploy.safety import Safety
+from maniskill_tomato.deploy.safety_config import SafetyConfig
 from maniskill_tomato.deploy.sunrise.loopback import LoopbackController
 from maniskill_tomato.robot.iiwa14 import IIWA14, READY_QPOS
 

@@ -25,7 +25,8 @@ from maniskill_tomato.deploy.move_choice import MoveChooser, MoveRequest
 from maniskill_tomato.deploy.policy_run import RunConfig, run
 from maniskill_tomato.deploy.profile import Profile, parse_profile
 from maniskill_tomato.deploy.run_replay import load_recording, replay
-from maniskill_tomato.deploy.safety import Safety, SafetyConfig
+from maniskill_tomato.deploy.safety import Safety
+from maniskill_tomato.deploy.safety_config import SafetyConfig
 from maniskill_tomato.deploy.workcell import make_workcell
 from maniskill_tomato.robot.d435 import T_flange_camera_color_optical
 from maniskill_tomato.robot.iiwa14 import IIWA14

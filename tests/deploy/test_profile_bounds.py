@@ -16,7 +16,8 @@ from maniskill_tomato.deploy.guarded_arm import GuardedArm
 from maniskill_tomato.deploy.profile import Profile, StopConfig, parse_profile
 from maniskill_tomato.deploy.profile_bounds import BASE_ZONE, BOUNDS, LARGEST_WORKSPACE
 from maniskill_tomato.deploy.run_records import LoopConfig
-from maniskill_tomato.deploy.safety import Safety, SafetyConfig
+from maniskill_tomato.deploy.safety import Safety
+from maniskill_tomato.deploy.safety_config import SafetyConfig
 from maniskill_tomato.deploy.workcell import make_workcell
 from maniskill_tomato.errors import InvalidInputError
 from maniskill_tomato.robot.iiwa14 import IIWA14

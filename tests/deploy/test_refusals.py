@@ -16,7 +16,8 @@ from maniskill_tomato.deploy.motion_bounds import straight_line
 from maniskill_tomato.deploy.move_choice import MoveChooser, MoveRequest
 from maniskill_tomato.deploy.plant_points import sphere_distances
 from maniskill_tomato.deploy.refusals import Reason
-from maniskill_tomato.deploy.safety import Safety, SafetyConfig
+from maniskill_tomato.deploy.safety import Safety
+from maniskill_tomato.deploy.safety_config import SafetyConfig
 from maniskill_tomato.robot.d435 import T_flange_camera_color_optical
 from maniskill_tomato.robot.iiwa14 import BASE_TO_SHOULDER, JOINT_UPPER, READY_QPOS, WRIST_TO_EE
 from maniskill_tomato.robot.inverse_kinematics import InverseKinematics, Reach

@@ -20,7 +20,8 @@ from maniskill_tomato.deploy.motion_bounds import (
 )
 from maniskill_tomato.deploy.plant_points import sphere_distances, swept_distances
 from maniskill_tomato.deploy.refusals import Refusal
-from maniskill_tomato.deploy.safety import Safety, SafetyConfig
+from maniskill_tomato.deploy.safety import Safety
+from maniskill_tomato.deploy.safety_config import SafetyConfig
 from maniskill_tomato.robot.d435 import T_flange_camera_color_optical
 from maniskill_tomato.robot.iiwa14 import EE_ORIGIN, JOINT_AXES, JOINT_ORIGINS, JOINT_UPPER, READY_QPOS
 

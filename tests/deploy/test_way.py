@@ -13,7 +13,8 @@ from maniskill_tomato.deploy.loop import Loop
 from maniskill_tomato.deploy.plant_points import sphere_distances
 from maniskill_tomato.deploy.profile import parse_profile
 from maniskill_tomato.deploy.run_records import KeptSteps
-from maniskill_tomato.deploy.safety import Safety, SafetyConfig
+from maniskill_tomato.deploy.safety import Safety
+from maniskill_tomato.deploy.safety_config import SafetyConfig
 from maniskill_tomato.deploy.stops import Stops
 from maniskill_tomato.deploy.way import WayPlanner
 from maniskill_tomato.deploy.workcell import make_workcell
