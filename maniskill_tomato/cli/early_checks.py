@@ -70,9 +70,12 @@ def check_policies(flag: str, text: str) -> None:
 
 
 def check_place(flag: str, place: str) -> None:
-    """Accepts FOLDER or FOLDER:SPLIT."""
-    if not Path(place).is_dir():
-        check_folder(flag, Path(place.rpartition(":")[0] or place))
+    """Accepts FOLDER, FOLDER:SPLIT, and a kind of plant in the folder's place."""
+    from maniskill_tomato.plants.kinds import KINDS
+
+    folder = place.rpartition(":")[0] or place
+    if folder not in KINDS and not Path(place).is_dir():
+        check_folder(flag, Path(folder))
 
 
 def check_segmenter(flag: str, text: str) -> None:

@@ -1,7 +1,7 @@
-"""Episodes on plants from mesh files: hidden starts are drawn until the lattice oracle solves as many as wanted."""
+"""Episodes on other plants: hidden starts are drawn until the lattice oracle solves as many as wanted."""
 
 import logging
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -12,6 +12,7 @@ import torch
 from maniskill_tomato.errors import InvalidInputError
 from maniskill_tomato.experiments.result_store import ResultStore
 from maniskill_tomato.plants.episode_list import Episode, write_episodes
+from maniskill_tomato.plants.kinds import KINDS
 from maniskill_tomato.plants.mesh_set import ALL, MeshSource
 from maniskill_tomato.plants.seed_splits import SEED_SPLITS
 from maniskill_tomato.policies.lattice_oracle import LatticeOracle
@@ -29,11 +30,48 @@ GIVE_UP_AFTER: Final = 12
 FIRST_SEED: Final = 7_000_000
 """Of the first draw on the first plant."""
 
+EPISODES_A_PLANT: Final = 2
+"""Of a kind that our generator grows, of which there is no end of plants."""
+
 SEEDS_A_PLANT: Final = 10_000
 """The draws on each plant begin this far from those on the plant before."""
 
 STORED: Final = "certified"
 """Where a benchmark's folder keeps the draws."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class PlantPlace:
+    """Where plants come from: mesh files, or a kind that our generator grows."""
+
+    text: str
+    """As the user named it."""
+    split: str
+    """Which of them."""
+    mesh: MeshSource | None = None
+    kind: str | None = None
+    """One of `KINDS`, where there is no mesh."""
+
+    @property
+    def plant(self) -> dict[str, Any]:
+        """The option `plant` with which a list of episodes there is replayed."""
+        if self.mesh is None:
+            return {"preset": self.kind, "seed": self.split}
+        return {"mesh": self.mesh.path, "seed": ALL}
+
+    @property
+    def mesh_seeds(self) -> list[int]:
+        """Of the plants of the split; none for a kind, of which there is no end."""
+        return [] if self.mesh is None else self.mesh.plants.seeds(self.split)
+
+    @property
+    def fingerprint(self) -> str:
+        """Says whether stored draws are of the same plants."""
+        return str(self.kind) if self.mesh is None else self.mesh.plants.fingerprint
+
+    def name_of(self, seed: int) -> str:
+        """What a plant is called."""
+        return f"{self.kind} {seed}" if self.mesh is None else self.mesh.plants.files[seed].name
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -48,7 +86,7 @@ class PlantDraws:
 
 @dataclass(frozen=True, kw_only=True)
 class CertifiedList:
-    """A list of episodes on plants from mesh files."""
+    """A list of episodes on the plants of a place."""
 
     path: Path
     """The list's file."""
@@ -115,11 +153,16 @@ def draw_on_plant(plant: Mapping[str, object], count: int, seed: int) -> PlantDr
     return PlantDraws(episodes=tuple(episodes), unsolved=unsolved)
 
 
-def certified_list(place: str, count: int, store: ResultStore, folder: Path, processes: int) -> CertifiedList:
-    """Episodes on the plants of a folder that the lattice oracle solves, spread evenly, in turn of the plants.
+def certified_list(
+    place: PlantPlace, count: int, store: ResultStore, folder: Path, processes: int
+) -> CertifiedList:
+    """Episodes on plants of a place that the lattice oracle solves.
+
+    Those on a folder's plants are spread evenly over them, in turn of the plants. Of a kind of ours grow as many plants
+    as it takes, with up to `EPISODES_A_PLANT` episodes on each, one plant after the other.
 
     Args:
-        place: FOLDER or FOLDER:SPLIT.
+        place: Where the plants come from.
         count: How many episodes.
         store: Keeps the draws, so that what was stopped goes on.
         folder: Where the list's file goes.
@@ -128,55 +171,72 @@ def certified_list(place: str, count: int, store: ResultStore, folder: Path, pro
     Raises:
         InvalidInputError: There are no plants, or the oracle solves fewer episodes on them.
     """
-    source, split = parse_place(place)
-    plants = source.plants
-    seeds = plants.seeds(split)
-    plant: dict[str, Any] = {"mesh": source.path, "seed": ALL}
-    wanted = -(-count // len(seeds))
+    kind = place.kind is not None
+    seeds = list(range(*SEED_SPLITS[place.split])[:count]) if kind else place.mesh_seeds
+    wanted = EPISODES_A_PLANT if kind else -(-count // len(seeds))
     stored = {seed: _read(result, wanted) for seed, result in store.read(STORED, "plants").items()}
     found = {seed: draws for seed, draws in stored.items() if draws is not None}
-    missing = [seed for seed in seeds if seed not in found]
-    work = partial(draw_on_plant, plant, wanted)
-    for seed, draws in run_jobs(work, missing, processes):
-        found[seed] = draws
-        result = {
-            "wanted": wanted,
-            "unsolved": draws.unsolved,
-            "episodes": [asdict(e) for e in draws.episodes],
-        }
-        store.add(STORED, "plants", {seed: result})
-        logger.info("%s: %d of %d episodes", plants.files[seed].name, len(draws.episodes), wanted)
-    drawn = [found[seed] for seed in seeds]
-    turns = [d.episodes[k] for k in range(wanted) for d in drawn if k < len(d.episodes)][:count]
+    work = partial(draw_on_plant, place.plant, wanted)
+
+    def draw(some: Sequence[int]) -> int:
+        for seed, draws in run_jobs(work, [seed for seed in some if seed not in found], processes):
+            found[seed] = draws
+            result = {
+                "wanted": wanted,
+                "unsolved": draws.unsolved,
+                "episodes": [asdict(e) for e in draws.episodes],
+            }
+            store.add(STORED, "plants", {seed: result})
+            logger.info("%s: %d of %d episodes", place.name_of(seed), len(draws.episodes), wanted)
+        return sum(len(found[seed].episodes) for seed in some)
+
+    used = [] if kind else seeds
+    total = draw(used)
+    while total < count and len(used) < len(seeds):
+        used = seeds[: len(used) + -(-(count - total) // wanted)]
+        total = draw(used)
+    drawn = [found[seed] for seed in used]
+    in_turn = [d.episodes[k] for k in range(wanted) for d in drawn if k < len(d.episodes)]
+    turns = ([e for d in drawn for e in d.episodes] if kind else in_turn)[:count]
+    barren = sum(not draws.episodes for draws in drawn)
     if len(turns) < count:
-        barren = sum(not draws.episodes for draws in drawn)
         raise InvalidInputError(
-            f"the lattice oracle solves only {len(turns)} episodes on the {len(seeds)} plants of {place}, --episodes "
-            f"asks for {count}; on {barren} plants it solves none of {GIVE_UP_AFTER} draws: are their ripe fruits in "
-            "the arm's reach, and hidden from somewhere?"
+            f"the lattice oracle solves only {len(turns)} episodes on the {len(used)} plants of {place.text}, "
+            f"--episodes asks for {count}; on {barren} plants it solves none of {GIVE_UP_AFTER} draws: are their ripe "
+            "fruits in the arm's reach, and hidden from somewhere?"
         )
     path = folder / f"episodes_{count}.json"
     write_episodes(path, turns)
     facts = {
-        "plants": f"{sum(bool(d.episodes) for d in drawn)} of {len(seeds)} ({split})",
+        "plants": f"{len(used) - barren} of {len(used)} ({place.split})",
         "oracle": LatticeOracle.name,
         "hidden starts that it does not solve": sum(d.unsolved for d in drawn),
     }
-    return CertifiedList(path=path, plant=plant, facts=facts)
+    return CertifiedList(path=path, plant=place.plant, facts=facts)
 
 
-def parse_place(place: str) -> tuple[MeshSource, str]:
-    """The plants of FOLDER or FOLDER:SPLIT and the split, which is `held_out` unless it is said.
+def parse_place(text: str) -> PlantPlace:
+    """Reads FOLDER, KIND, or either with a split as FOLDER:SPLIT; the split is `held_out` unless it is said.
 
     Raises:
-        InvalidInputError: There is no such folder or split.
+        InvalidInputError: There is no such folder, kind or split, or the folder has no plants of that split.
     """
-    folder, colon, split = place.rpartition(":")
-    if not colon or Path(place).exists():
-        folder, split = place, "held_out"
-    elif split not in (*SEED_SPLITS, ALL):
-        raise InvalidInputError.choice("the split of --plants FOLDER:SPLIT", split, (*SEED_SPLITS, ALL))
-    return MeshSource.parse(str(Path(folder).resolve())), split
+    first, colon, split = text.rpartition(":")
+    if not colon or Path(text).exists():
+        first, split = text, "held_out"
+    splits = SEED_SPLITS if first in KINDS else (*SEED_SPLITS, ALL)
+    if split not in splits:
+        raise InvalidInputError.choice("the split of --plants FOLDER:SPLIT", split, splits)
+    if first in KINDS:
+        return PlantPlace(text=text, split=split, kind=first)
+    if not Path(first).exists():
+        raise InvalidInputError(
+            f"there is no mesh file and no folder {first}; --plants takes one of them, or a kind of ours: "
+            f"{', '.join(KINDS)}"
+        )
+    mesh = MeshSource.parse(str(Path(first).resolve()))
+    mesh.plants.seeds(split)
+    return PlantPlace(text=text, split=split, mesh=mesh)
 
 
 def _read(result: Mapping[str, Any], wanted: int) -> PlantDraws | None:

@@ -67,9 +67,9 @@ class BenchmarkConfig:
     episode_list: str = "held_out"
     """Which fixed list: held_out to report, validation to choose, or a file of `tools/certify_episodes.py`."""
     plants: str | None = None
-    """Run on plants from mesh files instead: a folder of them, its held-out ones, or FOLDER:SPLIT with train,
-    validation, held_out or all. Hidden starts are drawn on each plant, and those that the lattice oracle solves
-    are the episodes."""
+    """Run on other plants instead: a folder of mesh files, or varied or other_kind, plants of many kinds from our
+    generator. The held-out ones, or FOLDER:SPLIT with train, validation, held_out or all. Hidden starts are drawn on
+    each plant, and those that the lattice oracle solves are the episodes."""
     seed: int = 0
     """The first of them."""
     out: Path = Path("runs/benchmark")

@@ -9,14 +9,13 @@ from typing import Any
 import maniskill_tomato
 from maniskill_tomato.errors import InvalidInputError
 from maniskill_tomato.experiments.benchmark_report import BenchmarkFigures, summarise_runs, write_benchmark
-from maniskill_tomato.experiments.certified_episodes import certified_list, parse_place
+from maniskill_tomato.experiments.certified_episodes import PlantPlace, certified_list, parse_place
 from maniskill_tomato.experiments.configs import BenchmarkConfig
 from maniskill_tomato.experiments.policy_runs import Condition, PolicySpec, parse_policies, run_policies
 from maniskill_tomato.experiments.result_store import ResultStore
 from maniskill_tomato.experiments.view_grid import draw_view_grid
 from maniskill_tomato.folder_lock import only_writer
 from maniskill_tomato.plants.episode_list import EPISODE_LISTS, load_episodes
-from maniskill_tomato.plants.mesh_set import MeshSource
 from maniskill_tomato.policies.registry import PRIVILEGED
 from maniskill_tomato.rendering import vulkan_probe
 from maniskill_tomato.tasks.row.row_config import GeneralTaskConfig
@@ -80,9 +79,9 @@ def _run_benchmark(config: BenchmarkConfig) -> BenchmarkResult:
         _check_counts(config, main, bool(swept))
         store = _open_store(config, specs)
     else:
-        source, split = _checked_plants(config, config.plants)
-        store = _open_store(config, specs, plants=[source.plants.fingerprint, split])
-        main, facts = _on_plants(config, config.plants, store, processes)
+        place = _checked_plants(config, config.plants)
+        store = _open_store(config, specs, plants=[place.fingerprint, place.split])
+        main, facts = _on_plants(config, place, store, processes)
         swept = []
     numbers = range(config.seed, config.seed + config.episodes)
     few = range(config.seed, config.seed + config.sweep_episodes)
@@ -125,8 +124,8 @@ def _open_store(config: BenchmarkConfig, specs: Sequence[PolicySpec], **settings
     return ResultStore(config.out, {**common, **settings}, members)
 
 
-def _checked_plants(config: BenchmarkConfig, place: str) -> tuple[MeshSource, str]:
-    """The plants of `--plants` and their split, if nothing else contradicts them.
+def _checked_plants(config: BenchmarkConfig, text: str) -> PlantPlace:
+    """The plants of `--plants`, if nothing else contradicts them.
 
     Raises:
         InvalidInputError: There are none, or an option is for our own plants.
@@ -137,15 +136,13 @@ def _checked_plants(config: BenchmarkConfig, place: str) -> tuple[MeshSource, st
         raise InvalidInputError(
             f"--episodes must be 1 or more and --seed 0 or more; got {config.episodes} and {config.seed}"
         )
-    source, split = parse_place(place)
-    source.plants.seeds(split)
-    return source, split
+    return parse_place(text)
 
 
 def _on_plants(
-    config: BenchmarkConfig, place: str, store: ResultStore, processes: int
+    config: BenchmarkConfig, place: PlantPlace, store: ResultStore, processes: int
 ) -> tuple[Condition, dict[str, Any]]:
-    """The condition of plants from mesh files, with facts about its episodes."""
+    """The condition of other plants, with facts about its episodes."""
     listed = certified_list(place, config.seed + config.episodes, store, config.out, processes)
     condition = Condition(
         name="plants",

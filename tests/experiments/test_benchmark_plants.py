@@ -1,4 +1,4 @@
-"""`benchmark --plants`: hidden starts on plants from mesh files, certified by the oracle, and policies on them."""
+"""`benchmark --plants`: hidden starts on other plants, certified by the oracle, and policies on them."""
 
 import json
 from pathlib import Path
@@ -14,6 +14,7 @@ from maniskill_tomato.experiments.configs import BenchmarkConfig
 from maniskill_tomato.experiments.result_store import ResultStore
 from maniskill_tomato.experiments.viewpoint_benchmark import run_benchmark
 from maniskill_tomato.plants.episode_list import read_episodes
+from maniskill_tomato.tasks.making import make_world
 
 
 def write_plant(path: Path, fruit: tuple[float, float, float]) -> None:
@@ -62,12 +63,31 @@ def test_policies_run_on_hidden_starts_that_the_oracle_solves(tmp_path: Path) ->
 def test_a_longer_list_begins_with_the_shorter_one_and_draws_are_kept(tmp_path: Path) -> None:
     write_plant(tmp_path / "set" / "held_out" / "a.npz", (-0.1, 0.0, 0.8))
     store = ResultStore(tmp_path / "out", {})
-    lists = [certified_list(str(tmp_path / "set"), count, store, tmp_path / "out", 1) for count in (1, 2, 1)]
+    lists = [
+        certified_list(parse_place(str(tmp_path / "set")), count, store, tmp_path / "out", 1)
+        for count in (1, 2, 1)
+    ]
     one, two, again = (read_episodes(listed.path) for listed in lists)
     assert one == again == two[:1] and len(two) == 2
     assert two[0].camera_position != two[1].camera_position
     lines = (tmp_path / "out" / "results" / "certified" / "plants.jsonl").read_text().splitlines()
     assert len(lines) == 2  # Drawn for one episode, again for two; then nothing was missing.
+
+
+def test_plants_of_other_kinds_of_ours_grow_until_there_are_enough_episodes(tmp_path: Path) -> None:
+    place = parse_place("other_kind:validation")
+    store = ResultStore(tmp_path / "out", {})
+    lists = [certified_list(place, count, store, tmp_path / "out", 1) for count in (2, 3)]
+    two, three = (read_episodes(listed.path) for listed in lists)
+    assert two == three[:2] and len(three) == 3 and lists[0].plant["preset"] == "other_kind"
+    seeds = [e.plant_seed for e in three]
+    # One plant after the other, with two episodes at most on each, of the validation split.
+    assert seeds == sorted(seeds) and 1_000_000 <= seeds[0] and max(map(seeds.count, seeds)) <= 2
+    world = make_world("TomatoViewpoint-v1", episodes=str(lists[1].path), plant=lists[1].plant)
+    for number, episode in enumerate(three):
+        world.reset(options={"episode": number})
+        assert float(world.state.visible_fraction[0]) == pytest.approx(episode.start_visibility, abs=1e-4)
+        assert world.state.visible_fraction[0] < 0.3
 
 
 def test_plants_out_of_reach_are_told(tmp_path: Path) -> None:
@@ -81,11 +101,15 @@ def test_plants_out_of_reach_are_told(tmp_path: Path) -> None:
 
 def test_which_plants_are_meant_is_checked_before_anything_runs(tmp_path: Path) -> None:
     write_plant(tmp_path / "set" / "train" / "a.npz", (-0.1, 0.0, 0.8))
-    assert parse_place(f"{tmp_path / 'set'}:all")[1] == "all"
+    assert parse_place(f"{tmp_path / 'set'}:all").split == "all"
     for change, message in (
         ({"plants": str(tmp_path / "set")}, "no plants of the split 'held_out'"),
         ({"plants": f"{tmp_path / 'set'}:test"}, "split of --plants FOLDER:SPLIT must be one of"),
-        ({"plants": str(tmp_path / "none")}, "there is no mesh file and no folder"),
+        ({"plants": str(tmp_path / "none")}, "no folder .*none; .*a kind of ours: varied, other_kind"),
+        (
+            {"plants": "other_kind:all"},
+            "split of --plants FOLDER:SPLIT must be one of 'train', 'validation', 'held_out'",
+        ),
         ({"plants": f"{tmp_path / 'set'}:train", "sweeps": "all"}, "leave out --sweeps"),
         ({"plants": f"{tmp_path / 'set'}:train", "episodes": 0}, "--episodes must be 1 or more"),
     ):
