@@ -22,7 +22,7 @@ EnvId = Annotated[
 class PlantOptions:
     """Another plant than the task's own."""
 
-    plant: Literal["one_tomato", "three_tomatoes", "full"] | None = None
+    plant: Literal["one_tomato", "three_tomatoes", "full", "varied", "other_kind"] | None = None
     """Preset of the plant."""
     plant_seed: str | None = None
     """Its seed, or train, validation or held_out for a new plant of that split in every episode."""

@@ -21,6 +21,7 @@ from maniskill_tomato.files import write_tensors
 from maniskill_tomato.learning.rl.agent import make_agent
 from maniskill_tomato.learning.rl.checkpoint import make_checkpoint
 from maniskill_tomato.learning.rl.presets import get_preset
+from maniskill_tomato.plants.kinds import PLANT_NAMES
 from maniskill_tomato.policies.trained_actor import load_actor, load_checkpoint
 from maniskill_tomato.tasks import THESIS_IDS
 
@@ -153,6 +154,13 @@ def test_another_plant_can_be_asked_for() -> None:
     assert command.plants.env_options() == options
     assert PlantOptions(plant_seed="7").env_options() == {"plant": {"seed": 7}}
     assert PlantOptions().env_options() == {}
+
+
+@pytest.mark.parametrize("preset", PLANT_NAMES)
+def test_every_preset_of_plants_can_be_trained_on(preset: str) -> None:
+    command = parse(["train", "TomatoViewpoint-v1", "--plant", preset])
+    assert isinstance(command, Train)
+    assert command.plants.env_options() == {"plant": {"preset": preset}}
 
 
 def test_evaluation_writes_metrics_that_follow_from_its_trajectories(
