@@ -95,7 +95,7 @@ class OneFruit:
         self._perception, self._config = perception, config
         self._is_chosen = target_position is None
         self._shown: int | None = None
-        self._lost_in_a_row = 0
+        self._lost_in_a_row = self._refused = 0
         self._is_first = True
         perception.begin(target_position)
 
@@ -104,11 +104,13 @@ class OneFruit:
         view = self._perception.look(frame, T_world_camera)
         self._lost_in_a_row = 0 if view.target_seen else self._lost_in_a_row + 1
         is_first, self._is_first = self._is_first, False
+        if view.is_new_target:
+            self._refused = 0
         return Look(
             view=view,
             moves_left=self.max_moves - moves,
             end=self._end(view, moves),
-            is_new_target=is_first,
+            is_new_target=is_first or view.is_new_target,
             true_fraction=self._true_fraction(frame, view),
         )
 
@@ -116,10 +118,13 @@ class OneFruit:
         """Nothing: the way has an end from which the target is looked at."""
 
     def refused(self, in_a_row: int, why: str) -> End | None:
-        """Too many in a row end the run."""
-        if in_a_row < self._config.refused_after:
+        """Too many in a row at one target end the run."""
+        self._refused = min(self._refused + 1, in_a_row)
+        if self._refused < self._config.refused_after:
             return None
-        return End(reason="refused", detail=f"{in_a_row} moves in a row were refused, the last one: {why}")
+        return End(
+            reason="refused", detail=f"{self._refused} moves in a row were refused, the last one: {why}"
+        )
 
     def _end(self, view: Sighting, moves: int) -> End | None:
         config, fraction = self._config, f"V_f = {view.visible_fraction:.2f}"
@@ -146,6 +151,8 @@ class OneFruit:
             return None
         if not self._is_chosen:
             return truth.visible_fraction
+        if view.is_new_target:
+            self._shown = None
         shown = truth.shown_label(view.mask)
         self._shown = self._shown if shown is None else shown
         return None if self._shown is None else truth.fraction(self._shown)

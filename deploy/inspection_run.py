@@ -30,6 +30,7 @@ from maniskill_tomato.deploy.workcell import Workcell
 from maniskill_tomato.errors import InvalidInputError
 from maniskill_tomato.folder_lock import only_writer
 from maniskill_tomato.sensing.inspection import InspectedFruit
+from maniskill_tomato.sensing.inspection_judge import JudgedFruit
 
 PICTURES: Final = "fruits"
 """Folder of the fruits' pictures."""
@@ -44,6 +45,8 @@ class InspectionResult:
     """The list, as in `inspection.json`."""
     totals: dict[str, Any]
     """What the twin makes of it; empty on hardware."""
+    judged: tuple[JudgedFruit, ...]
+    """The fruits of the list beside the twin's truth; empty on hardware."""
 
 
 def inspect_row(
@@ -92,12 +95,14 @@ def _report(
     fruits = goal.fruits()
     entries = [_entry(fruit) for fruit in fruits]
     totals: dict[str, Any] = {}
+    judged: list[JudgedFruit] = []
     world = prepared.workcell.twin()
     if world is not None:
-        from maniskill_tomato.deploy.mock.twin_judge import judge
+        from maniskill_tomato.deploy.mock.twin_judge import judge, true_facts
 
-        truth, totals = judge(world, fruits, goal.view_joints, config.profile.loop.threshold)
-        entries = [{**entry, **true} for entry, true in zip(entries, truth, strict=True)]
+        judged, totals = judge(world, fruits, goal.view_joints, config.profile.loop.threshold)
+        plant = world.episode.plant
+        entries = [{**entry, **true_facts(true, plant)} for entry, true in zip(entries, judged, strict=True)]
 
     def write() -> None:
         content = {**result_facts(result), **facts, **totals, "fruits": entries, "steps": steps.steps}
@@ -120,7 +125,7 @@ def _report(
         write_files(config.out, {html.name: write_page(html, content, entries, config.out / "report.png")})
 
     result = kept_result(result, write)
-    return InspectionResult(run=result, fruits=tuple(entries), totals=totals)
+    return InspectionResult(run=result, fruits=tuple(entries), totals=totals, judged=tuple(judged))
 
 
 def whole_row(workcell: Workcell, row_moves: int) -> WholeRow:

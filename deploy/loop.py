@@ -348,6 +348,7 @@ class Loop:
         with self._times.timed("plant points"):
             self._points.add(frame, T_world_camera, joints)
         if look.is_new_target:
+            self._no_way_from = None
             for one in {id(p): p for p in (self._policy, self._planner)}.values():
                 one.begin(self._belief, torch.zeros(1, dtype=torch.int64))
         self._fractions.append(view.visible_fraction)

@@ -2,7 +2,7 @@
 
 import importlib
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Final, Literal, Protocol
 
 import numpy as np
@@ -25,6 +25,7 @@ from maniskill_tomato.sensing.belief import Belief
 from maniskill_tomato.sensing.camera_perception import CameraPerception
 from maniskill_tomato.sensing.fruit_detector import FruitDetector
 from maniskill_tomato.sensing.fruit_map import FruitMap
+from maniskill_tomato.sensing.inspection import STALE_AFTER
 from maniskill_tomato.sensing.measurement import RIPE_CATEGORIES
 from maniskill_tomato.sensing.observation import ObservationLayout, ViewpointObserver
 from maniskill_tomato.sensing.posed_frame import PosedFrame
@@ -66,6 +67,8 @@ class Sighting:
     """Makes a memory of earlier views anew, if the target turned out to stand elsewhere."""
     has_target: bool = True
     """Whether there is a target; without one the robot looks for one about `target_position`."""
+    is_new_target: bool = False
+    """Whether the robot has just chosen it."""
 
     @property
     def target_seen(self) -> bool:
@@ -124,11 +127,19 @@ class ImagePerception:
         """Forgets all views; without a position the largest sure ripe fruit of a picture becomes the target, of those
         that it does not show fully if there are any.
 
-        It is the first picture that shows one. When a target turns out not to be there, another one is chosen.
+        It is the first picture that shows one. When a target turns out not to be there, or views have long shown no
+        more of it, another one is chosen, as with `target="any"` in the simulated task.
         """
-        self._perception = CameraPerception(1, self._detector)
-        self._perception.begin(0, target_position, place_error=PLACE_ERROR)
         self._chooses = target_position is None
+        self._perception = CameraPerception(1, self._detector)
+        self._perception.begin(
+            0,
+            target_position,
+            place_error=PLACE_ERROR,
+            chooses=self._chooses,
+            patience=STALE_AFTER,
+            threshold=FULL_VISIBILITY,
+        )
 
     def begin_row(self) -> CameraPerception:
         """Forgets all views and has no target; returns what the row's fruits are mapped with."""
@@ -151,13 +162,13 @@ class ImagePerception:
 
     def look(self, frame: Frame, T_world_camera: Float64) -> Sighting:
         """The sighting by masks and depth; see `Perception`."""
-        perception = self._perception
+        perception, before = self._perception, self._perception.target(0)
         moved = self.take(frame, T_world_camera)
         if self._chooses and perception.target(0) is None:
-            moved |= perception.choose(0, FULL_VISIBILITY)
-            if perception.target(0) is None:
-                moved |= perception.choose(0, 1.0)
-        return self.sighting(moved)
+            moved |= perception.choose(0, 1.0)
+        target, known = perception.target(0), None if before is None else self.map.current(before.number)
+        is_new = self._chooses and target is not None and target.number != known
+        return replace(self.sighting(moved), is_new_target=is_new)
 
     def take(self, frame: Frame, T_world_camera: Float64) -> bool:
         """Takes a picture into the map; whether the target turned out to stand elsewhere.

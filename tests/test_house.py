@@ -54,6 +54,7 @@ ALLOWED: dict[str, frozenset[str]] = {
 EXCEPTIONS = {
     ("deploy.sim2real", "tasks"): "ManiSkill's Sim2RealEnv compares the robot with the task's controllers",
     ("experiments.twin_comparison", "deploy"): "it runs the twin of deploy beside the simulated task",
+    ("experiments.twin_inspection", "deploy"): "it inspects rows with the twin of deploy",
 }
 """Single modules that may import one room more, with the reason."""
 

@@ -16,7 +16,7 @@ from maniskill_tomato.sensing.view_lattice import ViewLattice
 
 def judge(
     world: TwinWorld, fruits: Sequence[InspectedFruit], view_joints: Sequence[Float64], threshold: float
-) -> tuple[list[dict[str, Any]], dict[str, Any]]:
+) -> tuple[list[JudgedFruit], dict[str, Any]]:
     """Compares a list with the truth.
 
     Args:
@@ -26,9 +26,8 @@ def judge(
         threshold: V_f above which a fruit is fully visible.
 
     Returns:
-        For each fruit `true_fruit` (its index in `Plant.fruits`, None for no fruit), `true_ripeness`,
-        `true_visible_fraction` in the view that showed most of it and `true_position_error_m`. And for the whole list
-        recall of the ripe fruits in reach, precision, and the median error of the places, as `ListScore` has them.
+        Each fruit beside the truth, and for the whole list recall of the ripe fruits in reach, precision, and the
+        median error of the places, as `ListScore` has them.
     """
     plant = world.episode.plant
     T_world_plant = world.episode.T_world_plant.double().numpy()
@@ -53,10 +52,13 @@ def judge(
         "true_precision": None if precision is None else round(precision, 4),
         "true_position_error_median_m": None if error is None else round(error, 5),
     }
-    return [_entry(fruit, plant) for fruit in judged], totals
+    return judged, totals
 
 
-def _entry(fruit: JudgedFruit, plant: Plant) -> dict[str, Any]:
+def true_facts(fruit: JudgedFruit, plant: Plant) -> dict[str, Any]:
+    """What `inspection.json` tells of the truth about a fruit: `true_fruit` (its index in `Plant.fruits`, None for no
+    fruit), `true_ripeness`, `true_visible_fraction` in the view that showed most of it and `true_position_error_m`.
+    """
     is_any = fruit.fruit != NO_FRUIT
     return {
         "true_fruit": fruit.fruit if is_any else None,

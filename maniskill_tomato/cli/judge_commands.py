@@ -141,10 +141,11 @@ class JudgePerception(PerceptionComparisonConfig):
 
 @dataclass(frozen=True, kw_only=True)
 class JudgeTwin(TwinConfig):
-    """Run the twin of `deploy` and the simulated task on the same held-out episodes with the same policy.
+    """Run the twin of `deploy` on many episodes, and judge it by ray casting.
 
-    The difference of the two rates is what perception, depth noise, dynamics and the safety checks cost. An episode
-    whose run cannot begin, or ends with a fault, counts as failed.
+    The simulated task runs the same episodes with the same policy. The difference of the two rates is what perception,
+    depth noise, dynamics and the safety checks cost. An episode whose run cannot begin, or ends with a fault, counts as
+    failed.
     """
 
     def run(self) -> None:
@@ -154,5 +155,7 @@ class JudgeTwin(TwinConfig):
             check_policy("--policy", self.policy, on_robot=True)
 
         from maniskill_tomato.experiments.twin_comparison import compare_twin
+        from maniskill_tomato.experiments.twin_inspection import inspect_twin
 
-        print(json.dumps(compare_twin(self, say), indent=1))
+        measure = inspect_twin if self.inspect else compare_twin
+        print(json.dumps(measure(self, say), indent=1))

@@ -7,7 +7,7 @@ import numpy as np
 
 from maniskill_tomato.experiments.episode_record import EpisodeRecord
 from maniskill_tomato.experiments.statistics import wilson_interval
-from maniskill_tomato.sensing.inspection_judge import JudgedFruit, score_lists
+from maniskill_tomato.sensing.inspection_judge import JudgedFruit, ListScore, score_lists
 
 Cause = Literal["never_detected", "wrong_fruit", "overestimated", "underestimated", "place", "moves_ran_out"]
 """Why an episode through a camera failed.
@@ -75,14 +75,21 @@ def summarise_inspections(
         threshold,
     )
     return {
+        **list_figures(score),
+        "mean_moves": sum(row.moves for row in rows) / len(rows),
+        "mean_camera_path_m": sum(row.path_m for row in rows) / len(rows),
+        "finished_share": sum(e.success for e in episodes) / len(episodes),
+    }
+
+
+def list_figures(score: ListScore) -> dict[str, float | None]:
+    """Recall, precisions and the medians of the errors, by their names in `ListScore`."""
+    return {
         "recall": score.recall,
         "precision": score.precision,
         "full_precision": score.full_precision,
         "position_error_median_m": score.position_error_median_m,
         "radius_error_median_m": score.radius_error_median_m,
-        "mean_moves": sum(row.moves for row in rows) / len(rows),
-        "mean_camera_path_m": sum(row.path_m for row in rows) / len(rows),
-        "finished_share": sum(e.success for e in episodes) / len(episodes),
     }
 
 

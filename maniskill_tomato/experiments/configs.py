@@ -154,18 +154,21 @@ class PerceptionComparisonConfig:
 
 @dataclass(frozen=True, kw_only=True)
 class TwinConfig:
-    """Run the twin of `deploy` and the simulated task on the same held-out episodes with the same policy.
+    """Run the twin of `deploy` and the simulated task on the same episodes with the same policy.
 
     The difference of the two rates is what perception, depth noise, dynamics and the safety checks cost. An episode
     whose run cannot begin, or ends with a fault, counts as failed.
     """
 
     profile: str = "mock"
-    """The twin's: name or TOML file."""
+    """The twin's: name or TOML file. Its `twin.episodes` says from which list the episodes are."""
     policy: str | None = None
     """As for `deploy run`; by default the one that ships."""
+    inspect: bool = False
+    """Inspect the whole row of every episode, as `deploy inspect` does, and judge the lists by the truth, as those of
+    `benchmark-rows --perception` are."""
     episodes: int = 100
-    """How many episodes of the held-out list."""
+    """How many episodes of the list."""
     seed: int = 0
     """The first of them."""
     record: bool = False

@@ -1,4 +1,4 @@
-"""The twin of `deploy` and the simulated task on the same held-out episodes with the same policy."""
+"""The twin of `deploy` and the simulated task on the same episodes with the same policy."""
 
 import json
 import time
@@ -6,10 +6,13 @@ from collections import Counter
 from collections.abc import Callable, Sequence
 from typing import Any
 
+import gymnasium as gym
 import numpy as np
 
 import maniskill_tomato
 from maniskill_tomato.deploy.decision import TASK, default_policy
+from maniskill_tomato.deploy.deploy_errors import ProfileError
+from maniskill_tomato.deploy.mock.twin_world import TwinOptions, twin_options
 from maniskill_tomato.deploy.policy_run import RunConfig, run
 from maniskill_tomato.deploy.profile import Profile, load_profile
 from maniskill_tomato.errors import TomatoError
@@ -17,10 +20,10 @@ from maniskill_tomato.experiments.configs import TwinConfig
 from maniskill_tomato.experiments.result_store import ResultStore
 from maniskill_tomato.experiments.rollout import run_episode
 from maniskill_tomato.experiments.statistics import mcnemar_p, wilson_interval
-from maniskill_tomato.experiments.viewpoint_benchmark import MAIN
 from maniskill_tomato.files import write_json
 from maniskill_tomato.folder_lock import only_writer
 from maniskill_tomato.learning.rl.envs import make_env
+from maniskill_tomato.plants.mesh_set import ALL
 from maniskill_tomato.policies.opening import open_policy
 
 
@@ -43,17 +46,12 @@ def compare_twin(config: TwinConfig, report: Callable[[str], None] = lambda line
 
 def _compare(config: TwinConfig, report: Callable[[str], None]) -> dict[str, Any]:
     profile = load_profile(config.profile)
-    settings = {
-        "profile": config.profile,
-        "policy": config.policy or default_policy(),
-        "package_version": maniskill_tomato.__version__,
-    }
-    store = ResultStore(config.out, settings)
+    store, episodes = twin_store(config, profile)
     numbers = range(config.seed, config.seed + config.episodes)
-    missing = store.missing(MAIN, "twin", numbers)
+    missing = store.missing(episodes, "twin", numbers)
     if missing:
         policy = open_policy(config.policy or default_policy(), env_id=TASK)
-        env = make_env(TASK, episodes=MAIN)
+        env = simulated_task(profile)
         try:
             for number in missing:
                 record = run_episode(env, policy, number)
@@ -65,16 +63,54 @@ def _compare(config: TwinConfig, report: Callable[[str], None]) -> dict[str, Any
                     "visible_fraction": round(float(record.visible_fraction[-1]), 4),
                 }
                 result = {"episode": number, "twin": twin, "simulation": simulation}
-                store.add(MAIN, "twin", {number: result})
+                store.add(episodes, "twin", {number: result})
                 report(
                     f"{number:3d}  twin {twin['reason']:12} {twin.get('moves', 0):2d} moves   "
                     f"simulation {'success' if record.success else 'failure'} {record.steps:2d} moves"
                 )
         finally:
             env.close()
-    summary = summarise_twin(list(store.read(MAIN, "twin").values()))
+    found = store.read(episodes, "twin")
+    summary = summarise_twin([found[number] for number in numbers])
     write_json(config.out / "summary.json", summary)
     return summary
+
+
+def twin_store(config: TwinConfig, profile: Profile) -> tuple[ResultStore, str]:
+    """Where the results are kept, and the list that the episodes are from.
+
+    Raises:
+        InvalidInputError: The folder holds results of another profile or policy.
+        ProfileError: The profile is not of a twin.
+    """
+    settings = {
+        "profile": profile.text,
+        "policy": config.policy or default_policy(),
+        "package_version": maniskill_tomato.__version__,
+    }
+    return ResultStore(config.out, settings), _options(profile).episodes
+
+
+def simulated_task(profile: Profile) -> gym.Env[Any, Any]:
+    """The simulated task with the episodes of a twin, without a camera.
+
+    Raises:
+        ProfileError: The profile is not of a twin.
+    """
+    options = _options(profile)
+    plants: dict[str, Any] = {}
+    if options.plants is not None:
+        plants = {"plant": {"mesh": options.plants, "seed": ALL}}
+    return make_env(TASK, episodes=options.episodes, **plants)
+
+
+def _options(profile: Profile) -> TwinOptions:
+    if profile.arm_driver != "mock" or profile.camera_driver != "mock":
+        raise ProfileError(
+            f"the profile {profile.name} is of the arm {profile.arm_driver} and the camera {profile.camera_driver}; "
+            "only where both are mock is there a twin, whose truth is known"
+        )
+    return twin_options(profile.camera_options)
 
 
 def on_the_twin(profile: Profile, config: TwinConfig, episode: int) -> dict[str, Any]:
@@ -95,7 +131,7 @@ def on_the_twin(profile: Profile, config: TwinConfig, episode: int) -> dict[str,
 
 
 def summarise_twin(episodes: Sequence[dict[str, Any]]) -> dict[str, Any]:
-    """Rates, their intervals, what differs, and what a look costs."""
+    """Rates, their intervals, what differs, and what a look costs; None for a mean of nothing."""
     twin = [episode["twin"] for episode in episodes]
     wins = np.array(
         [
@@ -110,30 +146,40 @@ def summarise_twin(episodes: Sequence[dict[str, Any]]) -> dict[str, Any]:
             for stage, taken in step["timing_ms"].items():
                 stages.setdefault(stage, []).append(taken)
     only_twin, only_simulation = int((wins[:, 0] & ~wins[:, 1]).sum()), int((~wins[:, 0] & wins[:, 1]).sum())
+    won, truly = int(wins[:, 0].sum()), sum(bool(one.get("truly_visible")) for one in twin)
+    moves = sum(one["moves"] for one in ran)
     return {
         "episodes": len(episodes),
-        "twin_success": int(wins[:, 0].sum()),
-        "twin_interval_95": wilson_interval(int(wins[:, 0].sum()), len(wins)),
-        "twin_success_and_truly_visible": sum(bool(one.get("truly_visible")) for one in twin),
+        "twin_success": won,
+        "twin_interval_95": wilson_interval(won, len(wins)),
+        "twin_success_and_truly_visible": truly,
+        "truly_visible_share_of_success": truly / won if won else None,
+        "truly_visible_share_interval_95": wilson_interval(truly, won) if won else None,
         "simulation_success": int(wins[:, 1].sum()),
         "simulation_interval_95": wilson_interval(int(wins[:, 1].sum()), len(wins)),
         "only_twin": only_twin,
         "only_simulation": only_simulation,
         "mcnemar_p": mcnemar_p(only_twin, only_simulation),
         "reasons": dict(Counter(one["reason"] for one in twin)),
-        "failed": [e["episode"] for e, won in zip(episodes, wins[:, 0], strict=True) if not won],
-        "simulation_failed": [e["episode"] for e, won in zip(episodes, wins[:, 1], strict=True) if not won],
-        "twin_moves_of_successes": float(np.mean([one["moves"] for one in ran if one["success"]])),
-        "simulation_moves_of_successes": float(
-            np.mean([e["simulation"]["moves"] for e in episodes if e["simulation"]["success"]])
+        "failed": [e["episode"] for e, one in zip(episodes, wins[:, 0], strict=True) if not one],
+        "false_success": [
+            e["episode"] for e in episodes if e["twin"]["success"] and not e["twin"]["truly_visible"]
+        ],
+        "simulation_failed": [e["episode"] for e, one in zip(episodes, wins[:, 1], strict=True) if not one],
+        "twin_moves_of_successes": mean_of([one["moves"] for one in ran if one["success"]]),
+        "simulation_moves_of_successes": mean_of(
+            [e["simulation"]["moves"] for e in episodes if e["simulation"]["success"]]
         ),
-        "refused_share_of_moves": sum(one["refused_moves"] for one in ran) / sum(one["moves"] for one in ran),
-        "simulation_contact_share_of_episodes": float(
-            np.mean([e["simulation"]["contact"] for e in episodes])
-        ),
+        "refused_share_of_moves": sum(one["refused_moves"] for one in ran) / moves if moves else None,
+        "simulation_contact_share_of_episodes": mean_of([e["simulation"]["contact"] for e in episodes]),
         "stage_ms_mean": {stage: round(float(np.mean(taken)), 2) for stage, taken in stages.items()},
         "stage_ms_p95": {stage: round(float(np.percentile(taken, 95)), 2) for stage, taken in stages.items()},
         "looks": sum(len(one["steps"]) for one in ran),
-        "cpu_seconds_a_run": float(np.mean([one["cpu_seconds"] for one in ran])),
-        "device_seconds_median": float(np.median([one["device_seconds"] for one in ran])),
+        "cpu_seconds_a_run": mean_of([one["cpu_seconds"] for one in ran]),
+        "device_seconds_median": float(np.median([one["device_seconds"] for one in ran])) if ran else None,
     }
+
+
+def mean_of(values: Sequence[float]) -> float | None:
+    """None where there is no value."""
+    return float(np.mean(values)) if values else None

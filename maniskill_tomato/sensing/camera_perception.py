@@ -196,8 +196,7 @@ class CameraPerception:
         """
         search = self._searches[env_index]
         if search.views:
-            search.threshold = threshold
-            search.target = self._choice(search, search.views[-1])
+            search.target = self._choice(search, search.views[-1], threshold)
         return self._aim(search)
 
     def look(self, frames: Sequence[PosedFrame | None]) -> Tensor:
@@ -376,13 +375,13 @@ class CameraPerception:
         before, ruled_out = search.target, search.ruled_out
         if before is not None:
             search.ruled_out = ruled_out | {before}
-        chosen = self._choice(search, view)
+        chosen = self._choice(search, view, search.threshold)
         if chosen is None and before is not None:
             search.ruled_out = ruled_out
             return
         search.target, search.stale, search.most = chosen, 0, 0.0
 
-    def _choice(self, search: _Search, view: MappedView) -> int | None:
+    def _choice(self, search: _Search, view: MappedView, threshold: float) -> int | None:
         """The largest ripe, sure fruit of the picture that is not fully visible in it and was not given up."""
         best, pixels = None, 0
         given_up = {search.map.current(number) for number in search.ruled_out}
@@ -391,7 +390,7 @@ class CameraPerception:
             if track is None or not track.is_ripe or fruit.score < SURE_SCORE or not fruit.is_depth_measured:
                 continue
             seen = search.map.fraction(view.measurement, index, number)
-            if seen.value <= search.threshold and fruit.pixels > pixels and number not in given_up:
+            if seen.value <= threshold and fruit.pixels > pixels and number not in given_up:
                 best, pixels = number, fruit.pixels
         return best
 

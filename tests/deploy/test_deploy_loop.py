@@ -29,6 +29,7 @@ from maniskill_tomato.deploy.profile_files import profile_names
 from maniskill_tomato.deploy.robot_perception import TRUE_MASKS, ImagePerception, Sighting
 from maniskill_tomato.deploy.run_records import KeptSteps, Proposal, RunResult
 from maniskill_tomato.deploy.stops import Stops
+from maniskill_tomato.deploy.way import Way, WayPlanner
 from maniskill_tomato.deploy.workcell import Workcell, make_workcell
 from maniskill_tomato.errors import PolicyError
 from maniskill_tomato.policies.opening import open_policy
@@ -369,6 +370,34 @@ def test_without_a_given_target_the_largest_fruit_in_the_picture_is_taken() -> N
     assert np.linalg.norm(centres[chosen] - last.target_position) < 0.015
     truth = workcell.twin().visible_fractions([chosen], last.joint_positions)[0]
     assert result.true_visible_fraction == pytest.approx(truth, abs=1e-6)
+
+
+def test_another_target_gets_refusals_and_ways_of_its_own(monkeypatch: pytest.MonkeyPatch) -> None:
+    asked: list[Any] = []
+
+    def no_way(self: Any, places: Any, target: Any, *others: Any) -> Way:
+        asked.append(target)
+        return Way(pieces=(), place=None, blocked=())
+
+    monkeypatch.setattr(WayPlanner, "to_view", no_way)
+    monkeypatch.setattr(
+        MoveChooser, "choose", lambda *_: Choice(move=None, refusal=None, out_of_reach="too far")
+    )
+    text = TEXT.format(twin="depth_noise = 0.0", loop="refused_after = 8").replace(
+        'source = "twin"', 'source = "seen"'
+    )
+    text = text.replace("max_moves = 6", "max_moves = 12").replace("width = 160", "width = 424")
+    kept = KeptSteps()
+    result, _ = go(
+        parse_profile(text.replace("height = 120", "height = 240"), Path("seen.toml")),
+        seed=5,
+        recorders=[kept],
+    )
+    assert (result.reason, result.moves, result.refused_moves) == ("budget", 12, 12), result.detail
+    targets = np.unique([step.target_position.round(6) for step in kept.steps], axis=0)
+    assert len(targets) == 2 == len(asked), "each is asked for once, for the arm does not move"
+    one = go(parse_profile(text.replace('source = "seen"', 'source = "twin"'), Path("given.toml")), seed=5)[0]
+    assert (one.reason, one.moves) == ("refused", 8)
 
 
 @pytest.mark.parametrize(

@@ -29,6 +29,7 @@ from maniskill_tomato.robot.d435 import (
 from maniskill_tomato.robot.iiwa14 import READY_QPOS, VELOCITY_LIMITS
 from maniskill_tomato.robot.look_at_move import LookAtMover
 from maniskill_tomato.segmentation.instances import Instances
+from maniskill_tomato.sensing.inspection import STALE_AFTER
 
 SIZE = {"width": 424, "height": 240}
 EPISODE = 4
@@ -219,6 +220,32 @@ def test_an_unsure_fruit_is_found_again_but_not_chosen_as_the_target() -> None:
     again = looked(wavering, frame, pose, unsure)
     np.testing.assert_array_equal(again.mask, large)
     assert again.visible_fraction > 0.0
+
+
+def test_a_target_that_was_not_named_is_given_up_for_another_when_no_view_shows_more_of_it() -> None:
+    arm, camera = devices(5, depth_noise=0.0)
+    frame, pose = camera.read(), pose_of(arm)
+    truth = frame.truth
+    hidden = [
+        label
+        for label, fraction in zip(truth.ripe_labels, truth.ripe_fractions, strict=True)
+        if 0.3 < fraction < 0.7
+    ]
+    sizes = {label: int((truth.labels == label).sum()) for label in hidden}
+    large, small = (truth.labels == n for n in sorted(sizes, key=lambda label: -sizes[label])[:2])
+    perception = ImagePerception("given", GivenMasks(large, small, scores=(0.8, 0.8)))
+    perception.begin(None)
+    views = [perception.look(frame, pose) for _ in range(STALE_AFTER + 2)]
+    # The look after the choice is compared with nothing; the six after it show no more.
+    for view in views[:-1]:
+        np.testing.assert_array_equal(view.mask, large)
+        assert not view.is_new_target or view is views[0]
+    assert views[-1].is_new_target and views[-1].recall is not None
+    np.testing.assert_array_equal(views[-1].mask, small)
+    named = looked(perception, frame, pose, views[0].target_position)
+    for _ in range(STALE_AFTER + 2):
+        named = perception.look(frame, pose)
+    np.testing.assert_array_equal(named.mask, large)
 
 
 def test_fruits_are_located_to_a_centimetre_where_enough_is_seen() -> None:

@@ -5,10 +5,14 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+import torch
 
+from maniskill_tomato.deploy.deploy_errors import ProfileError
+from maniskill_tomato.deploy.mock.episode import load_episode
+from maniskill_tomato.deploy.profile import load_profile
 from maniskill_tomato.errors import TomatoError
 from maniskill_tomato.experiments.configs import TwinConfig
-from maniskill_tomato.experiments.twin_comparison import compare_twin, summarise_twin
+from maniskill_tomato.experiments.twin_comparison import compare_twin, simulated_task, summarise_twin
 
 
 def episode(number: int, twin: bool, simulated: bool, moves: int, truly: bool = True) -> dict[str, Any]:
@@ -52,6 +56,35 @@ def test_the_summary_counts_what_a_pencil_counts() -> None:
     )
     assert found["stage_ms_mean"] == {"capture": 60.0, "policy": 4.0} and found["looks"] == 6
     assert found["simulation_contact_share_of_episodes"] == 0.25
+    assert found["truly_visible_share_of_success"] == 0.5 and found["false_success"] == [1]
+    low, high = found["truly_visible_share_interval_95"]
+    assert (low, high) == (pytest.approx(0.0945, abs=1e-4), pytest.approx(0.9055, abs=1e-4)), (
+        "Wilson's, of 1 in 2"
+    )
+
+
+def test_where_no_run_began_there_are_rates_and_no_means() -> None:
+    cannot = episode(0, False, False, 1)
+    cannot["twin"] = {"success": False, "reason": "cannot begin", "detail": "no", "steps": []}
+    found = summarise_twin([cannot])
+    assert (found["twin_success"], found["reasons"], found["looks"]) == (0, {"cannot begin": 1}, 0)
+    means = ("twin_moves_of_successes", "simulation_moves_of_successes", "refused_share_of_moves")
+    costs = ("cpu_seconds_a_run", "device_seconds_median", "truly_visible_share_of_success")
+    assert all(found[name] is None for name in (*means, *costs))
+    json.dumps(found, allow_nan=False)
+
+
+def test_both_run_the_episodes_of_the_profiles_list(tmp_path: Path) -> None:
+    profile = tmp_path / "mine.toml"
+    profile.write_text('[arm]\ndriver = "mock"\n[camera]\ndriver = "mock"\n[twin]\nepisodes = "validation"\n')
+    env = simulated_task(load_profile(str(profile)))
+    env.reset(seed=3)
+    simulated: Any = env.unwrapped
+    expected = load_episode("validation", 3)
+    assert torch.equal(simulated.target_position_w[0], expected.target_position)
+    env.close()
+    with pytest.raises(ProfileError, match="only where both are mock is there a twin"):
+        compare_twin(TwinConfig(profile="iiwa14_d435", out=tmp_path / "out"))
 
 
 def test_an_episode_runs_on_both_and_is_not_run_again(tmp_path: Path) -> None:
