@@ -22,7 +22,7 @@ ifneq "$(shell cat $(STAMP) 2>/dev/null)$(if $(filter command line,$(origin PYTH
 $(STAMP): FORCE
 endif
 
-$(STAMP): pyproject.toml constraints.txt overrides.txt scripts/setup_env.sh scripts/check_env.py
+$(STAMP): pyproject.toml constraints.txt overrides.txt scripts/setup_env.sh
 	@scripts/setup_env.sh
 
 .PHONY: help

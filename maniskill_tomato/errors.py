@@ -71,6 +71,10 @@ class NotWrittenError(CheckpointError):
     """A file cannot be written: the disk is full, or the folder is not ours."""
 
 
+class UnsoundEnvironmentError(TomatoError):
+    """A package is missing or damaged, or the machine lacks what is needed."""
+
+
 class TrainingDivergedError(TomatoError):
     """A loss or a weight is no longer a finite number."""
 

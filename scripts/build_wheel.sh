@@ -34,6 +34,7 @@ say "trying deploy in an environment without ManiSkill and SAPIEN"
 (
     cd "$work"
     "$work/robot/bin/python" -I -c 'import importlib.util as u; assert not u.find_spec("mani_skill") and not u.find_spec("sapien")'
+    "$work/robot/bin/maniskill-tomato" doctor --packages
     "$work/robot/bin/maniskill-tomato" deploy run --profile mock --out "$work/run" </dev/null
 )
 

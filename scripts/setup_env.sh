@@ -99,6 +99,6 @@ fi
     "Check the network and the free disk space (df -h .), then run this again: what has arrived is kept."
 
 say "checking the environment"
-"$python" scripts/check_env.py || exit 1
+"$venv/bin/maniskill-tomato" doctor --packages || exit 1
 printf '%s\n' "$here" >"$stamp"
 say "ready: $venv ($("$python" --version))"

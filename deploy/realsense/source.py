@@ -37,6 +37,17 @@ def load_sdk() -> Any:
     )
 
 
+def connected_serials(sdk: Any, context: Any) -> list[str]:
+    """Serial numbers of the cameras that are plugged in.
+
+    Args:
+        sdk: The module `pyrealsense2`.
+        context: A `context` of it.
+    """
+    info = sdk.camera_info.serial_number
+    return [str(d.get_info(info)) for d in context.query_devices() if d.supports(info)]
+
+
 class FrameSource:
     """A running pipeline of the SDK."""
 
@@ -121,7 +132,7 @@ class FrameSource:
                     raise NotConnectedError(
                         "the recording is over; set camera.repeat = true to play it again"
                     )
-            elif self.serial not in self._serials():
+            elif self.serial not in connected_serials(self._sdk, self._context):
                 raise NotConnectedError(f"camera {self.serial} is gone; look at its cable and connect again")
             if time.monotonic() >= deadline:
                 raise DeviceTimeoutError(
@@ -135,12 +146,8 @@ class FrameSource:
         except RuntimeError:
             pass  # The device went first.
 
-    def _serials(self) -> list[str]:
-        info = self._sdk.camera_info.serial_number
-        return [str(d.get_info(info)) for d in self._context.query_devices() if d.supports(info)]
-
     def _find_camera(self) -> str:
-        serials = self._serials()
+        serials = connected_serials(self._sdk, self._context)
         listed = ", ".join(serials) if serials else "none"
         wanted = self._config.serial
         if not serials:

@@ -21,6 +21,7 @@ from maniskill_tomato.errors import (
     SeedsFailedError,
     TomatoError,
     TrainingDivergedError,
+    UnsoundEnvironmentError,
 )
 
 HELP = ("-h", "--help", "help")
@@ -107,7 +108,8 @@ def parse(argv: Sequence[str]) -> Any:
 
 def _status(error: TomatoError) -> int:
     """It failed on its way, or what was asked for cannot be done."""
-    return FAILED if isinstance(error, (NotWrittenError, SeedsFailedError, TrainingDivergedError)) else USAGE
+    failed = (NotWrittenError, SeedsFailedError, TrainingDivergedError, UnsoundEnvironmentError)
+    return FAILED if isinstance(error, failed) else USAGE
 
 
 def _end(message: str, status: int) -> None:

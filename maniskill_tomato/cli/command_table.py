@@ -31,6 +31,7 @@ class CommandEntry:
 
 
 COMMANDS: Final[dict[str, CommandEntry]] = {
+    "doctor": CommandEntry("doctor_command:Doctor", "Say what this machine lacks, and what mends it"),
     "demo": CommandEntry("demo_command:Demo", "Train, evaluate and report in one go"),
     "train": CommandEntry("train_command:Train", "Train a policy by reinforcement learning"),
     "train-imitation": CommandEntry(
@@ -89,7 +90,7 @@ FAMILIES: Final[dict[str, str]] = {
 """Commands that have commands, and what the list says of them."""
 
 GROUPS: Final[dict[str, tuple[str, ...]]] = {
-    "Begin": ("demo",),
+    "Begin": ("doctor", "demo"),
     "Learn": (
         "train",
         "train-imitation",
