@@ -84,6 +84,7 @@ class GuardedArm:
         self.watch: MoveWatch | None = None
         """Of the move under way, or of the last one."""
         self._watches = self._was_told = False
+        self._broke_off = self._ended_it = False
 
     def begin_run(self, why_stop: Callable[[], str | None]) -> None:
         """Forgets the stop of an earlier run.
@@ -91,7 +92,7 @@ class GuardedArm:
         Args:
             why_stop: Why the new one has to stop, None while it need not; asked before every move is sent and after.
         """
-        self._stopped, self._why_stop = None, why_stop
+        self._stopped, self._why_stop, self._ended_it = None, why_stop, False
 
     @property
     def model(self) -> ArmModel:
@@ -112,6 +113,11 @@ class GuardedArm:
     def why_stopped(self) -> str | None:
         """Why no move is sent until the next run; None if moves are sent."""
         return self._stopped
+
+    @property
+    def broke_off(self) -> bool:
+        """Whether `stop` ended the last move."""
+        return self._broke_off
 
     @property
     def can_stop(self) -> bool:
@@ -193,14 +199,16 @@ class GuardedArm:
         seconds = self._arm.move_seconds(move.joint_positions - start, move.speed_fraction)
         self.watch = MoveWatch(start, move, seconds, self._clock.now(), self._model)
         self._watches = True
-        self._arm.on_reading = self._see
+        self._arm.on_reading, self._arm.may_go = self._see, self._may_go
         try:
             sent = self._arm.command(move)
-        except BaseException:
+        except BaseException as error:
             self._watches = False
+            if isinstance(error, RefusedError):
+                self._check_stopped()
             raise
         self.watch.sent(self._clock.now())
-        self._under_way = sent
+        self._under_way, self._broke_off = sent, False
         if self._asked_to_stop() is not None:
             # Asked while it was sent.
             self.stop()
@@ -217,12 +225,17 @@ class GuardedArm:
         """Waits for the end of the move under way; True if the arm stands where it was sent.
 
         Raises:
+            StoppedError: The run was stopped, and the arm told to stop; likewise `HeartbeatLostError`.
             FaultError: It left its path or its speed, or stands elsewhere; it was told to stop.
             DeviceTimeoutError: It should have got farther by now; likewise.
             StaleError: Its readings are old; likewise.
         """
         self._was_told = False
-        if not self._arm.wait(timeout_s):
+        stands = self._arm.wait(timeout_s)
+        if self._ended_it:
+            self._ended_it = False
+            self._check_stopped()
+        if not stands:
             if self._watches and not self._was_told:
                 self._look()
             return False
@@ -231,6 +244,8 @@ class GuardedArm:
             self._under_way, self._watches = None, False
             off = np.abs(state.joint_positions - sent.joint_positions)
             if off.max() > self.safety.config.arrival_tolerance:
+                # After a stop the driver keeps the rest of the way back.
+                self._check_stopped()
                 k = int(off.argmax())
                 raise FaultError(
                     f"the arm stands {off[k]:.3f} rad from where {self._model.joint_names[k]} was sent, allowed are "
@@ -259,6 +274,10 @@ class GuardedArm:
         self._was_told = True
         if not self._watches or self.watch is None:
             return
+        if self._asked_to_stop() is not None:
+            self.stop()
+            self._ended_it = True
+            return
         departure = self.watch.see(joint_positions, earliest, stamp)
         if departure is not None:
             kind = DeviceTimeoutError if departure.is_late else FaultError
@@ -272,6 +291,9 @@ class GuardedArm:
             "nothing more of the move is sent; what is under way goes on to its end, and only the smartPAD or the "
             "emergency stop halts it"
         )
+
+    def _may_go(self) -> bool:
+        return self._asked_to_stop() is None
 
     def _asked_to_stop(self) -> str | None:
         if self._stopped is None:
@@ -293,11 +315,17 @@ class GuardedArm:
         """
         if self._stopped is None:
             self._stopped = "stopped"
-        self._watches = False  # An arm that brakes is on no plan.
-        stopped = self._arm.stop()
+        # An arm that brakes is on no plan.
+        is_first, self._watches = self._watches, False
+        try:
+            stopped = self._arm.stop()
+        except Exception as error:
+            _logger.error("the driver fails at a stop: %s: %s", type(error).__name__, error)
+            stopped = False
         if stopped:
+            self._broke_off = self._broke_off or self._under_way is not None
             self._under_way = None
-        elif self._under_way is not None:
+        elif self._under_way is not None and is_first:
             _logger.warning(
                 "the move under way goes on to its end: only the smartPAD or the emergency stop halts it"
             )

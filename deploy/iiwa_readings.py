@@ -1,6 +1,8 @@
 """What drivers of an iiwa check: moves, joint angles that can be true, a flange where our kinematics put it."""
 
 import math
+import time
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import ClassVar, Final, NamedTuple
 
@@ -8,7 +10,7 @@ import numpy as np
 import torch
 from scipy.spatial.transform import Rotation
 
-from maniskill_tomato.deploy.deploy_errors import FaultError, RefusedError
+from maniskill_tomato.deploy.deploy_errors import DeviceTimeoutError, FaultError, RefusedError
 from maniskill_tomato.deploy.interface import LIMIT_SLACK, ArmState, Float64, JointMove
 from maniskill_tomato.deploy.profile_bounds import Laxer
 from maniskill_tomato.deploy.rigid import difference, transform
@@ -22,6 +24,15 @@ SPEED_SLACK: Final = 1.2
 READING_SLACK: Final = 0.005
 """How far two readings may differ beyond that, in [rad]."""
 
+
+SPEED_WITHIN_S: Final = 3.0
+"""So long two readings may be waited for that are near enough in time to tell a velocity, in [s]."""
+
+BETWEEN_S: Final = 0.02
+"""Pause between two readings, in [s]."""
+
+TOLD_TO_STOP: Final = "the arm was told to stop; connect anew before it moves again"
+"""Why a driver sends no move after a stop."""
 
 LARGEST_TORQUE_SHARE: Final = 0.5
 """A torque window wider than this share of what a joint can do would guard nothing."""
@@ -170,6 +181,27 @@ class ReadingLog:
         if what is None:
             self._previous, self._last = self._last, reading
         return what
+
+    def state_by(self, look: Callable[[], object]) -> ArmState:
+        """A fresh state.
+
+        Args:
+            look: Adds a reading.
+
+        Raises:
+            DeviceTimeoutError: Answers take so long that they tell no velocity.
+        """
+        deadline = time.monotonic() + SPEED_WITHIN_S
+        look()
+        while (state := self.state()) is None:
+            if time.monotonic() > deadline:
+                raise DeviceTimeoutError(
+                    f"the controller answers too slowly to tell how fast the arm turns: in {SPEED_WITHIN_S:g} s no "
+                    "two readings were less than 1 s apart"
+                )
+            time.sleep(BETWEEN_S)
+            look()
+        return state
 
     def state(self) -> ArmState | None:
         """Positions and velocities; None where the readings are too near or too far apart to tell these."""

@@ -195,6 +195,10 @@ class Arm(Device):
     piece: joint positions in [rad], and the earliest and the latest time of the measurement, in [s]. It raises, and
     calls `stop`, where the arm does not do what was asked."""
 
+    may_go: Callable[[], bool] | None = None
+    """Drivers ask this, where it is set, right before each line that begins a motion; where it says no, the line is not
+    sent, and `command` raises `RefusedError`."""
+
     @abstractmethod
     def read(self, max_age_s: float = 0.5) -> ArmState:
         """The newest state.

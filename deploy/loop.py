@@ -470,6 +470,7 @@ class Loop:
             self._end(step, "dry_run", f"nothing was sent; the first move would go to ({turns}) deg; {told}")
         if refusal is not None:
             return
+        self._check_stops()
         after = self._robot_belief.camera_pose(move.joint_positions)
         proposal = Proposal(
             number=self._moves - 1,
@@ -501,6 +502,9 @@ class Loop:
 
     def _check_stops(self) -> None:
         reason = self._stops.beat()
+        if reason is not None and self._arm.is_under_way:
+            # Before anything is recorded: disks may be slow.
+            self._arm.stop()
         if reason == "heartbeat":
             raise HeartbeatLostError("the loop stood still for too long")
         if reason is not None:

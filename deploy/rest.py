@@ -14,18 +14,20 @@ STOP_TIME: Final = 2.0
 AT_REST: Final = 0.01
 """An arm whose joints all turn more slowly stands, in [rad/s]."""
 
+_STOPPED: Final = "the arm was stopped and holds its position"
+
 
 def come_to_rest(arm: GuardedArm) -> str:
     """Leaves the arm without a command, whatever fails; says what it does then."""
     with suppress(Exception):
         if arm.wait(0.0) and _speed(arm) < AT_REST:
-            return "the arm stands and holds its position"
+            return _STOPPED if arm.broke_off else "the arm stands and holds its position"
     if arm.stop():
         with suppress(Exception):
             arm.wait(STOP_TIME)
         speed = _speed(arm)
         if speed < AT_REST:
-            return "the arm was stopped and holds its position"
+            return _STOPPED
         if math.isinf(speed):
             return "the arm was told to stop; whether it stands nobody knows, for it does not answer"
         return f"the arm was told to stop and still moves at {speed:.3f} rad/s; use the emergency stop"

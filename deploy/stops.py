@@ -1,6 +1,7 @@
 """Ways to stop a run: Ctrl-C, SIGTERM, a key, a file, and a missing heartbeat of the loop."""
 
 import math
+import os
 import select
 import signal
 import sys
@@ -78,7 +79,7 @@ class Stops:
 
     def asked(self) -> str | None:
         """Why to stop, or None, without saying that the loop is alive."""
-        if self._reason is None and self._stop_file is not None and self._stop_file.exists():
+        if self._reason is None and self._stop_file is not None and _is_there(self._stop_file):
             self.request(f"stop file {self._stop_file}")
         if self._reason is None and self._keyboard and select.select([sys.stdin], [], [], 0)[0]:
             line = sys.stdin.readline()
@@ -91,10 +92,13 @@ class Stops:
         """While inside, nobody expects a beat: people take their time. A signal ends the waiting.
 
         Raises:
-            StoppedError: A signal asked to stop.
+            StoppedError: A signal asked to stop, or something did before.
         """
         self._waiting = True
         try:
+            # A signal that came before this line found nobody waiting.
+            if self._reason is not None:
+                raise StoppedError(self._reason)
             yield
         finally:
             self._last_beat = time.monotonic()
@@ -121,3 +125,15 @@ class Stops:
                 if self._on_lost is not None:
                     self._on_lost()
                 return
+
+
+def _is_there(path: Path) -> bool:
+    """Whether somebody put a file, a folder or a link there, also a link that leads nowhere; a place that cannot be
+    looked at counts as well, for no stop would be seen there."""
+    try:
+        os.lstat(path)
+    except FileNotFoundError:
+        return False
+    except OSError:
+        return True
+    return True

@@ -24,6 +24,7 @@ from maniskill_tomato.deploy.clock import Clock
 from maniskill_tomato.deploy.deploy_errors import StoppedError
 from maniskill_tomato.deploy.guarded_arm import GuardedArm
 from maniskill_tomato.deploy.interface import ArmState, Camera, Float64, JointMove
+from maniskill_tomato.deploy.rest import come_to_rest
 from maniskill_tomato.deploy.rigid import transform
 from maniskill_tomato.deploy.stops import Stops
 from maniskill_tomato.errors import InvalidInputError, check_ranges
@@ -148,9 +149,9 @@ def capture_views(
     def check_stops() -> None:
         reason = stops.beat()
         if reason is not None:
-            halted = arm.stop()
-            state = "the arm holds its position" if halted else "a move under way goes on to its end"
-            raise StoppedError(f"stopped ({reason}) after {len(views)} views; {state}")
+            if arm.is_under_way:
+                arm.stop()
+            raise StoppedError(f"stopped ({reason}) after {len(views)} views; {come_to_rest(arm)}")
 
     def look() -> BoardView | None:
         check_stops()
@@ -203,9 +204,11 @@ def capture_views(
             if going_back:
                 break
             continue
-        arm.command(move)
-        while not arm.wait(0.2):
-            check_stops()
+        with suppress(StoppedError):
+            arm.command(move)
+            while not arm.wait(0.2):
+                check_stops()
+        check_stops()
         if not going_back and look() is None:
             logger.info("the board is not in this picture; it is left out")
     return views

@@ -6,14 +6,12 @@ not come, or means nothing, ends the connection, by which the robot cancels its 
 
 import threading
 from collections.abc import Callable, Sequence
-from typing import Final
 
 from maniskill_tomato.deploy.deploy_errors import DeployError, ProtocolError, RefusedError
+from maniskill_tomato.deploy.iiwa_readings import TOLD_TO_STOP
 from maniskill_tomato.deploy.interface import Float64
 from maniskill_tomato.deploy.libiiwa.messages import ERRORS, NO_ERROR, Code, Messages, RobotState
 from maniskill_tomato.deploy.libiiwa.robot_connection import RobotConnection
-
-TOLD_TO_STOP: Final = "the arm was told to stop; connect anew before it moves again"
 
 
 class LibiiwaClient:

@@ -26,6 +26,7 @@ from maniskill_tomato.deploy.deploy_errors import (
 )
 from maniskill_tomato.deploy.drivers import DriverContext
 from maniskill_tomato.deploy.iiwa_readings import (
+    TOLD_TO_STOP,
     FlangeDifference,
     Reading,
     ReadingLog,
@@ -33,7 +34,7 @@ from maniskill_tomato.deploy.iiwa_readings import (
     pose_difference,
 )
 from maniskill_tomato.deploy.interface import Arm, ArmState, Float64, JointMove
-from maniskill_tomato.deploy.libiiwa.client import TOLD_TO_STOP, LibiiwaClient
+from maniskill_tomato.deploy.libiiwa.client import LibiiwaClient
 from maniskill_tomato.deploy.libiiwa.libiiwa_config import LibiiwaConfig
 from maniskill_tomato.deploy.libiiwa.messages import ERRORS, Code, RobotState
 from maniskill_tomato.deploy.libiiwa.robot_connection import RobotConnection
@@ -165,13 +166,7 @@ class LibiiwaArm(Arm):
         # Every reading is asked for, and so is never old; two of them tell the velocity.
         del max_age_s
         with self._telling_of_a_move():
-            self._look()
-            state = self._readings.state()
-            while state is None:
-                time.sleep(POLL_S)
-                self._look()
-                state = self._readings.state()
-            return state
+            return self._readings.state_by(self._look)
 
     def command(self, move: JointMove) -> JointMove:
         client = self._connected()
@@ -239,7 +234,7 @@ class LibiiwaArm(Arm):
         # Until the robot refuses it, a move that was sent counts as under way, answered or not.
         self._piece = target
         try:
-            self._error_before = client.start_move(target, self._may_go).error
+            self._error_before = client.start_move(target, self._is_free_to_go).error
         except RefusedError:
             self._piece = None
             raise
@@ -248,8 +243,8 @@ class LibiiwaArm(Arm):
         seconds = move_seconds(state.joint_positions, target, self._speed, acceleration)
         self._deadline = self._began + 2.0 * seconds + self._config.move_margin_s
 
-    def _may_go(self) -> bool:
-        return not self._stop_asked.is_set()
+    def _is_free_to_go(self) -> bool:
+        return not self._stop_asked.is_set() and (self.may_go is None or self.may_go())
 
     def _check_braking(self, state: RobotState) -> None:
         """Whether an arm that was told to stop stands."""
@@ -300,7 +295,7 @@ class LibiiwaArm(Arm):
             try:
                 self._next_piece(self._connected(), state)
             except RefusedError:
-                if self._may_go():
+                if self._is_free_to_go():
                     raise
 
     def _is_at_rest(self) -> bool:

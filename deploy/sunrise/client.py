@@ -11,7 +11,7 @@ import logging
 import math
 import re
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Final, Literal
 
 import numpy as np
@@ -23,6 +23,7 @@ from maniskill_tomato.deploy.deploy_errors import (
     ProtocolError,
     RefusedError,
 )
+from maniskill_tomato.deploy.iiwa_readings import TOLD_TO_STOP
 from maniskill_tomato.deploy.interface import Float64
 from maniskill_tomato.deploy.sunrise.line_connection import LineConnection
 from maniskill_tomato.errors import InvalidInputError
@@ -125,6 +126,7 @@ class SunriseClient:
         joint_positions: Sequence[float],
         relative_speed: float,
         windows: Sequence[tuple[float, float]] | None,
+        may_go: Callable[[], bool] = lambda: True,
     ) -> Float64:
         """Starts a point-to-point move; joints start and stop together.
 
@@ -133,13 +135,14 @@ class SunriseClient:
             relative_speed: Share of the largest joint speeds, above 0 and up to 1.
             windows: Smallest and largest torque of each joint, in [N m], outside which the arm stops. Shape
                 (7, 2). None for a move that nothing but the safety circuit stops.
+            may_go: Asked right before the line that begins the move.
 
         Returns:
             The joint angles as they were sent, in [rad]. Shape (7,).
 
         Raises:
             InvalidInputError: A number is not finite or a speed or a window impossible.
-            RefusedError: The controller said `nak`, or a move is under way.
+            RefusedError: The controller said `nak`, a move is under way, or this one may not go.
             NotConnectedError: The connection is gone; likewise `DeviceTimeoutError` and `ProtocolError`.
         """
         target = [float(_text(q)) for q in _finite(joint_positions, NUM_JOINTS, "joint_positions")]
@@ -158,7 +161,7 @@ class SunriseClient:
         # The speed is one variable with the speed of straight lines, and stays: it goes before every move.
         self._order("jRelVel", [relative_speed])
         self._order("jp", target, of_main_loop=False)
-        self._send("doPTPinJS" if windows is None else _command("doPTP!inJS", guard))
+        self._send("doPTPinJS" if windows is None else _command("doPTP!inJS", guard), may_go=may_go)
         self._expect_done("the move")
         self._moving, self._motion_end = True, None
         return np.array(target)
@@ -242,13 +245,17 @@ class SunriseClient:
             ProtocolError, f"it answered {word} with {line[:80]!r} instead of {count} finite numbers"
         )
 
-    def _send(self, command: str, during_move: bool = False) -> None:
+    def _send(
+        self, command: str, during_move: bool = False, may_go: Callable[[], bool] = lambda: True
+    ) -> None:
         if self._moving and not during_move:
             raise RefusedError(f"a move is under way; {command.split('_')[0]} would be lost")
         time.sleep(max(0.0, self._quiet_until - time.monotonic()))
         left_over = self._connection.receive(0.0)
         if left_over is not None and not self._take_motion_end(left_over):
             raise self._connection.fail(ProtocolError, f"it sent {left_over!r}, unasked")
+        if not may_go():
+            raise RefusedError(TOLD_TO_STOP)
         self._connection.send(command, self._timeout)
 
     def _receive(self, what: str) -> str:

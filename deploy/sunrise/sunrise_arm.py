@@ -24,6 +24,7 @@ from maniskill_tomato.deploy.deploy_errors import (
 )
 from maniskill_tomato.deploy.drivers import DriverContext
 from maniskill_tomato.deploy.iiwa_readings import (
+    TOLD_TO_STOP,
     FlangeDifference,
     Reading,
     ReadingLog,
@@ -127,16 +128,7 @@ class SunriseArm(Arm):
         # Every reading is asked for, and so is never old; two of them tell the velocity.
         del max_age_s
         with self._telling_of_a_move():
-            return self._read()
-
-    def _read(self) -> ArmState:
-        self._measure()
-        state = self._readings.state()
-        while state is None:
-            time.sleep(0.02)
-            self._measure()
-            state = self._readings.state()
-        return state
+            return self._readings.state_by(self._measure)
 
     def relaxations(self) -> tuple[str, ...]:
         return tuple(relaxed("arm", self._config, self._config.LAXER))
@@ -151,15 +143,13 @@ class SunriseArm(Arm):
             raise RefusedError("another move is under way")
         check_move(move)
         if self._stop_asked:
-            raise RefusedError("the arm was told to stop; connect anew before it moves again")
+            raise RefusedError(TOLD_TO_STOP)
         start = self._measure().positions
         target = np.round(move.joint_positions, 9)
         self._pieces = straight_pieces(start, target, self._config.largest_segment)
         self._speed = move.speed_fraction
         with self._telling_of_a_move():
             self._next_piece(client)
-        if self._piece is None:
-            raise RefusedError("stopped before the move began")
         return JointMove(joint_positions=target, speed_fraction=float(f"{self._speed:.9f}"))
 
     def wait(self, timeout_s: float) -> bool:
@@ -197,12 +187,10 @@ class SunriseArm(Arm):
         windows = np.stack([around - margin, around + margin], axis=1)
         start = self._measure().positions
         self._pieces = []
-        if self._stop_asked:
-            return
         # Until the controller refuses it, a move that was sent counts as under way, answered or not.
         self._piece = target
         try:
-            client.start_move(target.tolist(), self._speed, windows.tolist())
+            client.start_move(target.tolist(), self._speed, windows.tolist(), self._is_free_to_go)
         except RefusedError:
             self._piece = None
             raise
@@ -233,9 +221,16 @@ class SunriseArm(Arm):
             raise FaultError(
                 f"the controller says that the move is done, but a joint is {math.degrees(off):.2f} degrees off"
             )
-        if rest and not self._stop_asked:
+        if rest and self._is_free_to_go():
             self._pieces = rest
-            self._next_piece(client)
+            try:
+                self._next_piece(client)
+            except RefusedError:
+                if self._is_free_to_go():
+                    raise
+
+    def _is_free_to_go(self) -> bool:
+        return not self._stop_asked and (self.may_go is None or self.may_go())
 
     def _measure(self) -> Reading:
         """Joint angles that can be true."""

@@ -672,7 +672,9 @@ def test_a_stop_ends_the_taking_of_views_and_keeps_those_taken(tmp_path: Path) -
             file.touch()
         return True
 
-    with pytest.raises(StoppedError, match=r"stop file .*STOP\) after 3 views; the arm holds its position"):
+    with pytest.raises(
+        StoppedError, match=r"stop file .*STOP\) after 3 views; the arm stands and holds its position"
+    ):
         capture_views(guarded, BoardCamera(arm), BOARD, folder, clock, confirm, stops=Stops(stop_file=file))
     assert len(arm.moves) == 2, "the stop outweighs the yes"
     assert len(read_views(folder)[0]) == 3
@@ -689,6 +691,25 @@ def test_a_stop_ends_the_taking_of_views_and_keeps_those_taken(tmp_path: Path) -
     with pytest.raises(StoppedError, match="SIGTERM"):
         capture_views(guarded, BoardCamera(moving), BOARD, tmp_path / "b", clock, lambda q: True, stops=stops)
     assert len(moving.moves) == 1
+
+
+def test_an_arm_that_moves_on_after_a_stop_is_not_said_to_stand_while_views_are_taken(tmp_path: Path) -> None:
+    clock, stops = SimulatedClock(), Stops()
+
+    class Rolling(StillArm):
+        def read(self, max_age_s: float = 0.5) -> ArmState:
+            return replace(super().read(), joint_velocities=np.full(7, 0.2 if self.moves else 0.0))
+
+        def wait(self, timeout_s: float) -> bool:
+            stops.request("SIGTERM")
+            return False
+
+    arm = Rolling(clock)
+    guarded = GuardedArm(arm, Safety(SafetyConfig()), clock)
+    with pytest.raises(
+        StoppedError, match=r"after 1 views; the arm was told to stop and still moves at 0\.200 rad/s"
+    ):
+        capture_views(guarded, BoardCamera(arm), BOARD, tmp_path, clock, lambda q: True, stops=stops)
 
 
 DRIVERS = """
@@ -760,7 +781,7 @@ def test_a_signal_at_the_prompt_ends_the_taking_of_views_and_names_those_that_st
     os.close(master)
     assert end.value.code == 128 + number
     told = capsys.readouterr().out.splitlines()
-    assert told[-2].endswith(f"stopped ({number.name}) after 2 views; the arm holds its position")
+    assert told[-2].endswith(f"stopped ({number.name}) after 2 views; the arm stands and holds its position")
     kept = "view_000.png, view_001.png"
     assert told[-1] == f"kept    {out / 'views'}: {kept}; --views {out / 'views'} calculates from them"
     again, _, serial = read_views(out / "views")

@@ -124,7 +124,7 @@ def test_ctrl_c_while_views_of_a_calibration_are_taken_ends_it_with_its_status(
     with pytest.raises(SystemExit) as end:
         main(["deploy", "calibrate", "--profile", "mock", "--unattended", "--out", str(tmp_path)])
     assert end.value.code == 128 + signal.SIGINT
-    assert "stopped (SIGINT) after 0 views; the arm holds its position" in capsys.readouterr().out
+    assert "stopped (SIGINT) after 0 views; the arm stands and holds its position" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])

@@ -21,7 +21,7 @@ from maniskill_tomato.deploy.mock.episode import load_episode
 from maniskill_tomato.deploy.mock.rehearsal import rehearsal
 from maniskill_tomato.deploy.profile import load_profile
 from maniskill_tomato.deploy.profile_files import profile_path
-from maniskill_tomato.deploy.run_records import RunResult
+from maniskill_tomato.deploy.run_records import KeptSteps, Recorder, RunResult, Step
 from maniskill_tomato.deploy.stops import Stops
 from maniskill_tomato.policies.opening import open_policy
 
@@ -56,6 +56,7 @@ def run(
     moves: int = 2,
     speed_fraction: float = 0.1,
     reply_timeout_s: float = 10.0,
+    recorder: Callable[[LoopbackRobot], Recorder] | None = None,
 ) -> tuple[RunResult, LoopbackRobot]:
     port = free_port()
     start = load_episode("held_out", SEED).start_joints
@@ -87,7 +88,8 @@ def run(
             workcell.guarded_arm.wait = hang_once  # type: ignore[method-assign]
         with workcell.arm, workcell.camera, listening:
             watching = when_it_moves(robot, in_move) if in_move is not None else None
-            result = Loop(workcell, open_policy("nbv", env_id=TASK), listening, "unattended").run()
+            recorders = [] if recorder is None else [recorder(robot)]
+            result = Loop(workcell, open_policy("nbv", env_id=TASK), listening, "unattended", recorders).run()
             if watching is not None:
                 watching.join(60.0)
     return result, robot
@@ -121,6 +123,23 @@ def test_a_stop_in_a_move_halts_the_arm_on_its_way(how: str, tmp_path: Path) -> 
     assert len(sent) == 1
     assert np.abs(robot.arm.qpos - sent[0][1:]).max() > 0.01
     assert robot.stopped_at is not None
+
+
+def test_the_arm_is_halted_before_the_broken_move_is_recorded_on_a_disk_that_may_be_slow() -> None:
+    halted_before: list[bool] = []
+
+    class Disk(KeptSteps):
+        def __init__(self, robot: LoopbackRobot) -> None:
+            super().__init__()
+            self.robot = robot
+
+        def step(self, step: Step) -> None:
+            if step.outcome == "broken off":
+                halted_before.append(self.robot.stopped_at is not None)
+
+    result, _ = run(in_move=lambda: os.kill(os.getpid(), signal.SIGTERM), recorder=Disk)
+    assert result.end_state == "the arm was stopped and holds its position"
+    assert halted_before == [True]
 
 
 def test_a_lost_heartbeat_in_a_move_halts_the_arm_while_the_loop_still_hangs() -> None:

@@ -18,7 +18,7 @@ from torch import Tensor
 from maniskill_tomato.assets import asset_path
 from maniskill_tomato.deploy.clock import SimulatedClock
 from maniskill_tomato.deploy.decision import TASK, default_policy
-from maniskill_tomato.deploy.deploy_errors import DeployError, ProfileError, RefusedError
+from maniskill_tomato.deploy.deploy_errors import DeployError, ProfileError, RefusedError, StoppedError
 from maniskill_tomato.deploy.guarded_arm import GuardedArm
 from maniskill_tomato.deploy.interface import Frame, JointMove
 from maniskill_tomato.deploy.loop import Loop
@@ -537,6 +537,44 @@ def test_a_stop_file_ends_the_run_before_anything_moves(tmp_path: Path) -> None:
     result, workcell = go(profile(), stops=Stops(stop_file=tmp_path / "STOP"))
     assert (result.reason, result.moves) == ("stopped", 0)
     assert "STOP" in result.detail
+
+
+def test_a_stop_while_the_policy_decides_asks_nobody_for_a_yes() -> None:
+    asked: list[Proposal] = []
+
+    def ask(proposal: Proposal) -> bool:
+        asked.append(proposal)
+        return True
+
+    policy = StoppedWhileDeciding("SIGTERM", Path("unused"))
+    result, _ = go(profile(), policy, mode="confirm", confirm=ask)
+    assert (result.reason, result.detail, asked) == ("stopped", "SIGTERM", [])
+
+
+def test_a_signal_that_comes_just_before_a_person_is_waited_for_ends_the_waiting() -> None:
+    with Stops() as stops:
+        os.kill(os.getpid(), signal.SIGINT)
+        with pytest.raises(StoppedError, match="SIGINT"), stops.waiting_for_a_person():
+            pytest.fail("nobody is asked")
+
+
+@pytest.mark.parametrize(
+    "what", ["folder", "link to nothing", "link to itself", "link that is too long", "no folder"]
+)
+def test_whatever_stands_where_the_stop_file_would_stops_the_run(what: str, tmp_path: Path) -> None:
+    place = tmp_path / "out" / "STOP"
+    place.parent.mkdir()
+    stops = Stops(stop_file=place)
+    assert stops.asked() is None
+    if what == "folder":
+        place.mkdir()
+    elif what == "no folder":
+        place.parent.rmdir()
+        place.parent.touch()
+    else:
+        ends = {"link to nothing": "nowhere", "link to itself": "STOP", "link that is too long": "x" * 300}
+        place.symlink_to(ends[what])
+    assert stops.asked() == f"stop file {place}"
 
 
 class Sleepy(Towards):

@@ -235,6 +235,21 @@ def test_a_slow_answer_in_time_is_taken_and_a_late_one_ends_the_connection() -> 
         assert not any(line.startswith("doPTP") for line in controller.received)
 
 
+def test_a_controller_whose_answers_are_too_slow_to_tell_a_velocity_holds_nobody() -> None:
+    with LoopbackController(qpos=REST) as controller, driver(controller, reply_timeout_s=30.0) as arm:
+        line = controller._joint_line
+
+        def slowly() -> str:
+            time.sleep(1.1)
+            return line()
+
+        controller._joint_line = slowly  # type: ignore[method-assign]
+        began = time.monotonic()
+        with pytest.raises(DeviceTimeoutError, match="answers too slowly"):
+            arm.read()
+        assert time.monotonic() - began < 10.0
+
+
 def test_a_lost_command_is_not_sent_twice() -> None:
     faults = [Fault(kind="swallow", command="doPTP")]
     with LoopbackController(qpos=REST, faults=faults) as controller, driver(controller, **HASTY) as arm:

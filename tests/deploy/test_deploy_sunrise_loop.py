@@ -1,5 +1,7 @@
 """The whole loop with the iiwa's driver over a real socket: the loopback controller's arm carries the twin's camera."""
 
+import os
+import signal
 from collections.abc import Sequence
 from typing import Any
 
@@ -20,15 +22,18 @@ SEED = 1
 
 
 def run(
-    faults: Sequence[Fault] = (), moves: int = 2, speedup: float = 1.0, reply_timeout_s: float = 30.0
+    faults: Sequence[Fault] = (),
+    moves: int = 2,
+    speedup: float = 1.0,
+    reply_timeout_s: float = 30.0,
+    kind: type[LoopbackController] = LoopbackController,
+    largest_segment: float = 0.15,
 ) -> tuple[RunResult, LoopbackController]:
     start = load_episode("held_out", SEED).start_joints
-    with LoopbackController(
-        qpos=start.tolist(), speedup=speedup, media_flange_m=0.026, faults=faults
-    ) as controller:
+    with kind(qpos=start.tolist(), speedup=speedup, media_flange_m=0.026, faults=faults) as controller:
         host, port = controller.address
         options: dict[str, Any] = {"host": host, "port": port, "flange_xyz": [0.0, 0.0, 0.026]}
-        options["reply_timeout_s"] = reply_timeout_s
+        options |= {"reply_timeout_s": reply_timeout_s, "largest_segment": largest_segment}
         workcell = rehearsal("sunrise", options, lambda: np.array(controller.arm.qpos), SEED, moves, 0.3)
         with workcell.arm, workcell.camera, Stops() as stops:
             result = Loop(workcell, open_policy("nbv", env_id=TASK), stops, "unattended").run()
@@ -50,6 +55,32 @@ def test_the_loop_moves_the_arm_over_the_socket_through_safety_and_guarded_moves
     speeds = {line for line in controller.received if line.startswith("jRelVel")}
     assert speeds == {"jRelVel_0.300000000_"}
     assert controller.lost == []
+
+
+class Ending(LoopbackController):
+    """The program is told to end when the arm is at the end of a piece, before the controller says so."""
+
+    def _move(self, windows: Sequence[tuple[int, float, float]]) -> None:
+        super()._move(windows)
+        os.kill(os.getpid(), signal.SIGTERM)
+
+
+class Preparing(LoopbackController):
+    """The program is told to end when the target is set, before the line that begins the move."""
+
+    def _set_target(self, line: str) -> None:
+        super()._set_target(line)
+        os.kill(os.getpid(), signal.SIGTERM)
+
+
+@pytest.mark.parametrize(("kind", "sent"), [(Ending, 1), (Preparing, 0)])
+def test_a_signal_between_the_pieces_of_a_move_or_while_one_is_prepared_lets_none_out(
+    kind: type[LoopbackController], sent: int
+) -> None:
+    result, controller = run(kind=kind, largest_segment=0.05)
+    assert (result.reason, result.detail, result.is_fault) == ("stopped", "SIGTERM", False)
+    assert len([line for line in controller.received if line.startswith("doPTP")]) == sent
+    assert result.end_state.endswith("holds its position")
 
 
 @pytest.mark.parametrize(
