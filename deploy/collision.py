@@ -25,6 +25,9 @@ LOOK_AHEAD: Final = 0.05
 PATH_ERROR: Final = 5e-4
 """Between the postures that are looked at, shapes get nearer than their clearance by less than this, in [m]."""
 
+FARTHEST_CORNER: Final = 1e4
+"""Of a box from the base, in [m]: sums of larger numbers lose what the arm is held clear by."""
+
 LEAVING_SLACK: Final = 1e-3
 """What is too near already gets nearer by less than this before it must be clear, in [m]."""
 
@@ -44,6 +47,11 @@ class Box:
         if not all(low < high for low, high in zip(self.low, self.high, strict=True)):
             raise InvalidInputError(
                 f"low must lie below high along every axis, got {self.low} and {self.high}"
+            )
+        if not all(abs(corner) <= FARTHEST_CORNER for corner in (*self.low, *self.high)):
+            raise InvalidInputError(
+                f"low and high must be from {-FARTHEST_CORNER:g} to {FARTHEST_CORNER:g} m, got {self.low} and "
+                f"{self.high}"
             )
 
 

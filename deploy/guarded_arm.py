@@ -2,6 +2,7 @@
 comes back during a move is held against its plan (`move_watch`)."""
 
 import logging
+import math
 from collections import deque
 from collections.abc import Callable
 from typing import Final
@@ -34,7 +35,7 @@ JUMP_SLACK: Final = 0.02
 """A joint may seem to turn this much beyond what its largest speed allows between two states, in [rad]."""
 
 SENT_TOLERANCE: Final = 1e-3
-"""What a driver sends may be rounded by this much, in [rad]."""
+"""What a driver sends may be rounded by this much, in [rad], and as a speed fraction."""
 
 
 class GuardedArm:
@@ -128,7 +129,7 @@ class GuardedArm:
         """The newest state.
 
         Raises:
-            FaultError: It cannot be true: not finite, outside the joints' limits, or a jump.
+            FaultError: It cannot be true: not finite, outside the joints' limits, a jump, or from the future.
             DeployError: The arm does not give one.
         """
         state = self._arm.read(self.safety.config.max_state_age)
@@ -136,6 +137,12 @@ class GuardedArm:
         for name, values in (("positions", state.joint_positions), ("velocities", state.joint_velocities)):
             if not np.isfinite(values).all():
                 raise FaultError(f"the arm reports joint {name} that are not finite: {values.tolist()}")
+        now = self._clock.now()
+        if not (state.stamp <= now and 0.0 <= state.stamp_error < math.inf):
+            raise FaultError(
+                f"the arm's state is of {state.stamp:.3f} s, with an error of {state.stamp_error:g} s, and it is "
+                f"{now:.3f} s: no state can be of later, nor its error negative"
+            )
         joints = state.joint_positions
         beyond = np.maximum(self._model.joint_lower - joints, joints - self._model.joint_upper)
         if (beyond > LIMIT_SLACK).any():
@@ -218,6 +225,11 @@ class GuardedArm:
             raise FaultError(
                 f"the driver sent joint positions that are {off:.4f} rad off the checked ones, allowed are "
                 f"{SENT_TOLERANCE:g} rad"
+            )
+        if not sent.speed_fraction <= move.speed_fraction + SENT_TOLERANCE:
+            self.stop()
+            raise FaultError(
+                f"the driver sent the speed fraction {sent.speed_fraction:g}, {move.speed_fraction:g} was checked"
             )
         return sent
 

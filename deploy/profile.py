@@ -39,6 +39,9 @@ TABLES: Final = (
 """What a profile may have."""
 
 
+WRITTEN: Final = (".html", ".json", ".mcap", ".png")
+"""Endings of the files that the commands write."""
+
 FARTHEST_TARGET: Final = 1.6
 """An arm that reaches 0.82 m cannot look closely at what is farther from its base, in [m]."""
 
@@ -91,8 +94,12 @@ class StopConfig:
 
     def __post_init__(self) -> None:
         check_ranges(self, heartbeat=(1.0, 3600.0))
-        if Path(self.file).name != self.file or not self.file:
+        if Path(self.file).name != self.file or self.file in ("", "..") or not self.file.isprintable():
             raise InvalidInputError(f"file must be a plain file name, got {self.file!r}")
+        if Path(self.file).suffix.lower() in WRITTEN:
+            raise InvalidInputError(
+                f"file must not end in {', '.join(WRITTEN)}, as what a run writes does; got {self.file!r}"
+            )
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

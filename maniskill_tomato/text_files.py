@@ -1,6 +1,7 @@
 """Text files that others wrote, as values: JSON and TOML within limits that real files stay far below."""
 
 import json
+import stat
 import tomllib
 from collections.abc import Callable
 from pathlib import Path
@@ -51,7 +52,11 @@ def parse_toml(text: str) -> dict[str, Any]:
 
 def _read(path: Path, what: str, parse: Callable[[str], Any]) -> Any:
     try:
-        if (size := path.stat().st_size) > LARGEST_FILE:
+        status = path.stat()
+        if not (stat.S_ISREG(status.st_mode) or stat.S_ISDIR(status.st_mode)):
+            # Such as a device that never ends, or a pipe in which nobody writes.
+            raise InvalidInputError("it is no file")
+        if (size := status.st_size) > LARGEST_FILE:
             raise InvalidInputError(f"it has {size} bytes; {LARGEST_FILE} are allowed")
         return parse(path.read_text(encoding="utf-8"))
     except FileNotFoundError:

@@ -2,6 +2,7 @@
 
 import contextlib
 import json
+import os
 from pathlib import Path
 from typing import Any
 
@@ -54,6 +55,16 @@ def test_long_integers_are_refused(digits: int) -> None:
             parse(text % ("9" * digits))
     with pytest.raises(ProfileError, match="digits"):
         parse_profile("[loop]\nmax_moves = " + "9" * digits, Path("mine.toml"))
+
+
+@pytest.mark.timeout(60)
+def test_a_device_that_never_ends_and_a_pipe_in_which_nobody_writes_are_no_files(tmp_path: Path) -> None:
+    pipe = tmp_path / "pipe.json"
+    os.mkfifo(pipe)
+    for path in (Path("/dev/zero"), pipe):
+        for read in (read_json, read_toml):
+            with pytest.raises(InvalidInputError, match="it is no file"):
+                read(path)
 
 
 def test_what_is_no_text_names_the_file(tmp_path: Path) -> None:

@@ -1,5 +1,6 @@
 """The envelope: what is refused and why, and that nothing outside it reaches an arm."""
 
+import math
 from dataclasses import FrozenInstanceError, replace
 from typing import Any
 
@@ -489,6 +490,24 @@ def test_the_safety_configuration_refuses_what_makes_no_sense() -> None:
             SafetyConfig(**wrong)
     with pytest.raises(InvalidInputError, match="low must lie below high"):
         Box(low=(0.0, 0.0, 0.0), high=(1.0, 0.0, 1.0))
+    for far in (math.inf, 1e300, 1.1e4):
+        with pytest.raises(InvalidInputError, match="from -10000 to 10000 m"):
+            Box(low=(0.9, -far, -far), high=(0.91, far, far))
+
+
+def test_a_wall_as_large_as_a_box_may_be_keeps_its_distance_to_a_micrometre() -> None:
+    posture = turned()[None]
+    ahead = float(plain_flange(turned())[0]) + 0.25
+    small, large = (
+        CollisionChecker(
+            obstacles=(Box(low=(ahead, -size, -size), high=(ahead + size, size, size)),),
+            obstacle_clearance=0.5,
+        ).nearest(posture)
+        for size in (1.0, 9999.0)
+    )
+    assert small is not None and large is not None
+    assert small.second == large.second == "obstacle 0"
+    assert large.distance == pytest.approx(small.distance, abs=1e-6)
 
 
 @pytest.mark.parametrize(
@@ -741,6 +760,41 @@ def test_states_that_cannot_be_true_are_faults() -> None:
     arm.report = np.rad2deg(READY_QPOS)
     with pytest.raises(FaultError, match="which unit"):
         guard.read()
+
+
+@pytest.mark.parametrize(
+    "when", [{"stamp": 100.5}, {"stamp": math.nan}, {"stamp_error": math.nan}, {"stamp_error": -1.0}]
+)
+def test_a_state_from_the_future_or_from_no_time_is_a_fault(when: dict[str, Any]) -> None:
+    clock = SimulatedClock(100.0)
+    arm = SpyArm(clock)
+    guard = GuardedArm(arm, Safety(), clock)
+    state = replace(arm.read(), **when)
+    arm.read = lambda max_age_s=0.5: state  # type: ignore[method-assign]
+    with pytest.raises(FaultError, match="no state can be of later"):
+        guard.read()
+
+
+@pytest.mark.parametrize("speed", [0.2, math.nan])
+def test_a_driver_that_says_it_sent_another_speed_is_stopped(speed: float) -> None:
+    clock = SimulatedClock(100.0)
+    arm = SpyArm(clock)
+    command, stopped = arm.command, list[bool]()
+    arm.command = lambda move: replace(command(move), speed_fraction=speed)  # type: ignore[method-assign]
+    arm.stop = lambda: stopped.append(True) or True  # type: ignore[method-assign, func-returns-value]
+    guard = GuardedArm(arm, Safety(), clock)
+    with pytest.raises(FaultError, match="speed fraction"):
+        guard.command(move(turned(j1=0.1)))
+    assert stopped == [True]
+
+
+def test_a_driver_that_breaks_at_a_stop_is_not_said_to_have_stopped() -> None:
+    clock = SimulatedClock(100.0)
+    arm = SpyArm(clock)
+    guard = GuardedArm(arm, Safety(), clock)
+    guard.command(move(turned(j1=0.1)))
+    arm.stop = lambda: bool(1 / 0)  # type: ignore[method-assign]
+    assert guard.stop() is False and guard.is_under_way and guard.why_stopped == "stopped"
 
 
 def test_an_arm_that_does_not_arrive_is_a_fault_and_one_that_never_ends_a_timeout() -> None:

@@ -91,6 +91,15 @@ def test_the_error_names_the_key_the_value_and_what_is_allowed() -> None:
         table("safety", "arrival_tolerance = 1e9")
 
 
+@pytest.mark.parametrize(
+    "name", ["a\\u0000b", "..", ".", "", "a/b", "run.mcap", "calibration.json", "Report.PNG"]
+)
+def test_a_stop_file_is_named_as_a_file_that_nothing_else_writes(name: str) -> None:
+    with pytest.raises(ProfileError, match=r"stop: file must"):
+        profile(f'[stop]\nfile = "{name}"\n')
+    assert profile('[stop]\nfile = "halt.txt"\n').stop.file == "halt.txt"
+
+
 def test_no_profile_takes_the_zone_around_the_base_away() -> None:
     assert table("safety", "forbidden = []").safety.forbidden == (BASE_ZONE,)
     more = table("safety", "forbidden = [{ low = [0.5, 0.0, 0.0], high = [0.6, 1.0, 1.0] }]").safety
