@@ -68,6 +68,9 @@ COMMANDS: Final[dict[str, CommandEntry]] = {
     "judge perception": CommandEntry(
         "judge_commands:JudgePerception", "What a policy loses when it sees through the camera"
     ),
+    "judge plants": CommandEntry(
+        "judge_commands:JudgePlants", "Plants from mesh files, and what fewer triangles change"
+    ),
     "judge twin": CommandEntry("judge_commands:JudgeTwin", "The twin of `deploy` beside the simulated task"),
     "deploy run": CommandEntry("deploy_commands:DeployRun", "Look at a tomato until it is fully visible"),
     "deploy inspect": CommandEntry(
@@ -84,7 +87,7 @@ COMMANDS: Final[dict[str, CommandEntry]] = {
 
 FAMILIES: Final[dict[str, str]] = {
     "train-segmenter": "Train a segmenter on annotated images",
-    "judge": "Judge a part: V_f models, segmenters, perception, twin",
+    "judge": "Judge a part: V_f models, segmenters, perception, plants from files, twin",
     "deploy": "Run a policy on an arm and a camera, or on their twin",
 }
 """Commands that have commands, and what the list says of them."""

@@ -123,6 +123,40 @@ class JudgeSegmenter:
 
 
 @dataclass(frozen=True, kw_only=True)
+class JudgePlants:
+    """Read plants from mesh files, say what is in them, and what a budget of triangles changes in V_f.
+
+    Every file is read, so that one that is refused shows at once.
+    """
+
+    mesh: Path
+    """A mesh file, or a folder of them; the rules stand in its mesh.toml."""
+    split: Literal["train", "validation", "held_out", "all"] = "all"
+    """Whose plants."""
+    triangles: int | None = None
+    """The most that a plant may keep; by default what mesh.toml says."""
+    out: Path = Path("runs/plants")
+    """Folder of plants.md and plants.json."""
+
+    def run(self) -> None:
+        """Reads the plants and prints the table."""
+        from maniskill_tomato.plants.mesh_rules import MeshRules
+        from maniskill_tomato.plants.mesh_set import MeshSource
+
+        MeshRules(triangles=self.triangles)
+        source = MeshSource.parse(self.mesh)
+        count = len(source.plants.seeds(self.split))
+
+        from tqdm import tqdm
+
+        from maniskill_tomato.experiments.mesh_judgement import judge_meshes
+
+        with tqdm(total=count, unit="plant", disable=None) as bar:
+            text = judge_meshes(source, self.split, self.triangles, self.out, bar.update)
+        print(text)
+
+
+@dataclass(frozen=True, kw_only=True)
 class JudgePerception(PerceptionComparisonConfig):
     """Measure what a policy loses when it sees through the camera instead of the simulator, on the same episodes.
 

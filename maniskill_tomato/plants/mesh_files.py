@@ -11,7 +11,9 @@ from numpy.typing import NDArray
 
 from maniskill_tomato.array_files import read_arrays
 from maniskill_tomato.errors import InvalidInputError
+from maniskill_tomato.plants.mesh_colours import Paint, paint_of
 from maniskill_tomato.plants.meshing import Float64, Int64
+from maniskill_tomato.plants.organs import UInt8
 
 MESH_SUFFIXES: Final = (".glb", ".gltf", ".obj", ".ply", ".npz")
 """Endings of the files that can be a plant."""
@@ -34,6 +36,8 @@ class MeshObject:
     """Shape (V, 3)."""
     faces: Int64
     """Vertex indices. Shape (F, 3)."""
+    paint: Paint | None = None
+    """Its colours; None if the file has none."""
     has_holes: bool = False
     """Whether the alpha channel of its texture makes parts of it invisible."""
 
@@ -96,6 +100,7 @@ def _read_scene(path: Path, suffix: str) -> Iterator[MeshObject]:
     options: dict[str, Any] = {"split_objects": True} if suffix == ".obj" else {}
     scene = trimesh.load_scene(path, process=False, **options)
     parents = scene.graph.transforms.parents
+    images: dict[object, UInt8] = {}
     for node in scene.graph.nodes_geometry:
         T_scene_node, geometry = scene.graph[node]
         mesh = scene.geometry[geometry]
@@ -109,17 +114,19 @@ def _read_scene(path: Path, suffix: str) -> Iterator[MeshObject]:
         if np.linalg.det(T[:3, :3]) < 0.0:
             faces = faces[:, ::-1]  # A mirrored node turns its triangles inside out.
         vertices = np.asarray(mesh.vertices, dtype=np.float64) @ T[:3, :3].T + T[:3, 3]
+        paint = paint_of(mesh.visual, faces, images, linear=suffix in (".glb", ".gltf"))
         labels = _face_labels(path, mesh) if suffix == ".ply" else None
-        for number, own in [(None, faces)] if labels is None else _by_label(labels, faces):
+        for number, rows in [(None, np.arange(len(faces)))] if labels is None else _by_label(labels):
             named = path.stem if suffix == ".ply" else name
             if number is not None:
                 named = number
-            used, inverse = np.unique(own, return_inverse=True)
+            used, inverse = np.unique(faces[rows], return_inverse=True)
             # Exporters cut meshes along the seams of textures and normals: the same place is one vertex again.
             yield MeshObject(
                 named,
                 label,
                 *_joined_corners(vertices[used][inverse.reshape(-1, 3)]),
+                paint=None if paint is None else Paint(paint.image, paint.uvs[rows]),
                 has_holes=_has_holes(material),
             )
 
@@ -151,10 +158,11 @@ def _face_labels(path: Path, mesh: Any) -> tuple[str, NDArray[Any]] | None:
     return None
 
 
-def _by_label(labels: tuple[str, NDArray[Any]], faces: Int64) -> Iterator[tuple[str | None, Int64]]:
+def _by_label(labels: tuple[str, NDArray[Any]]) -> Iterator[tuple[str | None, Int64]]:
+    """The name of each object and the numbers of its faces."""
     name, values = labels
     for value in np.unique(values):
-        yield f"{name}_{value:g}", faces[values == value]
+        yield f"{name}_{value:g}", np.flatnonzero(values == value)
 
 
 def _has_holes(material: Any) -> bool:

@@ -1,6 +1,7 @@
 """A plant of somebody else's making: the objects of a mesh file as organs and fruits."""
 
 from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Final
 
@@ -8,9 +9,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from maniskill_tomato.errors import InvalidInputError
+from maniskill_tomato.plants.decimation import decimated
 from maniskill_tomato.plants.fruit import SKIN_VARIANTS
 from maniskill_tomato.plants.generator import FRUIT_CLASS
 from maniskill_tomato.plants.leaf import LEAF_VARIANTS
+from maniskill_tomato.plants.mesh_colours import Paint
 from maniskill_tomato.plants.mesh_files import MeshObject, read_objects
 from maniskill_tomato.plants.mesh_rules import METRES, MeshRules, OrganKind
 from maniskill_tomato.plants.meshing import Float64, Int64, cross, normalized
@@ -25,19 +28,50 @@ PLANT_HEIGHTS: Final = (0.05, 6.0)
 FARTHEST_AXIS: Final = 1.0
 """How far the middle of a plant may be from its origin, along the ground, in [m]."""
 
+WELD: Final = 5e-6
+"""Vertices of one object that are nearer to each other are one where it is decimated, in [m]; single precision moves
+them by less."""
+
 TEXTURE_LENGTH: Final = 0.1
 """Length of a stem over which its texture repeats, in [m]."""
+
+
+@dataclass(frozen=True, eq=False)
+class _Surface:
+    """The triangles of an object, in the plant frame, and what its file paints them with."""
+
+    vertices: Float64
+    """In [m]. Shape (V, 3)."""
+    faces: Int64
+    """Shape (F, 3)."""
+    paints: tuple[Paint | None, ...]
+    """Those of the object's parts; the places of a part's triangles stand in `uvs`."""
+    paint_of_face: Int64
+    """Which of them each triangle has. Shape (F,)."""
+    uvs: Float64
+    """Where the corners of each triangle are in its image. Shape (F, 3, 2)."""
+
+    def of(self, rows: NDArray[np.int64] | NDArray[np.bool_]) -> "_Surface":
+        """Some of the triangles, and the vertices that they need."""
+        used, inverse = np.unique(self.faces[rows], return_inverse=True)
+        return replace(
+            self,
+            vertices=self.vertices[used],
+            faces=inverse.reshape(-1, 3),
+            paint_of_face=self.paint_of_face[rows],
+            uvs=self.uvs[rows],
+        )
 
 
 def plant_from_mesh(path: Path, rules: MeshRules, seed: int = 0) -> Plant:
     """Reads a plant from a mesh file.
 
-    Leaves and stalks that are open surfaces are drawn from both sides; rays meet both sides anyway. Surfaces look like
-    ours: the file's own colours and textures are not used.
+    Leaves and stalks that are open surfaces are drawn from both sides; rays meet both sides anyway. Surfaces have the
+    file's own colours where it gives any, and look like ours elsewhere.
 
     Args:
         path: The file.
-        rules: Which object is what, and unit, axes and place.
+        rules: Which object is what, unit, axes and place, and the budget of triangles.
         seed: The number that the plant has in its set, kept in `Plant.seed`.
 
     Returns:
@@ -45,26 +79,28 @@ def plant_from_mesh(path: Path, rules: MeshRules, seed: int = 0) -> Plant:
 
     Raises:
         InvalidInputError: The file cannot be read, an object is none of the kinds or a card with a cut-out texture, a
-            fruit's or the plant's size is impossible, or no fruit is ripe. The message names the object.
+            fruit's or the plant's size is impossible, no fruit is ripe, or so few triangles would not do. The message
+            names the object.
     """
     T = rules.T_plant_file(path.suffix)
     kinds = _sorted_by_kind(path, read_objects(path), rules)
+    surfaces = [_placed(_joined(parts), T) for _, _, parts in kinds]
+    if rules.triangles is not None:
+        surfaces = _within(path, surfaces, [name for _, name, _ in kinds], rules.triangles)
     organs: list[Organ] = []
     fruits: list[Fruit] = []
-    for index, (kind, name, parts) in enumerate(kinds):
-        vertices, faces = _joined(parts)
-        vertices = np.round(vertices @ T[:3, :3].T + T[:3, 3], 6) + 0.0
+    for index, ((kind, name, parts), surface) in enumerate(zip(kinds, surfaces, strict=True)):
         if kind != "fruit":
-            organs.append(_green_organ(kind, name, vertices, faces, index))
+            organs.append(_green_organ(kind, name, surface, index))
             continue
         ripeness = rules.ripeness_of(name, parts[0].material)
-        for number, (own, own_faces) in enumerate(_fruit_meshes(vertices, faces, rules.fruits)):
+        for number, own in enumerate(_fruit_surfaces(surface, rules.fruits)):
             called = name if rules.fruits == "objects" else f"{name}_{number:02d}"
-            centre, radius = _fitted(path, called, own, own_faces, rules)
+            centre, radius = _fitted(path, called, own.vertices, own.faces, rules)
             material = f"fruit_{ripeness}_{len(fruits) % SKIN_VARIANTS[ripeness]}"
-            part = _part(own, own_faces, _round_uvs(own, centre), material)
+            meshes = _mesh_parts(own, _round_uvs(own.vertices, centre), material)
             fruits.append(Fruit(len(organs), centre.astype(np.float32), radius, ripeness))
-            organs.append(Organ(called, FRUIT_CLASS[ripeness], (part,)))
+            organs.append(Organ(called, FRUIT_CLASS[ripeness], meshes))
     plant = Plant(preset=path.stem, seed=seed, detail="training", organs=tuple(organs), fruits=tuple(fruits))
     _check_plant(path, plant, rules)
     return plant
@@ -103,48 +139,150 @@ def _sorted_by_kind(
     ]
 
 
-def _joined(parts: Sequence[MeshObject]) -> tuple[Float64, Int64]:
+def _joined(parts: Sequence[MeshObject]) -> _Surface:
     offsets = np.cumsum([0] + [len(part.vertices) for part in parts[:-1]])
-    faces = np.concatenate([part.faces + k for part, k in zip(parts, offsets, strict=True)])
-    return np.concatenate([part.vertices for part in parts]), faces
+    plain = [np.zeros((len(part.faces), 3, 2)) for part in parts]
+    return _Surface(
+        vertices=np.concatenate([part.vertices for part in parts]),
+        faces=np.concatenate([part.faces + k for part, k in zip(parts, offsets, strict=True)]),
+        paints=tuple(part.paint for part in parts),
+        paint_of_face=np.repeat(np.arange(len(parts)), [len(part.faces) for part in parts]),
+        uvs=np.concatenate(
+            [p.paint.uvs if p.paint else zeros for p, zeros in zip(parts, plain, strict=True)]
+        ),
+    )
 
 
-def _green_organ(kind: OrganKind, name: str, vertices: Float64, faces: Int64, index: int) -> Organ:
-    if kind == "leaf":
-        labels = _pieces(len(vertices), faces)
-        part = _part(
-            vertices, faces, _blade_uvs(vertices, labels), f"leaf_upper_{index % LEAF_VARIANTS}", sheet=True
+def _placed(surface: _Surface, T: Float64) -> _Surface:
+    """In the plant frame, rounded to a micrometre."""
+    return replace(surface, vertices=np.round(surface.vertices @ T[:3, :3].T + T[:3, 3], 6) + 0.0)
+
+
+def _within(path: Path, surfaces: Sequence[_Surface], names: Sequence[str], triangles: int) -> list[_Surface]:
+    """The surfaces with no more than so many triangles in all; what matters least to their shapes goes first."""
+    whole = [_welded(surface) for surface in surfaces]
+    firsts = np.cumsum([0] + [len(surface.vertices) for surface in whole])
+    owner = np.repeat(np.arange(len(whole)), [len(surface.faces) for surface in whole])
+    faces = np.concatenate([surface.faces for surface in whole]) + firsts[owner, None]
+    vertices, left, kept = decimated(np.concatenate([s.vertices for s in whole]), faces, triangles)
+    counts = np.bincount(owner[kept], minlength=len(whole))
+    gone = [
+        name
+        for name, count, surface in zip(names, counts, whole, strict=True)
+        if len(surface.faces) and not count
+    ]
+    if gone or len(kept) > triangles:
+        why = f"nothing would be left of {gone[0]!r}" if gone else f"its shapes need {len(kept)}"
+        raise InvalidInputError(
+            f"{path} has {len(faces)} triangles and cannot be decimated to triangles={triangles}: {why}; allow more, "
+            "or leave triangles out"
         )
-        return Organ(name, SemanticClass.LEAF, (part,))
+    rows = np.cumsum([0, *counts])
+    starts = np.cumsum([0] + [len(surface.faces) for surface in whole])
+    return [
+        replace(
+            surface,
+            vertices=np.round(vertices[firsts[k] : firsts[k + 1]], 6) + 0.0,
+            faces=left[rows[k] : rows[k + 1]] - firsts[k],
+            paint_of_face=surface.paint_of_face[kept[rows[k] : rows[k + 1]] - starts[k]],
+            uvs=surface.uvs[kept[rows[k] : rows[k + 1]] - starts[k]],
+        ).of(np.arange(counts[k]))
+        for k, surface in enumerate(whole)
+    ]
+
+
+def _welded(surface: _Surface) -> _Surface:
+    """The triangles that have an area, with vertices that are nearer to each other than `WELD` as one."""
+    from scipy.sparse import coo_array
+    from scipy.sparse.csgraph import connected_components
+    from scipy.spatial import cKDTree
+
+    count = len(surface.vertices)
+    pairs = cKDTree(surface.vertices).query_pairs(WELD, output_type="ndarray")
+    graph = coo_array((np.ones(len(pairs), np.int8), (pairs[:, 0], pairs[:, 1])), shape=(count, count))
+    labels = connected_components(graph, directed=False)[1]
+    _, first = np.unique(labels, return_index=True)
+    faces = first[labels][surface.faces]
+    return replace(surface, faces=faces).of(np.flatnonzero(_across(surface.vertices, faces).any(1)))
+
+
+def _green_organ(kind: OrganKind, name: str, surface: _Surface, index: int) -> Organ:
+    vertices = surface.vertices
+    if kind == "leaf":
+        uvs = _blade_uvs(vertices, _pieces(len(vertices), surface.faces))
+        parts = _mesh_parts(surface, uvs, f"leaf_upper_{index % LEAF_VARIANTS}", sheet=True)
+        return Organ(name, SemanticClass.LEAF, parts)
     uvs = np.stack([vertices[:, 0] + vertices[:, 1], vertices[:, 2]], 1) / TEXTURE_LENGTH
-    return Organ(name, SemanticClass.STEM, (_part(vertices, faces, uvs, "stem", sheet=True),))
+    return Organ(name, SemanticClass.STEM, _mesh_parts(surface, uvs, "stem", sheet=True))
 
 
-def _part(vertices: Float64, faces: Int64, uvs: Float64, material: str, *, sheet: bool = False) -> MeshPart:
-    """A part with smooth normals.
+def _mesh_parts(
+    surface: _Surface, uvs: Float64, material: str, *, sheet: bool = False
+) -> tuple[MeshPart, ...]:
+    """A part for each image of the file and one for what it does not paint, with smooth normals.
 
     Args:
-        vertices: In [m]. Shape (V, 3).
-        faces: Shape (F, 3).
-        uvs: Shape (V, 2).
+        surface: The triangles.
+        uvs: Where their vertices are in our texture. Shape (V, 2).
         material: Its name.
         sheet: Whether it may be an open surface, which is then drawn from both sides.
     """
-    corners = vertices[faces]
-    across = cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    kept = (across * across).sum(1) > 0.0
-    faces, across = faces[kept], across[kept]
-    normals = np.zeros_like(vertices)
+    across = _across(surface.vertices, surface.faces)
+    kept = np.flatnonzero((across * across).sum(1) > 0.0)
+    normals = np.zeros_like(surface.vertices)
     for k in range(3):
-        np.add.at(normals, faces[:, k], across)
-    return MeshPart(
-        vertices=vertices.astype(np.float32),
-        normals=normalized(normals).astype(np.float32),
-        uvs=uvs.astype(np.float32),
-        faces=faces.astype(np.int32),
-        material=material,
-        two_sided=sheet and not _is_closed(faces),
-    )
+        np.add.at(normals, surface.faces[kept, k], across[kept])
+    normals = normalized(normals)
+    two_sided = sheet and not _is_closed(surface.faces[kept])
+    parts = []
+    for number, paint in enumerate(surface.paints):
+        own = kept[surface.paint_of_face[kept] == number]
+        faces = surface.faces[own]
+        if not len(own) and len(surface.paints) > 1:
+            continue
+        if paint is None:
+            used = np.arange(len(surface.vertices))
+            if len(surface.paints) > 1:
+                used, inverse = np.unique(faces, return_inverse=True)
+                faces = inverse.reshape(-1, 3)
+            places = uvs[used]
+        else:
+            used, places, faces = _split_at_seams(faces, surface.uvs[own])
+        parts.append(
+            MeshPart(
+                vertices=surface.vertices[used].astype(np.float32),
+                normals=normals[used].astype(np.float32),
+                uvs=places.astype(np.float32),
+                faces=faces.astype(np.int32),
+                material=material,
+                two_sided=two_sided,
+                texture=None if paint is None else paint.image,
+            )
+        )
+    return tuple(parts)
+
+
+def _split_at_seams(faces: Int64, uvs: Float64) -> tuple[Int64, Float64, Int64]:
+    """Vertices of which each has one place in an image.
+
+    Args:
+        faces: Shape (F, 3).
+        uvs: Places of their corners. Shape (F, 3, 2).
+
+    Returns:
+        Which of the old vertices each is, its place, and the faces. Shapes (V,), (V, 2), (F, 3).
+    """
+    from trimesh.grouping import unique_rows
+
+    corners, places = faces.reshape(-1), uvs.reshape(-1, 2)
+    first, inverse = unique_rows(np.column_stack([corners, np.round(places * 1e5).astype(np.int64)]))
+    return corners[first], places[first], inverse.reshape(-1, 3).astype(np.int64)
+
+
+def _across(vertices: Float64, faces: Int64) -> Float64:
+    """Normals of triangles, twice as long as their areas are large. Shape (F, 3)."""
+    corners = vertices[faces]
+    return cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
 
 
 def _is_closed(faces: Int64) -> bool:
@@ -166,13 +304,14 @@ def _pieces(vertices: int, faces: Int64) -> Int64:
     return np.asarray(connected_components(graph, directed=False)[1], dtype=np.int64)
 
 
-def _fruit_meshes(vertices: Float64, faces: Int64, fruits: str) -> Iterable[tuple[Float64, Int64]]:
-    """Vertices and faces of each fruit of an object, from the lowest up.
+def _fruit_surfaces(surface: _Surface, fruits: str) -> Iterable[_Surface]:
+    """Each fruit of an object, from the lowest up.
 
     A piece whose middle lies in a larger one, such as a seed or a calyx, is part of that.
     """
     if fruits == "objects":
-        return [(vertices, faces)]
+        return [surface]
+    vertices, faces = surface.vertices, surface.faces
     labels = _pieces(len(vertices), faces)
     kinds = np.unique(labels[faces[:, 0]])
     centres = np.stack([vertices[labels == kind].mean(0) for kind in kinds])
@@ -183,12 +322,8 @@ def _fruit_meshes(vertices: Float64, faces: Int64, fruits: str) -> Iterable[tupl
     for i in np.argsort(-radii, kind="stable").tolist():
         inside = [j for j in owner if np.linalg.norm(centres[i] - centres[j]) < radii[j]]
         owner.setdefault(inside[0] if inside else i, []).append(i)
-    meshes = []
-    for members in (owner[i] for i in sorted(owner, key=lambda i: centres[i][::-1].tolist())):
-        own = faces[np.isin(labels[faces[:, 0]], kinds[members])]
-        used, inverse = np.unique(own, return_inverse=True)
-        meshes.append((vertices[used], inverse.reshape(-1, 3)))
-    return meshes
+    order = sorted(owner, key=lambda i: centres[i][::-1].tolist())
+    return [surface.of(np.isin(labels[faces[:, 0]], kinds[owner[i]])) for i in order]
 
 
 def _fitted(
@@ -196,8 +331,7 @@ def _fitted(
 ) -> tuple[Float64, float]:
     """Centre of a fruit's surface and the radius of the sphere about it that holds every vertex, in [m]."""
     corners = vertices[faces]
-    across = cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    weights = np.sqrt((across * across).sum(1))
+    weights = np.linalg.norm(_across(vertices, faces), axis=1)
     if not weights.sum() > 0.0:
         raise InvalidInputError(f"{path}: fruit {name!r} has no surface; all its triangles are flat")
     centre = np.round((corners.mean(1) * weights[:, None]).sum(0) / weights.sum(), 6)

@@ -11,6 +11,9 @@ from maniskill_tomato.errors import InvalidInputError
 from maniskill_tomato.plants.meshing import Float64
 from maniskill_tomato.plants.organs import Ripeness
 
+FEWEST_TRIANGLES: Final = 500
+"""The smallest budget for a plant."""
+
 OrganKind = Literal["leaf", "stem", "fruit", "ignore"]
 Unit = Literal["m", "cm", "mm", "in"]
 Axis = Literal["x", "y", "z", "-x", "-y", "-z"]
@@ -59,6 +62,9 @@ class MeshRules:
     """Fruits that are green, by their object or material."""
     turning: tuple[str, ...] = ("*turning*",)
     """Fruits that are turning; all others are ripe."""
+    triangles: int | None = None
+    """The most triangles that a plant keeps: a larger one is decimated, and its leaves keep their outlines; None keeps
+    all."""
     fruits: Literal["objects", "pieces"] = "objects"
     """Whether each object is one fruit, or each connected piece of one."""
     units: Unit = "m"
@@ -81,6 +87,12 @@ class MeshRules:
                     f"{name} must be a pattern such as '{name}_*' or a list of them; got {given!r}"
                 )
             object.__setattr__(self, name, tuple(patterns))
+        budget: object = self.triangles
+        if budget is not None and not (type(budget) is int and budget >= FEWEST_TRIANGLES):
+            raise InvalidInputError(
+                f"triangles must be a whole number of {FEWEST_TRIANGLES} or more, or be left out to keep all; got "
+                f"{budget!r}"
+            )
         for name, choices in (("fruits", ("objects", "pieces")), ("units", get_args(Unit))):
             if getattr(self, name) not in choices:
                 raise InvalidInputError.choice(name, getattr(self, name), choices)

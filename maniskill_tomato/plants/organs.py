@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 Float32 = NDArray[np.float32]
 Int32 = NDArray[np.int32]
+UInt8 = NDArray[np.uint8]
 Ripeness = Literal["ripe", "turning", "green"]
 
 
@@ -50,6 +51,8 @@ class MeshPart:
     """Name of the material, a key of `materials.MATERIALS`."""
     two_sided: bool = False
     """Whether a renderer, which draws only what faces the camera, must draw both sides; rays meet both anyway."""
+    texture: UInt8 | None = None
+    """Base colours of its mesh file, sRGB with alpha, in place of those of the material. Shape (rows, columns, 4)."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -105,7 +105,8 @@ def plant_bytes(plant: Plant) -> int:
     """What a plant takes in memory, in [bytes]."""
     parts = [part for organ in plant.organs for part in organ.parts]
     vertices, faces = (sum(len(getattr(part, name)) for part in parts) for name in ("vertices", "faces"))
-    return BYTES_OF_A_VERTEX * vertices + BYTES_OF_A_FACE * faces
+    textures = {id(part.texture): part.texture.nbytes for part in parts if part.texture is not None}
+    return BYTES_OF_A_VERTEX * vertices + BYTES_OF_A_FACE * faces + sum(textures.values())
 
 
 PLANT_STORE: Final = ByteStore(store_limit)

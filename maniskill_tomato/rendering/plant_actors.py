@@ -44,13 +44,16 @@ def make_render_shape(
 
     Args:
         part: What to show.
-        materials: Materials made so far, by name; a missing one is made and added.
+        materials: Materials made so far, by name; a missing one is made and added. What keeps it keeps the part, too:
+            the name of a file's own texture is its place in memory.
     """
     import sapien.render
 
-    if part.material not in materials:
+    name = part.material if part.texture is None else f"{part.material} {id(part.texture)}"
+    if name not in materials:
         made = MATERIALS[part.material]
-        materials[part.material] = textured_material(made.base_color, made.roughness, made.specular)
+        pixels = made.base_color if part.texture is None else part.texture
+        materials[name] = textured_material(pixels, made.roughness, made.specular)
     vertices, normals, uvs, faces = part.vertices, part.normals, part.uvs, part.faces
     if part.two_sided:
         faces = np.concatenate([faces, faces[:, ::-1] + len(vertices)])
@@ -61,7 +64,7 @@ def make_render_shape(
         triangles=faces.astype(np.uint32),
         normals=normals,
         uvs=uvs,
-        material=materials[part.material],
+        material=materials[name],
     )
 
 

@@ -12,6 +12,9 @@ from mani_skill.envs.utils.system.backend import parse_sim_and_render_backend
 from mani_skill.render import PREBUILT_SHADER_CONFIGS, set_shader_pack
 from mani_skill.utils.structs.actor import Actor
 from numpy.typing import NDArray
+from PIL import Image
+from trimesh.visual import TextureVisuals
+from trimesh.visual.material import PBRMaterial
 
 from maniskill_tomato.plants.generator import generate_plant
 from maniskill_tomato.plants.mesh_plant import plant_from_mesh
@@ -35,6 +38,13 @@ def build(scene: ManiSkillScene, plant: Plant, x: float = 0.0) -> list[Actor]:
 
 def photograph(scene: ManiSkillScene, eye: list[float], forward: NDArray[np.float64]) -> NDArray[np.int64]:
     """A segmentation image by actor. Shape (320, 320)."""
+    return np.asarray(take(scene, eye, forward).get_picture("Segmentation")[..., 1], np.int64)
+
+
+def take(
+    scene: ManiSkillScene, eye: list[float], forward: NDArray[np.float64]
+) -> sapien.render.RenderCameraComponent:
+    """A camera that has taken its picture."""
     left = np.cross([0.0, 0.0, 1.0], forward)
     left /= np.linalg.norm(left)
     T_world_camera = np.eye(4)
@@ -44,7 +54,7 @@ def photograph(scene: ManiSkillScene, eye: list[float], forward: NDArray[np.floa
     camera.entity.set_pose(sapien.Pose(T_world_camera))
     scene.sub_scenes[0].update_render()
     camera.take_picture()
-    return np.asarray(camera.get_picture("Segmentation")[..., 1], np.int64)
+    return camera
 
 
 def test_a_scene_without_a_renderer_gets_an_actor_for_each_organ() -> None:
@@ -127,3 +137,39 @@ def test_an_open_sheet_of_a_mesh_file_is_drawn_from_both_sides(tmp_path: Path) -
         image = photograph(scene, [-0.7 * side, 0.0, 0.5], np.array([side, 0.0, 0.0]))
         assert leaf in image and fruit not in image
     assert fruit in photograph(scene, [0.0, -0.7, 0.5], np.array([0.0, 1.0, 0.0]))
+
+
+@pytest.mark.render
+def test_a_picture_shows_the_colours_of_a_file(tmp_path: Path) -> None:
+    """A leaf that its texture makes red at its right and blue at its left side, as seen from -x; a green fruit."""
+    pixels = np.zeros((8, 8, 3), np.uint8)
+    pixels[:, :4, 2], pixels[:, 4:, 0] = 230, 230
+    corners = [[-0.2, 0.1, 0.4], [-0.2, -0.1, 0.4], [-0.2, -0.1, 0.6], [-0.2, 0.1, 0.6]]
+    leaf = trimesh.Trimesh(corners, [[0, 1, 2], [0, 2, 3]], process=False)
+    material = PBRMaterial(name="blade", baseColorTexture=Image.fromarray(pixels))
+    leaf.visual = TextureVisuals(uv=np.array([[0.0, 0], [1, 0], [1, 1], [0, 1]]), material=material)
+    ball = trimesh.creation.icosphere(subdivisions=2, radius=0.03).apply_translation([0.0, 0.0, 0.8])
+    ball.visual = TextureVisuals(material=PBRMaterial(name="skin", baseColorFactor=[0.0, 0.6, 0.0, 1.0]))
+    turned = trimesh.Scene()
+    for name, mesh in {"leaf": leaf, "fruit": ball}.items():
+        turned.add_geometry(
+            mesh, node_name=name, transform=trimesh.transformations.rotation_matrix(-np.pi / 2, [1, 0, 0])
+        )
+    turned.export(tmp_path / "a.glb")
+    plant = plant_from_mesh(tmp_path / "a.glb", MeshRules())
+    scene = make_scene("cpu")
+    build(scene, plant)
+    scene.sub_scenes[0].set_ambient_light([0.8, 0.8, 0.8])
+    picture = np.asarray(take(scene, [-0.9, 0.0, 0.6], np.array([1.0, 0.0, 0.0])).get_picture("Color"))[
+        ..., :3
+    ]
+    pixels_per_metre = 160 / np.tan(0.6)
+
+    def at(x: float, y: float, z: float) -> NDArray[np.float64]:
+        scale = pixels_per_metre / (x + 0.9)
+        return np.asarray(picture[int(160 - (z - 0.6) * scale), int(160 - y * scale)], np.float64)
+
+    red, blue, green = at(-0.2, -0.05, 0.5), at(-0.2, 0.05, 0.5), at(-0.03, 0.0, 0.8)
+    for colour, channel in ((red, 0), (blue, 2), (green, 1)):
+        others = np.delete(colour, channel)
+        assert colour[channel] > 3 * others.max() and colour[channel] > 0.1

@@ -34,7 +34,7 @@ class PlantMaterials(dict[str, sapien.render.RenderMaterial]):
         self._seed = int(rng.integers(2**31))
 
     def __contains__(self, name: object) -> bool:
-        return name in MATERIALS
+        return name in MATERIALS or super().__contains__(name)  # The others are a mesh file's own.
 
     def __missing__(self, name: str) -> sapien.render.RenderMaterial:
         material = MATERIALS[name]
