@@ -6,7 +6,7 @@ import json
 import subprocess
 import sys
 import tomllib
-from importlib.metadata import distributions, entry_points
+from importlib.metadata import distributions, entry_points, metadata
 from pathlib import Path
 from typing import Any
 
@@ -168,6 +168,20 @@ def test_assets_are_real_files_under_the_size_limit() -> None:
 def test_the_console_command_is_declared() -> None:
     (entry,) = entry_points(group="console_scripts", name="maniskill-tomato")
     assert entry.value == "maniskill_tomato.cli:main"
+
+
+@needs_checkout
+def test_the_citation_names_this_version_and_the_authors_of_the_package() -> None:
+    citation = (ROOT / "CITATION.cff").read_text(encoding="utf-8").splitlines()
+    about = metadata("maniskill-tomato")
+    assert about["Version"] == maniskill_tomato.__version__
+    lines = (
+        f"version: {about['Version']}",
+        f"license: {about['License-Expression']}",
+        f"  - name: {about['Author']}",
+    )
+    assert [line for line in lines if line not in citation] == []
+    assert about["Author"] in (ROOT / "LICENSE").read_text(encoding="utf-8")
 
 
 def test_gymnasium_entry_point_is_not_declared() -> None:
