@@ -34,6 +34,9 @@ class JudgeOcclusion:
     """Folder of occlusion.md and occlusion.json, or of steps.png."""
     models: tuple[OcclusionModelName, ...] = ("thesis", "improved", "sphere", "amodal")
     """Which models."""
+    segmenter: str | None = None
+    """Name of a segmenter, or a file of weights, that finds the tomatoes; the models then measure as on the robot. By
+    default they are given the true masks."""
     count: int | None = None
     """Only the first images; all by default."""
     categories: tuple[str, ...] = ("tomato_ripe",)
@@ -48,6 +51,8 @@ class JudgeOcclusion:
     def run(self) -> None:
         """Runs the models and prints the tables."""
         check_folder("--data", self.data)
+        if self.segmenter is not None:
+            check_segmenter("--segmenter", self.segmenter)
         check_counts(count=self.count)
 
         from tqdm import tqdm
@@ -73,6 +78,7 @@ class JudgeOcclusion:
                 categories=self.categories,
                 min_visible=self.min_visible,
                 min_total=self.min_total,
+                segmenter=self.segmenter,
                 on_image=bar.update,
             )
         print(text)

@@ -11,6 +11,8 @@ from maniskill_tomato.experiments.occlusion_scores import annotated_fruits, judg
 from maniskill_tomato.files import write_atomically
 from maniskill_tomato.segmentation.datasets.annotations import AnnotatedImage
 from maniskill_tomato.segmentation.datasets.reading import read_annotated
+from maniskill_tomato.segmentation.segmenter import make_segmenter
+from maniskill_tomato.sensing.fruit_detector import robots_model
 from maniskill_tomato.sensing.visible_fraction.occlusion_models import make_occlusion_model
 from maniskill_tomato.sensing.visible_fraction.thesis import ThesisModel
 
@@ -23,6 +25,7 @@ def report_occlusion(
     categories: Sequence[str],
     min_visible: int,
     min_total: int,
+    segmenter: str | None = None,
     on_image: Callable[[int], object] | None = None,
 ) -> str:
     """Judges models and writes occlusion.md, and occlusion.json with every single judgement.
@@ -34,21 +37,33 @@ def report_occlusion(
         categories: Which tomatoes count.
         min_visible: Tomatoes seen in fewer pixels are left out.
         min_total: Tomatoes whose whole silhouette has fewer pixels, too.
+        segmenter: Name or weights of the one that finds the tomatoes; None gives the models the true masks.
         on_image: Called with 1 after every image.
 
     Returns:
         The tables as Markdown.
     """
+    found_by = None if segmenter is None else make_segmenter(segmenter)
     judged, milliseconds = judge(
         tuple(images),
-        {name: make_occlusion_model(name) for name in models},
+        {
+            name: robots_model() if found_by and name == "sphere" else make_occlusion_model(name)
+            for name in models
+        },
+        segmenter=found_by,
         min_visible=min_visible,
         min_total=min_total,
         on_image=on_image,
     )
     judged = [j for j in judged if j.category in categories]
+    masks = (
+        "true masks"
+        if segmenter is None
+        else f"masks of {segmenter}; failures are tomatoes that it missed, too"
+    )
     text = (
-        f"{len(images)} images, {', '.join(categories)}, at least {min_visible} px visible, {min_total} px in all."
+        f"{len(images)} images, {', '.join(categories)}, at least {min_visible} px visible, {min_total} px in all, "
+        f"{masks}."
         f"\n\n{markdown(judged, milliseconds)}"
     )
     write_atomically(out / "occlusion.md", text.encode())

@@ -5,14 +5,23 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from maniskill_tomato.report_design import markdown_table
 from maniskill_tomato.robot.d435 import CameraIntrinsics
 from maniskill_tomato.segmentation.datasets.annotations import AnnotatedImage, Instance
+from maniskill_tomato.segmentation.instances import Instances
+from maniskill_tomato.segmentation.metrics.detection_metrics import mask_overlaps
+from maniskill_tomato.segmentation.segmenter import Segmenter
+from maniskill_tomato.sensing.fruit_detector import FruitDetector
+from maniskill_tomato.sensing.posed_frame import PosedFrame
 from maniskill_tomato.sensing.visible_fraction.estimate import OcclusionModel, SegmentedImage
 
 BANDS = ((0.0, 0.2), (0.2, 0.4), (0.4, 0.6), (0.6, 0.8), (0.8, 0.95), (0.95, 1.001))
 """Levels of the true visible fraction."""
+
+SAME_FRUIT = 0.5
+"""Intersection over union of a fruit's visible pixels and a mask from which on the mask is that fruit's."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -66,6 +75,7 @@ def judge(
     images: tuple[AnnotatedImage, ...],
     models: Mapping[str, OcclusionModel],
     *,
+    segmenter: Segmenter | None = None,
     min_visible: int = 100,
     min_total: int = 400,
     on_image: Callable[[int], object] | None = None,
@@ -75,13 +85,15 @@ def judge(
     Args:
         images: With depth, cameras and V_f.
         models: By name.
+        segmenter: What finds the fruits, measured as a robot does (`FruitDetector`); one that no mask shares half with
+            counts as a failure. None gives the models the true masks.
         min_visible: Fruits seen in fewer pixels are left out of the judgement.
         min_total: Fruits whose whole silhouette has fewer pixels, too: those of the rows behind. At 640 x 480 a tomato
             30 mm in radius has 400 px at 1.6 m.
         on_image: Called with 1 after every image.
 
     Returns:
-        Every single judgement, and each model's mean processor time for an image, in [ms].
+        Every single judgement, and each model's mean processor time for an image, in [ms], without the segmenter's.
     """
     results: list[Judged] = []
     seconds = dict.fromkeys(models, 0.0)
@@ -91,9 +103,13 @@ def judge(
         view = make_view(image, fruits)
         if view is not None and fruits:
             count += 1
+            found = None if segmenter is None else segmenter(view.rgb, view.depth_m.astype(np.float32))
             for name, model in models.items():
                 start = time.process_time()
-                estimates = model(view)
+                if found is None:
+                    estimates = [estimate.visible_fraction for estimate in model(view)]
+                else:
+                    estimates = _measured(image, view, fruits, model, found)
                 seconds[name] += time.process_time() - start
                 for fruit, estimate in zip(fruits, estimates, strict=True):
                     assert fruit.visible_mask is not None and fruit.visible_fraction is not None
@@ -107,12 +123,42 @@ def judge(
                             category=fruit.category,
                             visible_px=area,
                             truth=fruit.visible_fraction,
-                            estimate=estimate.visible_fraction,
+                            estimate=estimate,
                         )
                     )
         if on_image is not None:
             on_image(1)
     return results, {name: 1000 * s / max(count, 1) for name, s in seconds.items()}
+
+
+def _measured(
+    image: AnnotatedImage,
+    view: SegmentedImage,
+    fruits: list[Instance],
+    model: OcclusionModel,
+    found: Instances,
+) -> list[float]:
+    """V_f of each annotated fruit as a robot measures it that was told what a segmenter found; NaN where it did not."""
+    assert image.camera is not None
+    frame = PosedFrame(
+        depth_m=view.depth_m.astype(np.float32),
+        intrinsics=view.intrinsics,
+        T_world_camera=image.camera.T_world_optical,
+        rgb=view.rgb,
+    )
+
+    def told(image: NDArray[np.uint8], depth_m: NDArray[np.float32] | None = None) -> Instances:
+        return found
+
+    measurement = FruitDetector(told, model).measure(frame)
+    shape = (-1, *view.depth_m.shape)
+    masks = np.array([measurement.mask(k) for k in range(len(measurement.fruits))], bool).reshape(shape)
+    estimates = []
+    for overlaps in mask_overlaps(np.array(view.masks, bool).reshape(shape), masks):
+        best = int(overlaps.argmax()) if len(overlaps) else -1
+        shared = best >= 0 and overlaps[best] >= SAME_FRUIT
+        estimates.append(measurement.fruits[best].visible_fraction if shared else float("nan"))
+    return estimates
 
 
 def score(judged: list[Judged]) -> Score:

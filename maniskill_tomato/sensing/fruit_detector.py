@@ -37,6 +37,11 @@ SURFACE_SHARE: Final = 0.7
 """The centre of a fruit lies this share of a radius behind the median depth of its visible surface."""
 
 
+def robots_model() -> SphereModel:
+    """`SphereModel` with the size of the tasks' tomatoes."""
+    return SphereModel(SphereConfig(radius_m=USUAL_RADIUS, radius_spread=RADIUS_SPREAD))
+
+
 class FruitDetector:
     """Measures frames; the same for simulated and real cameras."""
 
@@ -46,10 +51,10 @@ class FruitDetector:
         Args:
             segmenter: Finds fruits in colours and depth; None takes `PosedFrame.told_fruits`, or where there are none
                 the ripe ones of `PosedFrame.true_fruits`.
-            model: Estimates V_f and centre; by default `SphereModel` with the size of the tasks' tomatoes.
+            model: Estimates V_f and centre; by default `robots_model`.
         """
         self._segmenter = segmenter
-        self._model = model or SphereModel(SphereConfig(radius_m=USUAL_RADIUS, radius_spread=RADIUS_SPREAD))
+        self._model = model or robots_model()
 
     def measure(self, frame: PosedFrame) -> Measurement:
         """The fruits of a frame.

@@ -1,8 +1,18 @@
 """Errors of occlusion models on annotated images, summed up."""
 
-import pytest
+from pathlib import Path
 
-from maniskill_tomato.experiments.occlusion_scores import Judged, by_band, markdown, score
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from maniskill_tomato.experiments.occlusion_scores import Judged, by_band, judge, markdown, score
+from maniskill_tomato.robot.d435 import color_intrinsics
+from maniskill_tomato.segmentation.datasets.annotations import AnnotatedImage, CameraView, Instance
+from maniskill_tomato.segmentation.datasets.picture_files import write_picture
+from maniskill_tomato.segmentation.instances import Instances, mask_box
+from maniskill_tomato.segmentation.masks import EncodedMask
+from maniskill_tomato.sensing.fruit_detector import robots_model
 
 
 def test_scores_follow_from_the_errors() -> None:
@@ -17,3 +27,70 @@ def test_scores_follow_from_the_errors() -> None:
     assert result.bias == pytest.approx(0.0) and result.rmse == pytest.approx(0.1)
     assert [s.count for _, s in by_band(judged)] == [1, 0, 1, 0, 1, 0]
     assert "| m | 3 | 0.233 |" in markdown(judged, {"m": 3.0})
+
+
+SIZE = (320, 240)
+INTRINSICS = color_intrinsics(*SIZE)
+
+
+def discs(tmp_path: Path) -> tuple[AnnotatedImage, list[NDArray[np.bool_]]]:
+    """An image of three fruits, 58 mm wide and 0.85 times as high, at 0.5 m: free, half behind a board, free."""
+    columns, rows = np.meshgrid(np.arange(SIZE[0]) + 0.5, np.arange(SIZE[1]) + 0.5)
+    radius = 0.029 * INTRINSICS.fx / 0.5
+    depth = np.full(columns.shape, 1.0)
+    masks, instances = [], []
+    for k, (x, y) in enumerate(((70.0, 120.0), (160.0, 120.0), (250.0, 120.0))):
+        away = ((columns - x) ** 2 + ((rows - y) / 0.85) ** 2) / radius**2
+        whole = away < 1.0
+        depth[whole] = 0.5 - 0.029 * np.sqrt(1.0 - away[whole])
+        seen = whole & ~((columns > x) & (k == 1))
+        depth[(np.abs(columns - x - 20) < 20) & (np.abs(rows - y) < 40) & (k == 1)] = 0.4
+        masks.append(seen)
+        encoded = EncodedMask.encode(seen)
+        instances.append(
+            Instance(
+                category="tomato_ripe",
+                box_xywh=encoded.box_xywh,
+                visible_mask=encoded,
+                visible_fraction=float(seen.sum() / whole.sum()),
+                name=f"fruit_{k}",
+            )
+        )
+    write_picture(tmp_path / "a.png", np.full((*columns.shape, 3), 90, np.uint8))
+    write_picture(tmp_path / "d.png", np.round(1000 * depth).astype(np.uint16))
+    level = np.array([[0.0, 0, 1, 0], [-1, 0, 0, 0], [0, -1, 0, 1], [0, 0, 0, 1]])
+    return (
+        AnnotatedImage(
+            path=tmp_path / "a.png",
+            file_name="a.png",
+            width=SIZE[0],
+            height=SIZE[1],
+            instances=tuple(instances),
+            depth_path=tmp_path / "d.png",
+            camera=CameraView(T_world_optical=level, matrix=INTRINSICS.matrix),
+        ),
+        masks,
+    )
+
+
+def test_fruits_that_a_segmenter_misses_are_failures_and_the_others_are_measured(tmp_path: Path) -> None:
+    image, masks = discs(tmp_path)
+    found = masks[:2]
+
+    def segmenter(image: NDArray[np.uint8], depth_m: NDArray[np.float32] | None = None) -> Instances:
+        return Instances(
+            boxes=np.array([mask_box(mask) for mask in found], np.float32),
+            scores=np.array([0.9, 0.8], np.float32),
+            categories=("tomato_ripe",) * 2,
+            masks=np.array(found),
+        )
+
+    judged, _ = judge((image,), {"sphere": robots_model()}, segmenter=segmenter, min_total=0)
+    assert [j.truth for j in judged] == pytest.approx([1.0, 0.5, 1.0], abs=0.03)
+    assert judged[0].estimate == pytest.approx(1.0, abs=0.1)
+    assert judged[1].estimate == pytest.approx(0.5, abs=0.1)
+    assert np.isnan(judged[2].estimate) and score(judged).failures == 1
+    # A mask that shares less than half with a fruit is not that fruit's.
+    found = [np.roll(masks[0], 25, axis=1), masks[1]]
+    judged, _ = judge((image,), {"sphere": robots_model()}, segmenter=segmenter, min_total=0)
+    assert np.isnan(judged[0].estimate) and np.isfinite(judged[1].estimate)
