@@ -1,22 +1,31 @@
 """An arm model's URDF in MuJoCo, with the camera's housing on its flange: for collisions and for the twin."""
 
 import itertools
+from collections.abc import Iterator
 from typing import Any, Final
 
 import mujoco
 import numpy as np
+import torch
 
 from maniskill_tomato.deploy.interface import Float64
 from maniskill_tomato.errors import InvalidInputError
-from maniskill_tomato.robot.arm_model import ArmModel
+from maniskill_tomato.robot.arm_model import NUM_JOINTS, ArmModel
 from maniskill_tomato.robot.d435 import CAMERA_LINK_NAME, camera_link_pose
 from maniskill_tomato.robot.iiwa14 import IIWA14
+from maniskill_tomato.robot.kinematics import link_transforms
 
 mj: Any = mujoco
 
 LARGEST_BARE: Final = 0.03
 """A corner of a collision shape may be this far outside the spheres of its link, in [m]; the iiwa 14's, whose cylinders
 have corners that its links have not, are up to 0.023 outside."""
+
+AGREES: Final = 1e-6
+"""So well a model's kinematics and limits agree with its URDF, in [m] and [rad]; the iiwa 14's do to 1e-15."""
+
+POSTURES: Final = 8
+"""In so many both are looked at."""
 
 
 def arm_shapes(model: ArmModel, T_flange_camera: Float64) -> Any:
@@ -38,7 +47,8 @@ def arm_shapes(model: ArmModel, T_flange_camera: Float64) -> Any:
 
 
 def check_arm_shapes(model: ArmModel) -> None:
-    """Accepts a model whose URDF has the joints and links that it names, with collision shapes that its spheres cover.
+    """Accepts a model whose URDF has the joints and links that it names, where its kinematics have them, with collision
+    shapes that its spheres cover.
 
     Raises:
         InvalidInputError: It has not; with the reason.
@@ -51,6 +61,8 @@ def check_arm_shapes(model: ArmModel) -> None:
     joints = tuple(compiled.joint(j).name for j in range(compiled.njnt))
     if joints != model.joint_names or compiled.nq != len(joints):
         raise _refusal(model, f"the joints of {model.urdf} are {', '.join(joints)}")
+    for what in _disagreements(model, compiled):
+        raise _refusal(model, what)
     # Without shapes a link would pass through everything.
     bare = [
         name
@@ -69,6 +81,32 @@ def check_arm_shapes(model: ArmModel) -> None:
                     model,
                     f"the spheres of {link} leave a corner of its collision shapes {outside * 1e3:.0f} mm bare, "
                     f"allowed are {LARGEST_BARE * 1e3:.0f} mm",
+                )
+
+
+def _disagreements(model: ArmModel, compiled: Any) -> Iterator[str]:
+    """Where numbers of the model are not those of its URDF: the kinematics, which tell where flange and camera are,
+    and the collision checks would have different arms in mind."""
+    low, high = compiled.jnt_range.T
+    beyond = np.maximum(low - model.joint_lower, model.joint_upper - high)
+    beyond[compiled.jnt_limited == 0] = 0.0
+    if (beyond > AGREES).any():
+        k = int(beyond.argmax())
+        yield f"{model.joint_names[k]} may turn {beyond[k]:.3g} rad beyond its limits in {model.urdf}"
+    data = mj.MjData(compiled)
+    postures = np.random.default_rng(0).uniform(model.joint_lower, model.joint_upper, (POSTURES, NUM_JOINTS))
+    poses = link_transforms(torch.from_numpy(postures), model).numpy()
+    for joints, ours in zip(postures, poses, strict=True):
+        data.qpos[:] = joints
+        mj.mj_kinematics(compiled, data)
+        for link, T in zip(model.link_names[1:], ours[1:], strict=True):
+            body = compiled.body(link).id
+            off = float(np.linalg.norm(T[:3, 3] - data.xpos[body]))
+            turned = float(np.abs(T[:3, :3] - data.xmat[body].reshape(3, 3)).max())
+            if off > AGREES or turned > AGREES:
+                yield (
+                    f"its kinematics have {link} {off * 1e3:.3g} mm from where {model.urdf} has it, and turned by "
+                    f"{turned:.3g} in its rotation; make the model by read_arm_model"
                 )
 
 

@@ -5,13 +5,14 @@ import io
 import json
 import os
 import zipfile
+from collections.abc import Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 if TYPE_CHECKING:
     import torch
 
-from maniskill_tomato.errors import CheckpointError, NotWrittenError
+from maniskill_tomato.errors import CheckpointError, InvalidInputError, NotWrittenError
 
 LARGEST_TENSORS: Final = 8_000_000_000
 """Of a file of tensors, in [bytes], packed and unpacked: a full buffer of experience has 2 GB."""
@@ -39,6 +40,24 @@ def write_atomically(path: Path, content: bytes) -> None:
             f"cannot write {path}: {error.strerror or error}; what was there before is kept. Free some space "
             "or choose another --out; a run goes on with --resume"
         ) from error
+
+
+def refuse_inputs(option: str, out: Path, inputs: Iterable[Path]) -> None:
+    """Accepts a place of a result that is none of what it is made from.
+
+    Args:
+        option: Names it in the message.
+        out: The file to be written.
+        inputs: The files that are read.
+
+    Raises:
+        InvalidInputError: It is one of them, whatever path leads there.
+    """
+    for path in inputs:
+        if out.exists() and path.exists() and out.samefile(path):
+            raise InvalidInputError(
+                f"{option}: {out} would take the place of what is read; choose another file"
+            )
 
 
 def write_json(path: Path, content: Any) -> None:

@@ -98,6 +98,7 @@ class Detect:
         if not 0 <= self.score_threshold <= 1:
             raise InvalidInputError(f"--score-threshold must be between 0 and 1, got {self.score_threshold}")
 
+        from maniskill_tomato.files import refuse_inputs
         from maniskill_tomato.segmentation.datasets.picture_files import write_picture
         from maniskill_tomato.segmentation.detection_list import detect, drawing_files, image_files
         from maniskill_tomato.segmentation.drawing import draw_instances
@@ -105,6 +106,7 @@ class Detect:
         from maniskill_tomato.segmentation.segmenter import open_for_files
 
         image_files(self.images)
+        refuse_inputs("--out", self.out, [Path(self.segmenter)])
         drawings = {} if self.pictures is None else drawing_files(self.images, self.pictures)
         segmenter = open_for_files(self.segmenter, self.score_threshold, thorough=not self.quick)
 

@@ -34,6 +34,13 @@ CENTRE_TOLERANCE: Final = 1e-6
 LARGEST_ANGLE: Final = 2.0 * math.pi
 """No joint limit lies farther from 0, in [rad]: more is the wrong unit."""
 
+LIMIT_RANGES: Final = {
+    "velocity_limits": (0.01, 20.0),
+    "acceleration_limits": (0.01, 1000.0),
+    "torque_limits": (0.01, 10_000.0),
+}
+"""Of joints, in [rad/s], [rad/s^2] and [N m]: beyond them is the wrong unit, or a check that checks nothing."""
+
 LARGEST_SPHERE: Final = 0.3
 """Radius, in [m]."""
 
@@ -176,10 +183,11 @@ class ArmModel:
                     f"ready_qpos has {name} at {self.ready_qpos[j]:g} rad, but the kinematics turn it by at most "
                     f"{self.symmetric_limits[j]:g} rad to either side, the nearer of its limits"
                 )
-            for kind in ("velocity_limits", "acceleration_limits", "torque_limits"):
+            for kind in LIMIT_RANGES:
                 value = getattr(self, kind)[j]
-                if not 0.0 < value <= 1e4:
-                    yield f"{kind} of {name} must be above 0 and at most 10000, got {value:g}"
+                low, high = LIMIT_RANGES[kind]
+                if not low <= value <= high:
+                    yield f"{kind} of {name} must be from {low:g} to {high:g}, got {value:g}"
 
     def _wrong_geometry(self) -> Iterator[str]:
         origins = self.joint_origins.cumsum(axis=0)
@@ -208,6 +216,9 @@ class ArmModel:
             )
 
     def _wrong_spheres(self) -> Iterator[str]:
+        if not isinstance(self.spheres, Mapping):
+            yield f"spheres must name links, got {self.spheres!r}"
+            return
         unknown = [link for link in self.spheres if link not in self.link_names]
         if unknown:
             yield f"spheres names links that it has not: {', '.join(unknown)}; it has {', '.join(self.link_names)}"

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from maniskill_tomato.errors import InvalidInputError
-from maniskill_tomato.files import write_atomically
+from maniskill_tomato.files import refuse_inputs, write_atomically
 from maniskill_tomato.segmentation.datasets.picture_files import read_picture
 from maniskill_tomato.segmentation.instances import Image, Instances
 from maniskill_tomato.segmentation.masks import EncodedMask
@@ -89,7 +89,7 @@ def detect(
         seen: Called with each name, image and what was found in it.
 
     Raises:
-        InvalidInputError: There is no image, none can be read, or `out` is a folder or named as an image.
+        InvalidInputError: There is no image, none can be read, or `out` is a folder, an image, or named as one.
         CheckpointError: The file cannot be written.
     """
     if out.is_dir():
@@ -99,6 +99,7 @@ def detect(
     entries: list[dict[str, Any]] = []
     skipped: list[str] = []
     files = image_files(place)
+    refuse_inputs("--out", out, files)
     for path in files:
         try:
             image = read_picture(path)

@@ -7,6 +7,7 @@ import ast
 import sys
 import tomllib
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +15,7 @@ import numpy as np
 import pytest
 import torch
 
+from maniskill_tomato.deploy.arm_shapes import check_arm_shapes
 from maniskill_tomato.deploy.check import check, print_findings
 from maniskill_tomato.deploy.clock import SimulatedClock
 from maniskill_tomato.deploy.collision import Box, CollisionChecker
@@ -28,6 +30,7 @@ from maniskill_tomato.deploy.run_replay import load_recording, replay
 from maniskill_tomato.deploy.safety import Safety
 from maniskill_tomato.deploy.safety_config import SafetyConfig
 from maniskill_tomato.deploy.workcell import make_workcell
+from maniskill_tomato.errors import InvalidInputError
 from maniskill_tomato.robot.d435 import T_flange_camera_color_optical
 from maniskill_tomato.robot.iiwa14 import IIWA14
 from maniskill_tomato.robot.kinematics import forward_kinematics
@@ -192,6 +195,24 @@ def posture(model: Any, **joints: float) -> Float64:
 
 def to(joints: Float64, speed: float = 0.1) -> JointMove:
     return JointMove(joint_positions=joints, speed_fraction=speed)
+
+
+@pytest.mark.parametrize(
+    ("changed", "words"),
+    [
+        ({"joint_origins": IIWA14.joint_origins * 1.2}, "kinematics have link_1"),
+        ({"joint_axes": -IIWA14.joint_axes}, "kinematics have link_1"),
+        ({"flange_height": IIWA14.flange_height + 0.1}, "kinematics have link_ee 100 mm"),
+        ({"link_turns": np.stack([np.eye(3), *[2.0 * np.eye(3)] * 7, np.eye(3)])}, "kinematics have link_1"),
+        ({"joint_upper": IIWA14.joint_upper + 0.1}, "joint_1 may turn 0.1 rad beyond its limits"),
+        ({"joint_lower": IIWA14.joint_lower * 1.5}, "rad beyond its limits"),
+    ],
+)
+def test_a_model_that_is_not_of_its_urdf_is_refused(changed: dict[str, Any], words: str) -> None:
+    check_arm_shapes(IIWA14)
+    check_arm_shapes(replace(IIWA14, joint_upper=IIWA14.joint_upper - 0.3))
+    with pytest.raises(InvalidInputError, match=words):
+        check_arm_shapes(replace(IIWA14, **changed))
 
 
 def test_the_guard_holds_another_arm_to_its_own_limits(makers: Path) -> None:

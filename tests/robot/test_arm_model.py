@@ -237,7 +237,7 @@ REFUSED: dict[str, tuple[Callable[[str], str], str]] = {
     ),
     "no speed": (
         lambda t: t.replace('velocity="2.2689280"', 'velocity="0"'),
-        "velocity_limits of A4 must be above 0",
+        "velocity_limits of A4 must be from 0.01 to 20",
     ),
     "no chain": (
         lambda t: t.replace('<child link="link_ee"/>', '<child link="hand"/>'),
@@ -269,6 +269,8 @@ def test_an_arm_that_cannot_be_served_is_refused_in_words(what: str, tmp_path: P
 @pytest.mark.parametrize(
     ("changed", "words"),
     [
+        ({"spheres": None}, "spheres must name links, got None"),
+        ({"acceleration_limits": (5e-324,) * 7}, "acceleration_limits of A1 must be from 0.01 to 1000"),
         ({"spheres": {}}, "no spheres cover link_5, link_6, link_7, link_ee"),
         ({"spheres": {**IIWA14.spheres, "link_6": ()}}, "no spheres cover link_6"),
         ({"spheres": {**IIWA14.spheres, "hand": ((0, 0, 0, 0.1),)}}, "names links that it has not: hand"),

@@ -22,6 +22,7 @@ from maniskill_tomato.segmentation.datasets.coco import read_coco, write_coco
 from maniskill_tomato.segmentation.datasets.reading import read_annotated
 from maniskill_tomato.segmentation.datasets.voc import read_voc, write_voc
 from maniskill_tomato.segmentation.masks import EncodedMask
+from maniskill_tomato.segmentation.synthesis.dataset_rendering import copy_photos
 
 pytest.importorskip("pycocotools")
 
@@ -73,6 +74,23 @@ def make_set(folder: Path) -> AnnotatedImages:
         camera=camera,
     )
     return AnnotatedImages(images=(image,))
+
+
+def test_photos_of_one_name_from_several_folders_are_all_copied_in(tmp_path: Path) -> None:
+    photos = []
+    for k, name in enumerate(("a/1.jpg", "b/1.jpg", "b/1.png")):
+        path = tmp_path / name
+        path.parent.mkdir(exist_ok=True)
+        path.write_bytes(bytes([k]) * 10)
+        photos.append(AnnotatedImage(path=path, file_name=name, width=60, height=40, instances=()))
+    out = tmp_path / "out"
+    for _ in range(2):
+        copied = copy_photos(AnnotatedImages(images=tuple(photos)), out)
+        assert [image.path.read_bytes() for image in copied.images] == [bytes([k]) * 10 for k in range(3)]
+        write_voc(copied, out)
+    photos[0].path.write_bytes(b"retouched.")
+    again = copy_photos(AnnotatedImages(images=tuple(photos)), out)
+    assert again.images[0].path.read_bytes() == b"retouched."
 
 
 def coco_file(folder: Path, **changes: Any) -> Path:

@@ -148,6 +148,28 @@ def test_no_drawing_takes_the_place_of_an_image_or_of_another_drawing(
     assert (photos / "a.jpg").read_bytes() == before["a.jpg"]
 
 
+def test_the_list_takes_the_place_of_nothing_that_is_read(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    write_image(tmp_path / "a.png", (20, 30, 60, 70))
+    photo = (tmp_path / "a.png").rename(tmp_path / "photo.raw")
+    weights = tmp_path / "weights.pt"
+    weights.write_bytes(asset_path(SHIPPED_WEIGHTS).read_bytes())
+    link = tmp_path / "list.json"
+    link.symlink_to("photo.raw")
+    before = photo.read_bytes(), weights.read_bytes()
+    (tmp_path / "b").mkdir()
+    for out, segmenter in (
+        (photo, "colour"),
+        (link, "colour"),
+        (tmp_path / "b" / ".." / "photo.raw", "colour"),
+        (weights, str(weights)),
+    ):
+        error = fails(capsys, str(photo), "--segmenter", segmenter, "--out", str(out))
+        assert "would take the place of what is read" in error
+    assert (photo.read_bytes(), weights.read_bytes()) == before and link.is_symlink()
+
+
 def test_pictures_that_are_cut_off_or_too_large_are_said_to_be(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -157,11 +157,19 @@ def _make(
 def copy_photos(photos: AnnotatedImages, out: Path) -> AnnotatedImages:
     """Copies photos into a data set's folder under names of their own."""
     copied = []
+    taken: set[str] = set()
     for image in photos.images:
-        name = f"images/real_{Path(image.file_name).stem}{image.path.suffix}"
-        target = out / name
-        if not target.is_file() or target.stat().st_size != image.path.stat().st_size:
-            write_atomically(target, image.path.read_bytes())
+        # Photos of several folders may have one name, and Pascal VOC knows files without their endings.
+        stem = first = f"real_{Path(image.file_name).stem}"
+        count = 1
+        while stem in taken:
+            count += 1
+            stem = f"{first}_{count}"
+        taken.add(stem)
+        name = f"images/{stem}{image.path.suffix}"
+        target, content = out / name, image.path.read_bytes()
+        if not target.is_file() or target.read_bytes() != content:
+            write_atomically(target, content)
         copied.append(replace(image, path=target, file_name=name, depth_path=None))
     return AnnotatedImages(images=tuple(copied), skipped=photos.skipped)
 
