@@ -31,6 +31,10 @@ STILL_S: Final = 2.0
 STILL_TURN: Final = 0.002
 """An arm has turned once the fastest joint has by this much, in [rad]; less for a slow move."""
 
+SMOOTH_FACTOR: Final = 1.25
+"""An arm may begin and end as smoothly as a path of minimum jerk, of whose time a share of the way takes at least
+(share / 10)^(1/3) there, and this many times as long. In moves of up to 15 s the other tolerances are wider."""
+
 ENDS_WITHIN_S: Final = 5.0
 """After the arm has got there the driver says so within this, in [s]."""
 
@@ -165,7 +169,7 @@ class MoveWatch:
             self._turned_to, self._since_turn = done, 0.0
         if left <= PATH_TOLERANCE / 2.0:
             self._since_there += gap
-            if self._since_there <= ENDS_WITHIN_S:
+            if self._since_there <= max(ENDS_WITHIN_S, LATE_FACTOR * self._smooth(PATH_TOLERANCE / 2.0)):
                 return None
             return Departure(
                 kind="unended",
@@ -173,10 +177,11 @@ class MoveWatch:
                 f"{ENDS_WITHIN_S:g} s; it may be "
                 "blocked just before its end",
             )
-        allowed = LATE_FACTOR * self.seconds * share + LATE_S
+        allowed = max(LATE_FACTOR * self.seconds * share + LATE_S, self._smooth(max(done, enough)))
         self._note("late", self._watched / allowed)
-        self._note("still", self._since_turn / STILL_S)
-        if self._since_turn > STILL_S:
+        may_stand = self._watched <= self._smooth(self._turned_to + enough)
+        self._note("still", 0.0 if may_stand else self._since_turn / STILL_S)
+        if self._since_turn > STILL_S and not may_stand:
             return Departure(
                 kind="still",
                 detail=f"no joint has turned for {self._since_turn:.1f} s, allowed are {STILL_S:g} s, "
@@ -190,6 +195,10 @@ class MoveWatch:
                 f"allowed are {allowed:.1f} s; the arm may be blocked",
             )
         return None
+
+    def _smooth(self, done: float) -> float:
+        """How long the first or the last part of the move may take, of so much turn of the fastest joint, in [s]."""
+        return float(SMOOTH_FACTOR * self.seconds * (min(done / self._largest, 1.0) / 10.0) ** (1.0 / 3.0))
 
     def _note(self, kind: str, share: float) -> None:
         self.worst[kind] = max(self.worst[kind], float(share))

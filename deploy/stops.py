@@ -1,4 +1,4 @@
-"""Ways to stop a run: Ctrl-C, SIGTERM, a key, a file, and a missing heartbeat of the loop."""
+"""Ways to stop a run: Ctrl-C, SIGTERM, a terminal that closes, a key, a file, and a missing heartbeat of the loop."""
 
 import math
 import os
@@ -53,8 +53,10 @@ class Stops:
 
     def __enter__(self) -> Self:
         if threading.current_thread() is threading.main_thread():
-            for number in (signal.SIGINT, signal.SIGTERM):
-                self._handlers[number] = signal.signal(number, self._on_signal)
+            for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+                # What `nohup` starts goes on when its terminal closes.
+                if number is not signal.SIGHUP or signal.getsignal(number) is not signal.SIG_IGN:
+                    self._handlers[number] = signal.signal(number, self._on_signal)
         self._watch = threading.Thread(target=self._watch_heartbeat, name="heartbeat", daemon=True)
         self._watch.start()
         return self

@@ -466,13 +466,23 @@ class KillingClock(SimulatedClock):
             os.kill(os.getpid(), self.number)
 
 
-@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT, signal.SIGHUP])
 def test_a_signal_in_the_middle_of_a_move_stops_the_arm(number: int) -> None:
     before = signal.getsignal(number)
     result, workcell = go(profile(), clock=KillingClock(number))
     assert (result.reason, result.detail, result.is_fault) == ("stopped", signal.Signals(number).name, False)
     assert result.end_state == "the arm was stopped and holds its position"
     assert signal.getsignal(number) is before
+
+
+def test_a_run_that_was_started_by_nohup_goes_on_when_its_terminal_closes() -> None:
+    before = signal.signal(signal.SIGHUP, signal.SIG_IGN)
+    try:
+        result, _ = go(profile(), clock=KillingClock(signal.SIGHUP))
+        assert signal.getsignal(signal.SIGHUP) is signal.SIG_IGN
+    finally:
+        signal.signal(signal.SIGHUP, before)
+    assert result.reason in ("success", "budget")
 
 
 def test_an_arm_that_is_told_to_stop_and_moves_on_is_not_said_to_stand() -> None:

@@ -184,6 +184,36 @@ def test_what_a_real_controller_may_do_is_not_held_against_it(path: Any) -> None
         assert seen(path, 6.0, dt)[1] is None
 
 
+@pytest.mark.parametrize("fraction", [0.1, 0.03, 0.01, 0.005])
+@pytest.mark.parametrize("turn", [0.05, 0.4, 1.5])
+def test_an_arm_that_begins_and_ends_a_slow_move_smoothly_is_never_stopped(
+    fraction: float, turn: float
+) -> None:
+    way = turn * np.eye(7)[0]
+    seconds = 1.875 * turn / (fraction * math.radians(85.0))
+    for dt in (0.02, 0.1, 0.45):
+        move = JointMove(joint_positions=way, speed_fraction=fraction)
+        watch = MoveWatch(np.zeros(7), move, seconds, 100.0, IIWA14)
+        for t in np.arange(dt, seconds + 1.0, dt):
+            x = min((t - 0.2) / seconds, 1.0) if t > 0.2 else 0.0
+            share = x**3 * (10.0 - 15.0 * x + 6.0 * x**2)
+            departure = watch.see(share * way, 100.0 + t, 100.0 + t)
+            assert departure is None, f"after {t:.2f} of {seconds:.1f} s: {departure}"
+
+
+@pytest.mark.parametrize("fraction", [0.1, 0.03, 0.01, 0.005])
+def test_an_arm_that_does_not_begin_a_slow_move_is_noticed_long_before_its_end(fraction: float) -> None:
+    seconds = 1.875 * 0.4 / (fraction * math.radians(85.0))
+    move = JointMove(joint_positions=STRAIGHT, speed_fraction=fraction)
+    watch = MoveWatch(np.zeros(7), move, seconds, 100.0, IIWA14)
+    for t in np.arange(0.1, seconds, 0.1):
+        departure = watch.see(np.zeros(7), 100.0 + t, 100.0 + t)
+        if departure is not None:
+            break
+    assert departure is not None and departure.is_late
+    assert t <= max(2.2, seconds / 8.0)
+
+
 def test_a_loop_that_was_held_up_blames_nothing_on_the_arm_and_late_answers_no_speed() -> None:
     watch = MoveWatch(np.zeros(7), SLOW, SECONDS, 100.0, IIWA14)
     assert watch.see(at(0.1), 100.3, 100.3) is None
