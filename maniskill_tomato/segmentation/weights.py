@@ -68,14 +68,20 @@ def load_weights(path: Path, kind: str) -> dict[str, Any]:
     data = _read(path)
     if data["segmenter"] != kind:
         raise CheckpointError(f"{path} holds weights of the segmenter {data['segmenter']!r}, not of {kind!r}")
-    if not isinstance(data["format"], int) or data["format"] > FORMAT:
+    if not isinstance(data.get("format"), int) or data["format"] > FORMAT:
         raise CheckpointError(
-            f"{path} has weight format {data['format']}; this version, {maniskill_tomato.__version__}, reads up to "
+            f"{path} has weight format {data.get('format')}; this version, {maniskill_tomato.__version__}, reads up to "
             f"{FORMAT}: upgrade maniskill-tomato",
             newer_format=True,
         )
-    if not isinstance(data["state"], dict) or not all(isinstance(t, Tensor) for t in data["state"].values()):
-        raise CheckpointError(f"{path} holds weights that are no tensors; train it again")
+    state = data["state"]
+    # A tensor whose numbers are not all in the file could ask for any amount of memory.
+    if not isinstance(state, dict) or not all(
+        isinstance(t, Tensor) and t.layout == torch.strided and t.is_contiguous() for t in state.values()
+    ):
+        raise CheckpointError(f"{path} holds weights that are no whole tensors; train it again")
+    if not isinstance(data.get("training"), dict):
+        raise CheckpointError(f"{path} does not tell its training in a table; train it again")
     data["state"] = {n: t.float() if t.is_floating_point() else t for n, t in data["state"].items()}
     return data
 

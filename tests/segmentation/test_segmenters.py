@@ -6,6 +6,7 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
+import torch
 from numpy.typing import NDArray
 
 from maniskill_tomato.assets import ASSETS_DIR
@@ -18,7 +19,7 @@ from maniskill_tomato.segmentation.colour_segmenter import (
 from maniskill_tomato.segmentation.instances import Image, Instances, box_ellipse, mask_box
 from maniskill_tomato.segmentation.metrics.detection_metrics import mask_overlaps
 from maniskill_tomato.segmentation.segmenter import SEGMENTERS, make_segmenter
-from maniskill_tomato.segmentation.weights import save_weights
+from maniskill_tomato.segmentation.weights import load_weights, save_weights
 
 RED, GREEN = (205, 40, 30), (60, 140, 50)
 
@@ -151,6 +152,28 @@ def test_unknown_names_missing_weights_and_wrong_options_are_clear() -> None:
         make_segmenter("mask_rcnn")
     with pytest.raises(CheckpointError, match="no YOLO weights"):
         make_segmenter("yolo")
+
+
+@pytest.mark.parametrize(
+    ("changed", "words"),
+    [
+        ({"training": None}, "does not tell its training"),
+        ({"format": None}, "has weight format None"),
+        # Four terabytes in 32 bits, two bytes in the file.
+        ({"state": {"a": torch.zeros(1).half().expand(10**6, 10**6)}}, "no whole tensors"),
+        ({"state": {"a": torch.eye(2).to_sparse()}}, "no whole tensors"),
+    ],
+)
+def test_weights_with_a_hostile_entry_are_refused(
+    changed: dict[str, Any], words: str, tmp_path: Path
+) -> None:
+    path = tmp_path / "weights.pt"
+    good = {"format": 1, "segmenter": "light", "config": {}, "state": {"a": torch.zeros(2)}, "training": {}}
+    torch.save(good, path)
+    assert load_weights(path, "light")["state"]["a"].shape == (2,)
+    torch.save({**good, **changed}, path)
+    with pytest.raises(CheckpointError, match=words):
+        load_weights(path, "light")
 
 
 def test_a_file_that_is_no_weights_is_refused(tmp_path: Path) -> None:
