@@ -80,11 +80,18 @@ def _read_npz(path: Path) -> Iterator[MeshObject]:
                 f"{corners.dtype} of shape {corners.shape}"
             )
         if len(corners):
-            yield MeshObject(name, "", *_joined_corners(corners.astype(np.float64)))
+            yield MeshObject(name, "", *joined_corners(corners.astype(np.float64)))
 
 
-def _joined_corners(corners: Float64) -> tuple[Float64, Int64]:
-    """Vertices and faces of triangles of shape (F, 3, 3), with equal corners as one vertex."""
+def joined_corners(corners: Float64) -> tuple[Float64, Int64]:
+    """Vertices and faces of triangles of shape (F, 3, 3), with equal corners as one vertex.
+
+    Args:
+        corners: Shape (F, 3, 3).
+
+    Returns:
+        Shapes (V, 3) and (F, 3).
+    """
     from trimesh.grouping import unique_rows
 
     points = corners.reshape(-1, 3)
@@ -125,7 +132,7 @@ def _read_scene(path: Path, suffix: str) -> Iterator[MeshObject]:
             yield MeshObject(
                 named,
                 label,
-                *_joined_corners(vertices[used][inverse.reshape(-1, 3)]),
+                *joined_corners(vertices[used][inverse.reshape(-1, 3)]),
                 paint=None if paint is None else Paint(paint.image, paint.uvs[rows]),
                 has_holes=_has_holes(material),
             )
@@ -169,6 +176,8 @@ def _has_holes(material: Any) -> bool:
     """Whether a material's alpha channel cuts pieces out."""
     if getattr(material, "alphaMode", None) == "OPAQUE":
         return False
+    if "map_d" in (getattr(material, "kwargs", None) or {}):
+        return True  # A picture of its own, which trimesh does not read.
     image = getattr(material, "baseColorTexture", None) or getattr(material, "image", None)
     mode = getattr(image, "mode", "")
     if image is None or not (mode in ("RGBA", "LA") or "transparency" in getattr(image, "info", {})):

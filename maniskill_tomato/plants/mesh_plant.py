@@ -14,7 +14,7 @@ from maniskill_tomato.plants.fruit import SKIN_VARIANTS
 from maniskill_tomato.plants.generator import FRUIT_CLASS
 from maniskill_tomato.plants.leaf import LEAF_VARIANTS
 from maniskill_tomato.plants.mesh_colours import Paint
-from maniskill_tomato.plants.mesh_files import MeshObject, read_objects
+from maniskill_tomato.plants.mesh_files import MeshObject, joined_corners, read_objects
 from maniskill_tomato.plants.mesh_rules import METRES, MeshRules, OrganKind
 from maniskill_tomato.plants.meshing import Float64, Int64, cross, normalized
 from maniskill_tomato.plants.organs import Fruit, MeshPart, Organ, Plant, SemanticClass
@@ -27,6 +27,9 @@ PLANT_HEIGHTS: Final = (0.05, 6.0)
 
 FARTHEST_AXIS: Final = 1.0
 """How far the middle of a plant may be from its origin, along the ground, in [m]."""
+
+OPPOSED: Final = 0.2
+"""Where normals cancel out to less than this share, the triangles about a vertex are two sides of a sheet."""
 
 WELD: Final = 5e-6
 """Vertices of one object that are nearer to each other are one where it is decimated, in [m]; single precision moves
@@ -140,11 +143,14 @@ def _sorted_by_kind(
 
 
 def _joined(parts: Sequence[MeshObject]) -> _Surface:
-    offsets = np.cumsum([0] + [len(part.vertices) for part in parts[:-1]])
+    """Parts as one object: what two of them have in the same place, such as both sides of a leaf, is one vertex."""
+    vertices, faces = parts[0].vertices, parts[0].faces
+    if len(parts) > 1:
+        vertices, faces = joined_corners(np.concatenate([part.vertices[part.faces] for part in parts]))
     plain = [np.zeros((len(part.faces), 3, 2)) for part in parts]
     return _Surface(
-        vertices=np.concatenate([part.vertices for part in parts]),
-        faces=np.concatenate([part.faces + k for part, k in zip(parts, offsets, strict=True)]),
+        vertices=vertices,
+        faces=faces,
         paints=tuple(part.paint for part in parts),
         paint_of_face=np.repeat(np.arange(len(parts)), [len(part.faces) for part in parts]),
         uvs=np.concatenate(
@@ -219,47 +225,72 @@ def _green_organ(kind: OrganKind, name: str, surface: _Surface, index: int) -> O
 def _mesh_parts(
     surface: _Surface, uvs: Float64, material: str, *, sheet: bool = False
 ) -> tuple[MeshPart, ...]:
-    """A part for each image of the file and one for what it does not paint, with smooth normals.
+    """Parts of one image of the file, or of none, that are drawn from one or from both sides; with smooth normals.
 
     Args:
         surface: The triangles.
         uvs: Where their vertices are in our texture. Shape (V, 2).
         material: Its name.
-        sheet: Whether it may be an open surface, which is then drawn from both sides.
+        sheet: Whether pieces may be open surfaces, which are then drawn from both sides.
     """
     across = _across(surface.vertices, surface.faces)
     kept = np.flatnonzero((across * across).sum(1) > 0.0)
-    normals = np.zeros_like(surface.vertices)
+    count = len(surface.vertices)
+    # Numbers from `count` on are the same vertices on the lower side of a sheet that is modelled from both.
+    corners = surface.faces.copy()
+    corners[kept] += count * _is_below(count, surface.faces[kept], across[kept])
+    normals = np.zeros((2 * count, 3))
     for k in range(3):
-        np.add.at(normals, surface.faces[kept, k], across[kept])
+        np.add.at(normals, corners[kept, k], across[kept])
     normals = normalized(normals)
-    two_sided = sheet and not _is_closed(surface.faces[kept])
+    paint_of_kept = surface.paint_of_face[kept]
+    two_sided = _is_open(count, surface.faces[kept]) & sheet
+    groups = np.unique(np.stack([paint_of_kept, two_sided], 1), axis=0).tolist() or [[0, False]]
     parts = []
-    for number, paint in enumerate(surface.paints):
-        own = kept[surface.paint_of_face[kept] == number]
-        faces = surface.faces[own]
-        if not len(own) and len(surface.paints) > 1:
-            continue
-        if paint is None:
-            used = np.arange(len(surface.vertices))
-            if len(surface.paints) > 1:
+    for number, side in groups:
+        own = kept[(paint_of_kept == number) & (two_sided == side)]
+        faces, paint = corners[own], surface.paints[number]
+        if paint is not None:
+            used, places, faces = _split_at_seams(faces, surface.uvs[own])
+        else:
+            used = np.arange(count)
+            if len(groups) > 1 or (faces >= count).any():
                 used, inverse = np.unique(faces, return_inverse=True)
                 faces = inverse.reshape(-1, 3)
-            places = uvs[used]
-        else:
-            used, places, faces = _split_at_seams(faces, surface.uvs[own])
+            places = uvs[used % count]
         parts.append(
             MeshPart(
-                vertices=surface.vertices[used].astype(np.float32),
+                vertices=surface.vertices[used % count].astype(np.float32),
                 normals=normals[used].astype(np.float32),
                 uvs=places.astype(np.float32),
                 faces=faces.astype(np.int32),
                 material=material,
-                two_sided=two_sided,
+                two_sided=bool(side),
                 texture=None if paint is None else paint.image,
             )
         )
     return tuple(parts)
+
+
+def _is_below(count: int, faces: Int64, across: Float64) -> NDArray[np.bool_]:
+    """Which corners are on the lower side of a vertex whose triangles face opposite ways, as on a sheet of two sides.
+
+    Args:
+        count: Number of vertices.
+        faces: Shape (F, 3).
+        across: Their normals, of any length above 0. Shape (F, 3).
+
+    Returns:
+        Shape (F, 3).
+    """
+    length = np.linalg.norm(across, axis=1)
+    total, size, upward = np.zeros((count, 3)), np.zeros(count), np.zeros((count, 3))
+    for k in range(3):
+        np.add.at(total, faces[:, k], across)
+        np.add.at(size, faces[:, k], length)
+        upward[faces[:, k]] = across
+    opposed = np.linalg.norm(total, axis=1) < OPPOSED * size
+    return np.asarray(opposed[faces] & (np.einsum("fi,fki->fk", across, upward[faces]) < 0.0))
 
 
 def _split_at_seams(faces: Int64, uvs: Float64) -> tuple[Int64, Float64, Int64]:
@@ -285,12 +316,28 @@ def _across(vertices: Float64, faces: Int64) -> Float64:
     return cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
 
 
-def _is_closed(faces: Int64) -> bool:
-    """Whether every edge is met once in either direction, as on the skin of a solid body."""
+def _is_open(count: int, faces: Int64) -> NDArray[np.bool_]:
+    """Whether the connected piece of each triangle has an edge that is not met as often in the other direction.
+
+    A solid body has none, and neither has a sheet that is modelled from both sides.
+
+    Args:
+        count: Number of vertices.
+        faces: Shape (F, 3).
+
+    Returns:
+        Shape (F,).
+    """
     edges = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
-    size = int(faces.max()) + 1 if len(faces) else 1
-    there, back = edges[:, 0] * size + edges[:, 1], edges[:, 1] * size + edges[:, 0]
-    return bool(np.array_equal(np.sort(there), np.sort(back)))
+    there, back = edges[:, 0] * count + edges[:, 1], edges[:, 1] * count + edges[:, 0]
+    found, times = np.unique(there, return_counts=True)
+    places = np.searchsorted(found, np.stack([there, back]))
+    places = np.minimum(places, len(found) - 1)
+    met = np.where(found[places] == np.stack([there, back]), times[places], 0) if len(found) else places
+    pieces = _pieces(count, faces)
+    is_open = np.zeros(count, np.bool_)
+    is_open[pieces[edges[met[0] != met[1], 0]]] = True
+    return is_open[pieces[faces[:, 0]]]
 
 
 def _pieces(vertices: int, faces: Int64) -> Int64:

@@ -132,6 +132,28 @@ def test_an_obj_has_the_colours_and_pictures_of_its_materials(tmp_path: Path) ->
     assert of(plant, "stem").texture is None
 
 
+def test_a_leaf_with_another_material_below_shows_each_on_its_own_side(tmp_path: Path) -> None:
+    (tmp_path / "vine.mtl").write_text("newmtl upper\nKd 0 0.4 0\nnewmtl under\nKd 0.5 0.6 0.4\n")
+    lines, first = ["mtllib vine.mtl"], 1
+    for name, mesh in parts().items():
+        lines += [f"o {name}", *(f"v {x:.7f} {y:.7f} {z:.7f}" for x, y, z in mesh.vertices)]
+        for material, order in (("upper", (0, 1, 2)), ("under", (2, 1, 0)))[: 2 if name == "leaf" else 1]:
+            lines += [f"usemtl {material}"]
+            lines += ["f " + " ".join(str(face[k] + first) for k in order) for face in mesh.faces.tolist()]
+        first += len(mesh.vertices)
+    (tmp_path / "vine.obj").write_text("\n".join(lines) + "\n")
+    plant = plant_from_mesh(tmp_path / "vine.obj", MeshRules())
+    leaf = next(organ for organ in plant.organs if organ.name == "leaf")
+    under, upper = leaf.parts
+    assert near(colour_at(upper, 0, (0.2, 0.3, 0.5)), (0, 102, 0))
+    assert near(colour_at(under, 0, (0.2, 0.3, 0.5)), (128, 153, 102))
+    for part in leaf.parts:
+        assert len(part.faces) == 2 and not part.two_sided
+        a, b, c = part.vertices[part.faces[0]]
+        across = np.cross(b - a, c - a)
+        np.testing.assert_allclose(part.normals, np.tile(across / np.linalg.norm(across), (4, 1)), atol=1e-6)
+
+
 @pytest.mark.parametrize("suffix", ["glb", "ply"])
 def test_colours_of_vertices_paint_each_triangle_with_their_mean(tmp_path: Path, suffix: str) -> None:
     meshes = parts()

@@ -182,6 +182,35 @@ def test_open_sheets_are_drawn_from_both_sides_and_closed_bodies_are_not(tmp_pat
     assert sides == {"stem": False, "leaf_00": True, "fruit_00": False, "fruit_green_01": False}
 
 
+def test_only_the_open_pieces_of_an_object_are_drawn_from_both_sides(tmp_path: Path) -> None:
+    """A leaf of a closed stalk and an open blade."""
+    meshes = parts()
+    stalk = trimesh.creation.cylinder(radius=0.002, height=0.1, sections=6).apply_translation(
+        [-0.2, 0.0, 0.7]
+    )
+    meshes["leaf_00"] = trimesh.util.concatenate([meshes["leaf_00"], stalk])
+    plant = plant_from_mesh(write_npz(tmp_path / "vine.npz", meshes), MeshRules())
+    leaf = next(organ for organ in plant.organs if organ.name == "leaf_00")
+    assert {part.two_sided: len(part.faces) for part in leaf.parts} == {False: len(stalk.faces), True: 2}
+
+
+def test_a_leaf_of_two_sides_is_lit_on_both(tmp_path: Path) -> None:
+    meshes = parts()
+    one = meshes["leaf_00"]
+    meshes["leaf_00"] = trimesh.Trimesh(
+        one.vertices, np.concatenate([one.faces, one.faces[:, ::-1]]), process=False
+    )
+    plant = plant_from_mesh(write_npz(tmp_path / "vine.npz", meshes), MeshRules())
+    (leaf,) = next(organ for organ in plant.organs if organ.name == "leaf_00").parts
+    assert not leaf.two_sided and len(leaf.faces) == 4
+    for face in leaf.faces:
+        a, b, c = leaf.vertices[face].astype(np.float64)
+        across = np.cross(b - a, c - a)
+        np.testing.assert_allclose(
+            leaf.normals[face], np.tile(across / np.linalg.norm(across), (3, 1)), atol=1e-6
+        )
+
+
 def test_leaf_cards_are_refused_with_the_reason(tmp_path: Path) -> None:
     def card(alpha: int) -> Path:
         picture = Image.new("RGBA", (4, 4), (0, 128, 0, 255))
@@ -195,6 +224,23 @@ def test_leaf_cards_are_refused_with_the_reason(tmp_path: Path) -> None:
     with pytest.raises(InvalidInputError, match=r"'leaf_00' is a card.*alpha.*'foliage'.*cut it out"):
         plant_from_mesh(card(0), MeshRules())
     plant_from_mesh(card(255), MeshRules())
+
+
+def test_an_obj_whose_material_names_a_picture_of_its_opacity_is_a_card(tmp_path: Path) -> None:
+    path = write_obj(tmp_path / "vine.obj", parts())
+    lines = path.read_text(encoding="utf-8")
+    for name, material in (("leaf_00", "foliage"), ("fruit_00", "skin")):
+        lines = lines.replace(f"o {name}\n", f"o {name}\nusemtl {material}\n")
+    path.write_text(f"mtllib vine.mtl\n{lines}", encoding="utf-8")
+    for opacity in ("d 1.0", "map_d holes.png"):
+        (tmp_path / "vine.mtl").write_text(
+            f"newmtl foliage\nKd 0.1 0.5 0.1\n{opacity}\nnewmtl skin\nKd 0.8 0.1 0.1\n", encoding="utf-8"
+        )
+        if opacity.startswith("map"):
+            with pytest.raises(InvalidInputError, match=r"'leaf_00' is a card.*'foliage'"):
+                plant_from_mesh(path, MeshRules())
+        else:
+            check_whole(plant_from_mesh(path, MeshRules()))
 
 
 def changed(name: str, mesh: trimesh.Trimesh | None) -> dict[str, trimesh.Trimesh]:
