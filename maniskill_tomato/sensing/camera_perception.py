@@ -348,7 +348,7 @@ class CameraPerception:
         weights = {}
         for number, track in search.map.tracks.items():
             ruled_out = any(search.map.current(other) == number for other in search.ruled_out)
-            if not track.is_ripe or ruled_out:
+            if not track.is_ripe or ruled_out or not self._is_apart(track):
                 continue
             spread = track.covariance[:3, :3] + search.place_error**2 * np.eye(3)
             off = track.position_w - search.place
@@ -362,6 +362,11 @@ class CameraPerception:
             search.target = best
         elif search.target is not None and best is not None and weights[best] <= unseen:
             search.target = None
+
+    def _is_apart(self, track: Track) -> bool:
+        """Whether its place tells a track from a fruit beside it; a view without depth gives a direction only."""
+        largest = float(np.linalg.eigvalsh(track.covariance[:3, :3])[-1])
+        return largest < self.config.usual_radius_m**2
 
     def _choose_anew(self, search: _Search, view: MappedView) -> None:
         """Chooses a target where there is none, or where views have long shown no more of it."""

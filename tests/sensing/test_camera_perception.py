@@ -16,6 +16,7 @@ from maniskill_tomato.segmentation.instances import Instances
 from maniskill_tomato.sensing.camera_perception import CameraPerception
 from maniskill_tomato.sensing.fruit_detector import FruitDetector
 from maniskill_tomato.sensing.inspection import STALE_AFTER
+from maniskill_tomato.sensing.posed_frame import PosedFrame
 from maniskill_tomato.sensing.simulated_camera import IMAGE_SIZE, SimulatedCamera
 from maniskill_tomato.tasks.making import make_world
 
@@ -317,6 +318,35 @@ def test_what_the_first_view_of_a_hidden_target_shows_well_is_not_taken_for_it()
     assert min(seen[:2]) > 0.45
     assert seen[2:] == [0.0, 0.0]
     env.close()
+
+
+def test_a_fruit_of_which_a_view_tells_no_more_than_the_direction_is_the_target_when_its_depth_is_measured() -> (
+    None
+):
+    # A round tomato of 27 mm in (0, 0, 0.5) before cameras that look along the world's z.
+    intrinsics = color_intrinsics(*IMAGE_SIZE)
+    u, v = np.meshgrid(np.arange(IMAGE_SIZE[0]) + 0.5, np.arange(IMAGE_SIZE[1]) + 0.5)
+    perception = CameraPerception(1, FruitDetector(None))
+    perception.begin(0, np.array([0.01, 0.0, 0.5]), place_error=0.02)
+    located = []
+    for camera_x, has_depth in ((0.0, False), (0.02, True)):
+        x = camera_x + 0.5 * (u - intrinsics.cx) / intrinsics.fx
+        y = 0.5 * (v - intrinsics.cy) / intrinsics.fy
+        away = np.hypot(x, y)
+        mask = away < 0.027
+        depth = np.where(mask, 0.5 - np.sqrt(np.maximum(0.027**2 - away**2, 0.0)), 0.8) * has_depth
+        pose = np.eye(4)
+        pose[0, 3] = camera_x
+        frame = PosedFrame(
+            depth_m=depth.astype(np.float32),
+            intrinsics=intrinsics,
+            T_world_camera=pose,
+            told_fruits=Instances.from_masks(mask[None], categories=("tomato_ripe",)),
+        )
+        perception.look([frame])
+        located.append(bool(perception.is_located[0]))
+    assert located == [False, True]
+    assert float(perception.visible_fraction[0]) > 0.8
 
 
 class LabelSegmenter:
