@@ -15,6 +15,7 @@ from torch import Tensor
 from maniskill_tomato.errors import InvalidInputError
 from maniskill_tomato.raycast.view_rays import RAYS_PER_SIDE, RayLabel, ViewRays
 from maniskill_tomato.segmentation.masks import BinaryMask
+from maniskill_tomato.sensing.axis_search import AxisSearch
 from maniskill_tomato.sensing.fruit_detector import FruitDetector
 from maniskill_tomato.sensing.fruit_map import Fraction, FruitMap, MapConfig, MappedView, Track
 from maniskill_tomato.sensing.inspection import LEAST_GAIN
@@ -29,21 +30,6 @@ RECENTRE: Final = CELL_SIZE / 4
 
 SAME_POSE: Final = 1e-3
 """Entries of the camera's pose (in [m] for its place) differ by less than this in views from the same place."""
-
-SCAN_DEPTH: Final = 0.5
-"""How far in front of the camera a robot looks that has seen no fruit yet, in [m]."""
-
-SCAN_VIEWS: Final = 2
-"""Views of one place before a robot that does not find its target looks at another."""
-
-SCAN_OFFSETS: Final = (0.0, 0.12, -0.12, 0.24, 0.06, -0.06)
-"""How much farther away these places are, in [m]."""
-
-NEAR_AXIS: Final = 0.15
-"""Fruits farther from the optical axis do not say how far away the target may be, in [m]."""
-
-LARGEST_SPREAD: Final = 0.03
-"""Nor do tracks whose place is less certain, in [m]."""
 
 MEASURED_MARGIN: Final = 0.15
 """How much more of a fruit must be measured than of a hidden target can be seen, to rule it out: three times the mean
@@ -89,6 +75,8 @@ class _Search:
     """Where the robot looks without a target, world frame, in [m]. Shape (3,)."""
     centre: Position | None = None
     """About which memory and rays stand, world frame, in [m]. Shape (3,)."""
+    axis: AxisSearch | None = None
+    """Where a target is looked for that no view has shown; None before the first view."""
     views: list[MappedView] | None = None
     fraction: Fraction = Fraction.nothing()
 
@@ -229,13 +217,17 @@ class CameraPerception:
             shown = measurement.frame.shown_fruit
             identities = [shown(measurement.mask(k)) for k in range(len(measurement.fruits))]
         pose, last = measurement.frame.T_world_camera, search.views[-1] if search.views else None
+        first = not search.views
+        if search.axis is None:
+            search.axis = AxisSearch(pose, self.config)
         if last is not None and np.allclose(
             pose, last.measurement.frame.T_world_camera, rtol=0.0, atol=SAME_POSE
         ):
             view = search.map.again(measurement, last)
         else:
             view = search.map.update(measurement, identities)
-        first = not search.views
+            if search.target is None and search.place is None and search.looks_at is None:
+                search.axis.miss(view.measurement)
         search.views = [*(_slimmed(earlier) for earlier in search.views or []), view]
         if search.target is not None:
             search.target = search.map.current(search.target)
@@ -410,7 +402,7 @@ class CameraPerception:
         elif search.looks_at is not None:
             towards = search.looks_at
         else:
-            towards = _scan_centre(search) if view is not None else np.zeros(3)
+            towards = np.zeros(3) if search.axis is None else search.axis.place(search.map.tracks.values())
         if view is not None:
             index = view.detection(search.target)
             search.fraction = search.map.fraction(view.measurement, index, search.target)
@@ -461,23 +453,3 @@ def _slimmed(view: MappedView) -> MappedView:
         return view
     frame = replace(frame, rgb=None, true_fruits=None, told_fruits=None, true_numbers=())
     return replace(view, measurement=replace(view.measurement, frame=frame))
-
-
-def _scan_centre(search: _Search) -> Position:
-    """Where a robot looks that does not know its target: on the optical axis of its first view. Shape (3,).
-
-    At first that is as far away as the fruit nearest to the axis, of 30 starts on validation plants 32 mm off in the
-    mean; the median depth of the plant is 109 mm off. After every `SCAN_VIEWS` views it is another of `SCAN_OFFSETS`.
-    """
-    assert search.views
-    pose = search.views[0].measurement.frame.T_world_camera
-    position, axis = pose[:3, 3], pose[:3, 2]
-    depth, nearest = SCAN_DEPTH, NEAR_AXIS
-    for track in search.map.tracks.values():
-        away = track.position_w - position
-        along = float(away @ axis)
-        beside = float(np.linalg.norm(away - along * axis))
-        if along > 0.0 and beside < nearest and track.covariance[:3, :3].trace() < LARGEST_SPREAD**2:
-            depth, nearest = along, beside
-    turn = (len(search.views) - 1) // SCAN_VIEWS
-    return np.asarray(position + max(depth + SCAN_OFFSETS[turn % len(SCAN_OFFSETS)], 0.2) * axis)

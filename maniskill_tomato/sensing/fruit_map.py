@@ -11,13 +11,15 @@ it does not.
 import itertools
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
+from numpy.typing import NDArray
 
 from maniskill_tomato.robot.d435 import CameraIntrinsics
 from maniskill_tomato.segmentation.masks import BinaryMask
 from maniskill_tomato.sensing.measurement import DetectedFruit, Measurement, Position
+from maniskill_tomato.sensing.posed_frame import PosedFrame
 from maniskill_tomato.sensing.visible_fraction.estimate import Float64
 from maniskill_tomato.sensing.visible_fraction.sphere import SphereConfig, round_outline, whole_silhouette
 
@@ -572,11 +574,26 @@ def shown_share(track: Track, measurement: Measurement) -> float | None:
         it lies outside the picture.
     """
     frame = measurement.frame
-    circle = outline(track.mean, frame.T_world_camera, frame.intrinsics)
+    deviation = float(np.sqrt(np.trace(track.covariance[:3, :3])))
+    return shown_of_sphere(track.mean, frame, frame.depth_m, deviation)
+
+
+def shown_of_sphere(
+    sphere: Float64, frame: PosedFrame, depth_m: NDArray[np.floating[Any]], deviation: float = 0.0
+) -> float | None:
+    """The same for a sphere that nothing was seen of.
+
+    Args:
+        sphere: Centre in the world frame and radius, in [m]. Shape (4,).
+        frame: The view.
+        depth_m: Its depth, in [m]. Shape (H, W).
+        deviation: Standard deviation of the sphere's place, in [m].
+    """
+    circle = outline(sphere, frame.T_world_camera, frame.intrinsics)
     if circle is None:
         return None
     x, y, radius = circle
-    height, width = frame.depth_m.shape
+    height, width = depth_m.shape
     if not (radius < x < width - radius and radius < y < height - radius):
         return None
     step = max(radius / 6.0, 1.0)
@@ -585,12 +602,11 @@ def shown_share(track: Track, measurement: Measurement) -> float | None:
     disc = dx**2 + dy**2 < (0.8 * radius) ** 2
     columns = np.clip((x + dx[disc]).astype(int), 0, width - 1)
     rows = np.clip((y + dy[disc]).astype(int), 0, height - 1)
-    depth = frame.depth_m[rows, columns]
+    depth = depth_m[rows, columns]
     if frame.robot_mask is not None:
         depth = np.where(frame.robot_mask[rows, columns], 0.0, depth)
-    z = float((frame.T_world_camera[:3, :3].T @ (track.position_w - frame.T_world_camera[:3, 3]))[2])
-    deviation = float(np.sqrt(np.trace(track.covariance[:3, :3])))
-    front = z - SURFACE_MARGIN * track.radius_m - deviation
+    z = float((frame.T_world_camera[:3, :3].T @ (sphere[:3] - frame.T_world_camera[:3, 3]))[2])
+    front = z - SURFACE_MARGIN * float(sphere[3]) - deviation
     return float(np.mean(np.isfinite(depth) & (depth > front)))
 
 

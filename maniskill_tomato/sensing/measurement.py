@@ -97,6 +97,8 @@ class Measurement:
     def rays(self, target_position: Position, fruit: int | None) -> ViewRays:
         """The pattern of rays about a target position, read from depth and masks.
 
+        Rays into a stereo shadow tell of what is farther: without them the surroundings of every leaf seem denser.
+
         Args:
             target_position: Where the target is believed to be, world frame, in [m]. Shape (3,).
             fruit: Index in `fruits` of the one that is the target; None if none is.
@@ -105,7 +107,7 @@ class Measurement:
             One view (B = 1), on the CPU.
         """
         return sample_view(
-            self.frame.depth_m,
+            self.frame.unshadowed_m,
             self.mask(fruit),
             self.frame.intrinsics,
             torch.as_tensor(self.frame.T_world_camera),

@@ -57,6 +57,14 @@ class PosedFrame:
         """The same without holes (`filled_depth`). Shape (H, W)."""
         return filled_depth(self.measured_m)
 
+    @cached_property
+    def unshadowed_m(self) -> NDArray[np.float32]:
+        """The same without the holes that stereo shadows make; 0 in others, such as where something is too near.
+
+        Shape (H, W).
+        """
+        return filled_depth(self.measured_m, self.intrinsics.fx).astype(np.float32)
+
     def shown_fruit(self, mask: BinaryMask) -> int | None:
         """Which fruit most pixels of a mask show, as an index in `Plant.fruits`.
 

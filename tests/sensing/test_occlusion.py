@@ -233,6 +233,16 @@ def test_holes_of_the_depth_take_the_farther_side() -> None:
     assert np.isnan(fruit_depth(depth, depth == 0.0))
 
 
+def test_a_hole_is_filled_as_a_shadow_only_if_it_is_no_wider_than_that_of_its_nearer_side() -> None:
+    # With a focal length of 100 px the imager 65 mm aside sees 100 x 0.065 x (1 / 0.4 - 1 / 0.9) = 9 px less.
+    for width, filled in ((9, 0.9), (20, 0.0)):
+        row = np.array([[0.4, *[0.0] * width, 0.9]])
+        assert filled_depth(row, focal=100.0).tolist() == [[0.4, *[filled] * width, 0.9]]
+    assert filled_depth(np.array([[0.0, 0.9]]), focal=100.0).tolist() == [[0.0, 0.9]], (
+        "nothing nearer beside it"
+    )
+
+
 def test_models_are_made_by_name_and_other_names_are_refused() -> None:
     view, _ = draw(leaf_from=2.0)
     for name in ("thesis", "improved", "sphere"):

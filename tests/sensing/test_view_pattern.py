@@ -16,6 +16,8 @@ from maniskill_tomato.raycast.scene import RayScene
 from maniskill_tomato.raycast.view_rays import DEPTH_MODE, NEAREST_DEPTH, RANGE, RayLabel, ViewRays
 from maniskill_tomato.robot.d435 import CameraIntrinsics, depth_noise_std
 from maniskill_tomato.robot.look_at import look_at_pose
+from maniskill_tomato.sensing.measurement import Measurement
+from maniskill_tomato.sensing.posed_frame import PosedFrame
 from maniskill_tomato.sensing.view_pattern import disturb, sample_view
 
 RADIUS = 0.035
@@ -137,3 +139,19 @@ def test_disturbed_rays_err_as_often_and_as_far_as_asked() -> None:
     assert bool((wrong.distance[lost] == 0).all())
     with pytest.raises(InvalidInputError, match=r"dropout must lie in \[0, 1\], got 1.5"):
         disturb(rays, generator, dropout=1.5)
+
+
+@pytest.mark.parametrize(("near", "label"), [(0.25, RayLabel.OTHER), (0.45, RayLabel.OUTSIDE)])
+def test_rays_into_the_shadow_of_a_leaf_meet_what_is_behind_it_and_those_into_other_holes_nothing(
+    near: float, label: RayLabel
+) -> None:
+    # A leaf to the left, a wall at 0.5 m, and between them 24 columns without depth. The shadow of a leaf at 0.25 m is
+    # 250 x 0.065 x (1 / 0.25 - 1 / 0.5) = 32 px wide, that of one at 0.45 m 4 px.
+    depth = np.full((WIDE.height, WIDE.width), 0.5, np.float32)
+    depth[:, :320], depth[:, 320:344] = near, 0.0
+    frame = PosedFrame(depth_m=depth, intrinsics=WIDE, T_world_camera=np.eye(4))
+    rays = Measurement(frame=frame, fruits=()).rays(np.array([0.0, 0.0, 0.5]), None)
+    column = WIDE.fx * rays.direction_c[0, :, 0] / rays.direction_c[0, :, 2] + WIDE.cx
+    in_hole = (column > 321.0) & (column < 343.0)
+    assert int(in_hole.sum()) > 16
+    assert set(rays.label[0, in_hole].tolist()) == {int(label)}

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from maniskill_tomato.errors import InvalidInputError
-from maniskill_tomato.robot.d435 import CameraIntrinsics
+from maniskill_tomato.robot.d435 import STEREO_BASELINE, CameraIntrinsics, T_color_optical_depth_optical
 from maniskill_tomato.segmentation.masks import BinaryMask
 
 USUAL_RADIUS: Final = 0.029
@@ -132,10 +132,21 @@ def surrounding_depth(depth_m: Float64, mask: BinaryMask) -> float:
     return float(np.median(values)) if len(values) else float("nan")
 
 
-def filled_depth(depth_m: Float64) -> Float64:
+FARTHER_IMAGER: Final = float(T_color_optical_depth_optical[0, 3]) + STEREO_BASELINE
+"""How far the second infrared imager sits beside the colour camera, in [m]."""
+
+SHADOW_MARGIN: Final = 3
+"""Holes may be so much wider than the shadow that explains them: edges of depth are smeared, in [px]."""
+
+
+def filled_depth(depth_m: Float64, focal: float | None = None) -> Float64:
     """Depth without holes: each takes the farther of the nearest measurements beside it in its row.
 
     A D435's holes beside an edge are the shadow of the nearer side, so that they show the farther one.
+
+    Args:
+        depth_m: In [m], 0 where there is no measurement. Shape (H, W).
+        focal: Focal length, in [px], to fill those holes alone that such a shadow is wide enough for; None to fill all.
     """
     filled = np.array(depth_m, dtype=np.float64)
     hole = ~(depth_m > 0)
@@ -147,5 +158,11 @@ def filled_depth(depth_m: Float64) -> Float64:
     after = changes[1::2] % (width + 1)
     before = np.where(first > 0, filled[rows, np.maximum(first - 1, 0)], 0.0)
     behind = np.where(after < width, filled[rows, np.minimum(after, width - 1)], 0.0)
-    filled[hole] = np.repeat(np.maximum(before, behind), after - first)
+    nearer, farther = np.minimum(before, behind), np.maximum(before, behind)
+    if focal is not None:
+        # What touches the edge of the picture has one side only.
+        shifts = 1.0 / np.maximum(nearer, 1e-6) - 1.0 / np.maximum(farther, 1e-6)
+        is_shadow = (nearer > 0) & (after - first <= focal * FARTHER_IMAGER * shifts + SHADOW_MARGIN)
+        farther = np.where(is_shadow, farther, 0.0)
+    filled[hole] = np.repeat(farther, after - first)
     return filled
