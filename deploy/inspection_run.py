@@ -66,6 +66,7 @@ def inspect_row(
         keyboard: Whether keys in a terminal stop the run.
 
     Raises:
+        StoppedError: A signal came before the first look, when nothing had moved.
         DeployError: It could not begin: a profile, a device or a folder cannot be used.
         PolicyError: The policy cannot be used.
         RecordingError: The recording cannot be begun.

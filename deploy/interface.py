@@ -7,6 +7,7 @@ the driver's `Clock` and say when the device took the measurement, as far as the
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass
 from types import TracebackType
 from typing import Any, Final, Self
@@ -172,7 +173,13 @@ class Device(ABC):
         return {"driver": self.name}
 
     def __enter__(self) -> Self:
-        self.connect()
+        try:
+            self.connect()
+        except BaseException:
+            # A signal may come when half of it is done.
+            with suppress(Exception):
+                self.disconnect()
+            raise
         return self
 
     def __exit__(

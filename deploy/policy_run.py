@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from maniskill_tomato import __version__
 from maniskill_tomato.deploy.clock import Clock
 from maniskill_tomato.deploy.decision import TASK, default_policy
-from maniskill_tomato.deploy.deploy_errors import RecordingError
+from maniskill_tomato.deploy.deploy_errors import RecordingError, StoppedError
 from maniskill_tomato.deploy.fault_state import FaultState, early_fault
 from maniskill_tomato.deploy.goal import Goal
 from maniskill_tomato.deploy.interface import Float64
@@ -88,6 +88,7 @@ def run(
         How it ended; faults during the run are told there.
 
     Raises:
+        StoppedError: A signal came before the first look, when nothing had moved.
         DeployError: It could not begin: a profile, a device or a folder cannot be used.
         PolicyError: The policy cannot be used.
         RecordingError: The recording cannot be begun.
@@ -158,6 +159,9 @@ def run_goal(
 
     Returns:
         How it ended, and what a result tells beside that.
+
+    Raises:
+        StoppedError: A signal came before the first look, when nothing had moved.
     """
     profile, workcell = config.profile, prepared.workcell
     stops = workcell.listen(config.out, keyboard)
@@ -171,28 +175,37 @@ def run_goal(
         return keep_fault(fault, recorder, config.out, info, workcell.clock, mount, workcell.arm.model)
 
     with ExitStack() as stack:
-        arm = stack.enter_context(workcell.arm)
-        camera = stack.enter_context(workcell.camera)
-        if prepared.mode != "dry_run":
-            workcell.check_calibration()
-        for problem in workcell.calibration_problems():
-            _logger.warning("only a dry run: %s", problem)
-        facts = {**facts, "devices": {"arm": arm.describe(), "camera": camera.describe()}}
-        info |= facts
-        every = list(recorders)
-        if config.record:
-            recorder = McapRecorder(config.out / RECORDING, info, workcell.clock, mount, workcell.arm.model)
-            every.append(stack.enter_context(recorder))
+        # The first to be entered is the last to be left: no signal ends the program before the devices are let go.
         stack.enter_context(stops)
+        with stops.interrupting():
+            arm = stack.enter_context(workcell.arm)
+            camera = stack.enter_context(workcell.camera)
+            if prepared.mode != "dry_run":
+                workcell.check_calibration()
+            for problem in workcell.calibration_problems():
+                _logger.warning("only a dry run: %s", problem)
+            facts = {**facts, "devices": {"arm": arm.describe(), "camera": camera.describe()}}
+            info |= facts
+            every = list(recorders)
+            if config.record:
+                recorder = McapRecorder(
+                    config.out / RECORDING, info, workcell.clock, mount, workcell.arm.model
+                )
+                every.append(stack.enter_context(recorder))
         try:
             # What is slow the first time is done before the loop's first beat, from which on the heartbeat is watched.
-            load_kernels()
-            workcell.perception.warm_up(camera.intrinsics)
+            with stops.interrupting():
+                load_kernels()
+                workcell.perception.warm_up(camera.intrinsics)
             result = Loop(workcell, prepared.policy, stops, prepared.mode, every, confirm, goal).run()
+        except StoppedError:
+            raise
         except Exception as error:
             # Before the loop's first look, in which nothing moves.
             keep(early_fault(error))
             raise
+        finally:
+            stops.rest()
         if result.fault is not None:
             result = replace(result, fault_file=keep(result.fault))
     return result, facts

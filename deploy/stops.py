@@ -90,8 +90,9 @@ class Stops:
         return self._reason
 
     @contextmanager
-    def waiting_for_a_person(self) -> Iterator[None]:
-        """While inside, nobody expects a beat: people take their time. A signal ends the waiting.
+    def interrupting(self) -> Iterator[None]:
+        """While inside, nobody expects a beat, and a signal raises where it finds the program: for what waits without
+        asking, such as a connection.
 
         Raises:
             StoppedError: A signal asked to stop, or something did before.
@@ -103,8 +104,24 @@ class Stops:
                 raise StoppedError(self._reason)
             yield
         finally:
-            self._last_beat = time.monotonic()
             self._waiting = False
+
+    @contextmanager
+    def waiting_for_a_person(self) -> Iterator[None]:
+        """While inside, nobody expects a beat: people take their time. A signal ends the waiting.
+
+        Raises:
+            StoppedError: A signal asked to stop, or something did before.
+        """
+        with self.interrupting():
+            try:
+                yield
+            finally:
+                self._last_beat = time.monotonic()
+
+    def rest(self) -> None:
+        """No beat is expected any more: the loop is over. Signals are still taken."""
+        self._last_beat = math.inf
 
     @property
     def reason(self) -> str | None:

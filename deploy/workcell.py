@@ -107,10 +107,16 @@ class Workcell:
         stop_file = out / self.profile.stop.file
         try:
             out.mkdir(parents=True, exist_ok=True)
-            stop_file.unlink(missing_ok=True)
         except OSError as error:
             raise RecordingError(
                 f"cannot use the folder {out}: {error.strerror or error}; choose another --out"
+            ) from error
+        try:
+            stop_file.unlink(missing_ok=True)
+        except OSError as error:
+            raise RecordingError(
+                f"cannot take {stop_file} away, which stops every run: {error.strerror or error}; remove it, or choose "
+                "another --out"
             ) from error
         return Stops(
             stop_file=stop_file,

@@ -1,6 +1,7 @@
 """`maniskill-tomato deploy calibrate`: where the camera sits on the flange, and how good a calibration is."""
 
 import math
+import sys
 from collections.abc import Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
@@ -9,7 +10,7 @@ from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Final
 
 from maniskill_tomato.cli.early_checks import check_counts, check_file, check_folder, check_profile
-from maniskill_tomato.cli.operator_prompt import FAULT_STATUS, end_by_signal, goes, one_mode
+from maniskill_tomato.cli.operator_prompt import FAULT_STATUS, end_by_signal, goes, one_mode, stopped_early
 from maniskill_tomato.errors import InvalidInputError
 from maniskill_tomato.folder_lock import only_writer
 
@@ -31,8 +32,8 @@ class DeployCalibrate:
     Without --confirm or --unattended nothing moves: it takes one picture and shows the first move. --views FOLDER
     calculates from pictures taken before. --evaluate calibration.json measures a calibration instead, on views that it
     was not made from. Ctrl-C, SIGTERM, the key q with Enter and the file STOP in the output folder stop it; the
-    pictures taken so far stay. Exit status: 0 done, 2 could not begin, 3 a real arm would not move by this calibration
-    or it did not pass, 130 or 143 stopped by a signal.
+    pictures taken so far stay. Exit status: 0 done, 2 could not begin, 3 a fault ended it, a real arm would not move by
+    this calibration, or it did not pass, 130 or 143 stopped by a signal.
     """
 
     profile: str | None = None
@@ -174,10 +175,11 @@ class DeployCalibrate:
 
     def _take(self, name: str, folder: Path) -> bool:
         """Takes pictures with the devices of a profile; whether there are enough to calculate."""
-        from maniskill_tomato.deploy.calibration.hand_eye import MIN_VIEWS
+        from maniskill_tomato.deploy.calibration.hand_eye import MIN_VIEWS, CalibrationError
         from maniskill_tomato.deploy.calibration.view_capture import CapturePlan, capture_views
-        from maniskill_tomato.deploy.deploy_errors import StoppedError
+        from maniskill_tomato.deploy.deploy_errors import DeployError, StoppedError
         from maniskill_tomato.deploy.profile import load_profile
+        from maniskill_tomato.deploy.rest import come_to_rest
         from maniskill_tomato.deploy.workcell import make_workcell
 
         moves = self.confirm or self.unattended
@@ -193,9 +195,11 @@ class DeployCalibrate:
         with ExitStack() as stack:
             if not moves:
                 folder = Path(stack.enter_context(TemporaryDirectory()))
-            stack.enter_context(workcell.arm)
-            camera = stack.enter_context(workcell.camera)
+            # The first to be entered is the last to be left: no signal ends the program before the devices are let go.
             stack.enter_context(stops)
+            with stopped_early(), stops.interrupting():
+                stack.enter_context(workcell.arm)
+                camera = stack.enter_context(workcell.camera)
             try:
                 taken = capture_views(
                     workcell.guarded_arm,
@@ -215,6 +219,15 @@ class DeployCalibrate:
                     _tell_kept(folder)
                 end_by_signal(stops.reason)
                 return False
+            except DeployError as error:
+                if isinstance(error, CalibrationError):
+                    raise
+                print(f"error: {error}; {come_to_rest(workcell.guarded_arm)}", file=sys.stderr)
+                if moves:
+                    _tell_kept(folder)
+                raise SystemExit(FAULT_STATUS) from error
+            finally:
+                stops.rest()
         if not moves:
             print("dry run: the board is in the picture; nothing moved; --confirm asks before every move")
             return False

@@ -14,7 +14,7 @@ from maniskill_tomato.cli.early_checks import (
     check_policy,
     check_profile,
 )
-from maniskill_tomato.cli.operator_prompt import FAULT_STATUS, end_by_signal, goes, one_mode
+from maniskill_tomato.cli.operator_prompt import FAULT_STATUS, end_by_signal, goes, one_mode, stopped_early
 from maniskill_tomato.policies.layout import GENERAL_IDS
 
 if TYPE_CHECKING:
@@ -78,7 +78,8 @@ class DeployRun(_Moving):
 
         from maniskill_tomato.deploy.policy_run import run
 
-        result = run(config, confirm=_ask, keyboard=not self.confirm)
+        with stopped_early():
+            result = run(config, confirm=_ask, keyboard=not self.confirm)
         print(
             f"{result.reason}: {result.detail}; {result.moves} moves, V_f {result.visible_fraction:.2f}, "
             f"{result.seconds:.1f} s; {result.end_state}"
@@ -111,7 +112,8 @@ class DeployInspect(_Moving):
 
         from maniskill_tomato.deploy.inspection_run import inspect_row
 
-        done = inspect_row(config, self.max_moves, confirm=_ask, keyboard=not self.confirm)
+        with stopped_early():
+            done = inspect_row(config, self.max_moves, confirm=_ask, keyboard=not self.confirm)
         result, ripe = done.run, [fruit for fruit in done.fruits if fruit["ripeness"] == "ripe"]
         full = sum(fruit["fully_seen"] for fruit in ripe)
         print(

@@ -2,6 +2,8 @@
 
 import signal
 import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import TYPE_CHECKING, Final, cast
 
 from maniskill_tomato.errors import InvalidInputError
@@ -34,6 +36,19 @@ def goes() -> bool:
         return input("go? [y/N] ").strip().lower() in ("y", "yes")
     except EOFError:
         return False
+
+
+@contextmanager
+def stopped_early() -> Iterator[None]:
+    """Ends with the exit status of a signal that came before a run's first look."""
+    from maniskill_tomato.deploy.deploy_errors import StoppedError
+
+    try:
+        yield
+    except StoppedError as error:
+        print(f"stopped: {error} before the first look; nothing has moved")
+        end_by_signal(str(error))
+        raise
 
 
 def end_by_signal(reason: str | None) -> None:

@@ -9,11 +9,15 @@ import sys
 import threading
 import time
 from pathlib import Path
+from typing import Any
 
 import pytest
 
 from maniskill_tomato.cli import deploy_commands, main, parse
 from maniskill_tomato.cli.operator_prompt import goes
+from maniskill_tomato.deploy.mock.mock_arm import MockArm
+from maniskill_tomato.deploy.mock.mock_camera import MockCamera
+from maniskill_tomato.deploy.robot_perception import ImagePerception, TruthPerception
 from maniskill_tomato.deploy.stops import Stops
 
 BLOCKED = """
@@ -113,18 +117,85 @@ def test_the_first_run_compiles_its_kernels_before_the_heartbeat_is_watched(tmp_
 def test_ctrl_c_while_views_of_a_calibration_are_taken_ends_it_with_its_status(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    listen = Stops.__enter__
+    beat = Stops.beat
 
-    def listen_and_press(self: Stops) -> Stops:
-        listen(self)
+    def press_and_beat(self: Stops) -> str | None:
         os.kill(os.getpid(), signal.SIGINT)
-        return self
+        return beat(self)
 
-    monkeypatch.setattr(Stops, "__enter__", listen_and_press)
+    monkeypatch.setattr(Stops, "beat", press_and_beat)
     with pytest.raises(SystemExit) as end:
         main(["deploy", "calibrate", "--profile", "mock", "--unattended", "--out", str(tmp_path)])
     assert end.value.code == 128 + signal.SIGINT
     assert "stopped (SIGINT) after 0 views; the arm stands and holds its position" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("command", "place"),
+    [
+        ("run", "arm"),
+        ("run", "camera"),
+        ("run", "warming up"),
+        ("inspect", "warming up"),
+        ("calibrate", "arm"),
+        ("calibrate", "camera"),
+    ],
+)
+def test_a_signal_before_the_first_look_ends_the_command_with_its_devices_let_go(
+    command: str,
+    place: str,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    opened: list[Any] = []
+    pressed = threading.Event()
+
+    def pressing(kind: Any, name: str, presses: bool) -> None:
+        real = getattr(kind, name)
+
+        def call(self: Any, *arguments: Any) -> Any:
+            if name == "connect":
+                opened.append(self)
+            answer = real(self, *arguments)
+            if presses and not pressed.is_set():
+                pressed.set()
+                os.kill(os.getpid(), signal.SIGTERM)
+                time.sleep(60.0)  # As if a controller did not answer.
+            return answer
+
+        monkeypatch.setattr(kind, name, call)
+
+    pressing(MockArm, "connect", place == "arm")
+    pressing(MockCamera, "connect", place == "camera")
+    for perception in (ImagePerception, TruthPerception):
+        pressing(perception, "warm_up", place == "warming up")
+    began, before = time.monotonic(), signal.getsignal(signal.SIGTERM)
+    options = ["--unattended"] if command == "calibrate" else []
+    with pytest.raises(SystemExit) as end:
+        main(["deploy", command, "--profile", "mock", *options, "--out", str(tmp_path / "out")])
+    assert end.value.code == 128 + signal.SIGTERM and time.monotonic() - began < 60.0
+    assert "stopped: SIGTERM before the first look; nothing has moved" in capsys.readouterr().out
+    assert len(opened) == (1 if place == "arm" else 2)
+    assert not any(device.is_connected for device in opened)
+    assert signal.getsignal(signal.SIGTERM) is before
+
+
+def test_a_fault_while_views_are_taken_tells_what_the_arm_does_then(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    profile = tmp_path / "broken.toml"
+    profile.write_text(
+        '[arm]\ndriver = "mock"\n[camera]\ndriver = "mock"\n'
+        '[twin]\nfaults = { camera = "unplugged", camera_from_read = 0 }\n'
+    )
+    with pytest.raises(SystemExit) as end:
+        main(
+            ["deploy", "calibrate", "--profile", str(profile), "--unattended", "--out", str(tmp_path / "out")]
+        )
+    assert end.value.code == 3
+    told = capsys.readouterr().err
+    assert "the camera is gone" in told and "; the arm stands and holds its position" in told
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
