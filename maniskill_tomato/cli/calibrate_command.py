@@ -19,6 +19,9 @@ if TYPE_CHECKING:
     from maniskill_tomato.deploy.calibration.view_folder import RecordedView
     from maniskill_tomato.robot.d435 import CameraIntrinsics
 
+EVALUATION: Final = "evaluation.json"
+"""What an evaluation writes into its folder."""
+
 EVALUATION_TURN: Final = 1.2
 """So far the pattern of views is turned for an evaluation, in [rad], that it looks from other places."""
 
@@ -135,7 +138,7 @@ class DeployCalibrate:
 
         pose, calibration = read_calibration(file)
         found = evaluate(board, pose, calibration, views, intrinsics, serial)
-        write_evaluation(self.out / "evaluation.json", file, found)
+        write_evaluation(self.out / EVALUATION, file, found)
         draw_calibration(self.out / "evaluation.png", found.agreement, intrinsics)
         for text in found.agreement.left_out:
             print(f"left out {text}")
@@ -144,7 +147,7 @@ class DeployCalibrate:
             f"lies {1000 * found.agreement.board_position_rms:.2f} mm and "
             f"{math.degrees(found.agreement.board_turn_rms):.3f} deg from that by all"
         )
-        print(f"numbers {self.out / 'evaluation.json'}")
+        print(f"numbers {self.out / EVALUATION}")
         print(f"picture {self.out / 'evaluation.png'}")
         _end_with(found.problems, f"{file} does not pass")
         print("passed")
@@ -157,6 +160,10 @@ class DeployCalibrate:
         if (self.profile is None) == (self.views is None):
             raise InvalidInputError("give either --profile (takes pictures) or --views (a folder of them)")
         check_file("--evaluate", self.evaluate)
+        if self.evaluate is not None and self.evaluate.resolve() == (self.out / EVALUATION).resolve():
+            raise InvalidInputError(
+                f"--evaluate {self.evaluate} would be replaced by what is measured; choose another --out"
+            )
         check_folder("--views", self.views)
         if self.profile is not None:
             check_profile("--profile", self.profile)

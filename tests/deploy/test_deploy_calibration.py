@@ -492,6 +492,21 @@ def test_a_wrong_calibration_does_not_pass_an_evaluation(
     assert json.loads((tmp_path / "out" / "evaluation.json").read_text())["passed"] is False
 
 
+def test_an_evaluation_does_not_take_the_place_of_the_calibration_that_it_measures(
+    calibration_file: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    named_so = tmp_path / "evaluation.json"
+    named_so.write_bytes(calibration_file.read_bytes())
+    (tmp_path / "link").symlink_to(tmp_path, target_is_directory=True)
+    with pytest.raises(SystemExit) as end:
+        main(
+            ["deploy", "calibrate", "--evaluate", str(tmp_path / "link" / "evaluation.json")]
+            + ["--views", str(tmp_path), "--out", str(tmp_path)]
+        )
+    assert end.value.code == 2 and "choose another --out" in capsys.readouterr().err
+    assert named_so.read_bytes() == calibration_file.read_bytes()
+
+
 def test_views_that_the_calibration_was_made_from_say_nothing_of_it(
     calibration_file: Path, views: list[RecordedView], new_views: list[RecordedView]
 ) -> None:
