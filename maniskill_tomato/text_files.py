@@ -41,7 +41,7 @@ def parse_json(text: str) -> Any:
     Raises:
         InvalidInputError: It is no JSON, or beyond the limits.
     """
-    return _parsed(lambda: json.loads(text, parse_int=_integer))
+    return _parsed(lambda: json.loads(text, parse_int=_integer, object_pairs_hook=_object))
 
 
 def parse_toml(text: str) -> dict[str, Any]:
@@ -80,6 +80,16 @@ def _integer(text: str) -> int:
     if len(text.lstrip("-")) > LONGEST_INTEGER:
         raise ValueError(f"an integer of {len(text)} digits; {LONGEST_INTEGER} are allowed")
     return int(text)
+
+
+def _object(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    """A table whose keys stand once each, as TOML asks for too: of two values nobody knows which is meant."""
+    table = dict(pairs)
+    if len(table) < len(pairs):
+        keys = [key for key, _ in pairs]
+        twice = next(key for key in keys if keys.count(key) > 1)
+        raise ValueError(f"the key {twice!r} stands twice in one table")
+    return table
 
 
 def _check(value: Any) -> None:

@@ -3,6 +3,7 @@
 import contextlib
 import json
 import os
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -58,6 +59,15 @@ def test_long_integers_are_refused(digits: int) -> None:
 
 
 @pytest.mark.timeout(60)
+@pytest.mark.parametrize("parse", [parse_json, parse_toml])
+def test_a_key_that_stands_twice_in_a_table_is_refused(parse: Callable[[str], Any]) -> None:
+    twice = '{"a": {"rms_px": 500, "b": 1, "rms_px": 0.1}}' if parse is parse_json else "[a]\nb = 1\nb = 2\n"
+    with pytest.raises(InvalidInputError, match="twice|overwrite"):
+        parse(twice)
+    once = '[{"a": 1}, {"a": 1}]' if parse is parse_json else "[[a]]\nb = 1\n[[a]]\nb = 2\n"
+    assert len(list(parse(once))) >= 1
+
+
 def test_a_device_that_never_ends_and_a_pipe_in_which_nobody_writes_are_no_files(tmp_path: Path) -> None:
     pipe = tmp_path / "pipe.json"
     os.mkfifo(pipe)
