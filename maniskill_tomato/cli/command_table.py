@@ -87,7 +87,7 @@ COMMANDS: Final[dict[str, CommandEntry]] = {
 
 FAMILIES: Final[dict[str, str]] = {
     "train-segmenter": "Train a segmenter on annotated images",
-    "judge": "Judge a part: V_f models, segmenters, perception, plants from files, twin",
+    "judge": "Judge a part: V_f, segmenters, perception, plants, twin",
     "deploy": "Run a policy on an arm and a camera, or on their twin",
 }
 """Commands that have commands, and what the list says of them."""
