@@ -165,36 +165,45 @@ def _placed(surface: _Surface, T: Float64) -> _Surface:
 
 
 def _within(path: Path, surfaces: Sequence[_Surface], names: Sequence[str], triangles: int) -> list[_Surface]:
-    """The surfaces with no more than so many triangles in all; what matters least to their shapes goes first."""
+    """The surfaces with no more than so many triangles in all; what matters least to their shapes goes first.
+
+    Of the smallest, such as buds, nothing would be left: they keep all that they have.
+    """
     whole = [_welded(surface) for surface in surfaces]
-    firsts = np.cumsum([0] + [len(surface.vertices) for surface in whole])
-    owner = np.repeat(np.arange(len(whole)), [len(surface.faces) for surface in whole])
+    sizes = np.array([len(surface.faces) for surface in whole])
+    firsts, starts = (np.cumsum([0, *counts]) for counts in ([len(s.vertices) for s in whole], sizes))
+    owner = np.repeat(np.arange(len(whole)), sizes)
+    vertices = np.concatenate([surface.vertices for surface in whole])
     faces = np.concatenate([surface.faces for surface in whole]) + firsts[owner, None]
-    vertices, left, kept = decimated(np.concatenate([s.vertices for s in whole]), faces, triangles)
-    counts = np.bincount(owner[kept], minlength=len(whole))
-    gone = [
-        name
-        for name, count, surface in zip(names, counts, whole, strict=True)
-        if len(surface.faces) and not count
-    ]
-    if gone or len(kept) > triangles:
-        why = f"nothing would be left of {gone[0]!r}" if gone else f"its shapes need {len(kept)}"
-        raise InvalidInputError(
-            f"{path} has {len(faces)} triangles and cannot be decimated to triangles={triangles}: {why}; allow more, "
-            "or leave triangles out"
+    is_whole = np.zeros(len(whole), np.bool_)
+    while True:
+        rest = np.flatnonzero(~is_whole[owner])
+        moved, left, kept = decimated(vertices, faces[rest], triangles - int(sizes[is_whole].sum()))
+        gone = (np.bincount(owner[rest[kept]], minlength=len(whole)) == 0) & ~is_whole & (sizes > 0)
+        fewest = int(sizes[is_whole | gone].sum()) + len(kept)
+        if not gone.any() or sizes[is_whole | gone].sum() >= triangles:
+            break
+        is_whole |= gone
+    if fewest > triangles:
+        named = (
+            f", among them all of {names[int(np.argmax(is_whole | gone))]!r}"
+            if (is_whole | gone).any()
+            else ""
         )
-    rows = np.cumsum([0, *counts])
-    starts = np.cumsum([0] + [len(surface.faces) for surface in whole])
-    return [
-        replace(
-            surface,
-            vertices=np.round(vertices[firsts[k] : firsts[k + 1]], 6) + 0.0,
-            faces=left[rows[k] : rows[k + 1]] - firsts[k],
-            paint_of_face=surface.paint_of_face[kept[rows[k] : rows[k + 1]] - starts[k]],
-            uvs=surface.uvs[kept[rows[k] : rows[k + 1]] - starts[k]],
-        ).of(np.arange(counts[k]))
-        for k, surface in enumerate(whole)
-    ]
+        raise InvalidInputError(
+            f"{path} has {len(faces)} triangles and cannot be decimated to triangles={triangles}: its shapes need "
+            f"{fewest}{named}; allow more, or leave triangles out"
+        )
+    is_kept = is_whole[owner]
+    is_kept[rest[kept]] = True
+    faces[rest[kept]] = left
+    found = []
+    for k, surface in enumerate(whole):
+        own = slice(starts[k], starts[k + 1])
+        points = np.round(moved[firsts[k] : firsts[k + 1]], 6) + 0.0
+        organ = replace(surface, vertices=points, faces=faces[own] - firsts[k])
+        found.append(organ.of(np.flatnonzero(is_kept[own])))
+    return found
 
 
 def _welded(surface: _Surface) -> _Surface:

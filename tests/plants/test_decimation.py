@@ -140,6 +140,18 @@ def test_a_plant_keeps_its_organs_within_the_budget(tmp_path: Path) -> None:
     np.testing.assert_array_equal(again.vertices, small.vertices)
 
 
+def test_a_bud_beside_large_leaves_stays(tmp_path: Path) -> None:
+    path = plant_file(tmp_path / "vine.npz")
+    vertices, faces = sheet(2, angular)
+    with np.load(path) as found:
+        arrays: dict[str, Any] = dict(found) | {"leaf_bud": 0.01 * vertices[faces] + [0.0, 0.0, 1.0]}
+    np.savez(path, **arrays)
+    plant = plant_from_mesh(path, MeshRules(triangles=600))
+    bud = next(organ for organ in plant.organs if organ.name == "leaf_bud")
+    assert len(plant.faces) <= 600
+    assert len(bud.faces) >= 4 and np.ptp(bud.vertices[:, 0]) == pytest.approx(0.001, abs=2e-6)
+
+
 def test_a_budget_below_what_shapes_need_is_refused(tmp_path: Path) -> None:
     pieces = {
         f"leaf_{k}": np.array([[[0, 0, 0.01 * k], [0.01, 0, 0.01 * k], [0, 0.01, 0.01 * k]]])
@@ -150,7 +162,7 @@ def test_a_budget_below_what_shapes_need_is_refused(tmp_path: Path) -> None:
     np.savez(tmp_path / "bits.npz", **arrays)
     with pytest.raises(
         InvalidInputError,
-        match=r"bits.npz has 680 triangles and cannot be decimated to triangles=500: nothing would be",
+        match=r"bits.npz has 680 triangles and cannot be decimated to triangles=500: its shapes need 6",
     ):
         plant_from_mesh(tmp_path / "bits.npz", MeshRules(triangles=500))
 
