@@ -2,16 +2,15 @@
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, Literal, get_args
+from typing import Annotated, Any, get_args
 
 from maniskill_tomato.cli.arguments import Flat
-from maniskill_tomato.cli.early_checks import check_counts, check_env_id, check_policy
+from maniskill_tomato.cli.early_checks import check_choice, check_counts, check_env_id, check_policy
 from maniskill_tomato.cli.shared_options import EnvId, PlantOptions
 from maniskill_tomato.errors import InvalidInputError
+from maniskill_tomato.plants.episode_list import EPISODE_LISTS
 from maniskill_tomato.policies.opening import shipped_policy
 from maniskill_tomato.tasks import THESIS_IDS
-
-EpisodeList = Literal["validation", "held_out"]
 
 LISTED_ID = "TomatoViewpoint-v1"
 """The task that has lists of episodes."""
@@ -43,9 +42,9 @@ class Eval:
     """Accept a policy that was trained on another task."""
     plants: Annotated[PlantOptions, Flat] = PlantOptions()
     """Another plant."""
-    episode_list: EpisodeList | None = None
-    """Episodes of a fixed list, TomatoViewpoint-v1 only: seed i is its i-th; by default held_out, unless options of
-    the plants are given."""
+    episode_list: str | None = None
+    """Episodes of a fixed list, TomatoViewpoint-v1 only: validation, held_out, or a file of
+    `tools/certify_episodes.py`. Seed i is its i-th; by default held_out, unless options of the plants are given."""
 
     perception: str = "ground_truth"
     """What V_f and the target's position come from: ground_truth, occlusion_model, simulated_segmenter,
@@ -62,6 +61,8 @@ class Eval:
         check_counts(episodes=self.episodes, num_envs=self.num_envs)
         env_id = None if self.allow_other_task else self.env_id
         check_policy("--policy", self.policy or shipped_policy(self.env_id), env_id)
+        if self.episode_list is not None and not Path(self.episode_list).is_file():
+            check_choice("--episode-list", self.episode_list, (*EPISODE_LISTS, "FILE.json"))
 
         from maniskill_tomato.experiments.configs import EvaluationConfig
         from maniskill_tomato.experiments.evaluation import evaluate

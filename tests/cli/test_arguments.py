@@ -114,6 +114,10 @@ ERRORS: dict[str, tuple[tuple[str, ...], str]] = {
         ("benchmark", "--policies", "mine=no.pt"),
         "error: --policies: no policy at 'no.pt'",
     ),
+    "list of an evaluation": (
+        ("eval", GENERAL, "--episode-list", "mine.json"),
+        "error: --episode-list must be one of 'validation', 'held_out', 'FILE.json'; got 'mine.json'",
+    ),
     "list of episodes": (("benchmark", "--episode-list", "heldout"), "error: --episode-list must be one of"),
     "rows": (("benchmark-rows", "--rows", "0"), "error: --rows must be 1 or more, got 0"),
     "split of rows": (("benchmark-rows", "--split", "test"), "error: --split must be one of"),

@@ -21,6 +21,7 @@ from maniskill_tomato.files import write_tensors
 from maniskill_tomato.learning.rl.agent import make_agent
 from maniskill_tomato.learning.rl.checkpoint import make_checkpoint
 from maniskill_tomato.learning.rl.presets import get_preset
+from maniskill_tomato.plants.episode_list import load_episodes, write_episodes
 from maniskill_tomato.plants.kinds import PLANT_NAMES
 from maniskill_tomato.policies.trained_actor import load_actor, load_checkpoint
 from maniskill_tomato.tasks import THESIS_IDS
@@ -161,6 +162,28 @@ def test_every_preset_of_plants_can_be_trained_on(preset: str) -> None:
     command = parse(["train", "TomatoViewpoint-v1", "--plant", preset])
     assert isinstance(command, Train)
     assert command.plants.env_options() == {"plant": {"preset": preset}}
+
+
+def test_an_evaluation_runs_the_episodes_of_a_file(tmp_path: Path) -> None:
+    episodes = load_episodes("validation")[3:5]
+    write_episodes(tmp_path / "mine.json", episodes)
+    words = [
+        "eval",
+        "TomatoViewpoint-v1",
+        "--policy",
+        "stay",
+        "--episodes",
+        "2",
+        "--seed",
+        "0",
+        "--no-baseline",
+    ]
+    main(
+        [*words, "--no-video", "--episode-list", str(tmp_path / "mine.json"), "--out", str(tmp_path / "out")]
+    )
+    with np.load(tmp_path / "out" / "trajectories.npz") as data:
+        first = data["visible_fraction"][data["first_view"]]
+    assert first == pytest.approx([e.start_visibility for e in episodes], abs=1e-4)
 
 
 def test_evaluation_writes_metrics_that_follow_from_its_trajectories(
