@@ -198,7 +198,8 @@ class MoveWatch:
 
     def _smooth(self, done: float) -> float:
         """How long the first or the last part of the move may take, of so much turn of the fastest joint, in [s]."""
-        return float(SMOOTH_FACTOR * self.seconds * (min(done / self._largest, 1.0) / 10.0) ** (1.0 / 3.0))
+        share = done / self._largest if done < self._largest else 1.0
+        return float(SMOOTH_FACTOR * self.seconds * (share / 10.0) ** (1.0 / 3.0))
 
     def _note(self, kind: str, share: float) -> None:
         self.worst[kind] = max(self.worst[kind], float(share))

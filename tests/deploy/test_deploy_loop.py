@@ -453,11 +453,16 @@ class KillingClock(SimulatedClock):
 
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT, signal.SIGHUP])
 def test_a_signal_in_the_middle_of_a_move_stops_the_arm(number: int) -> None:
-    before = signal.getsignal(number)
-    result, workcell = go(profile(), clock=KillingClock(number))
+    # As in a terminal, also where `nohup` started the tests.
+    usual = signal.default_int_handler if number == signal.SIGINT else signal.SIG_DFL
+    before = signal.signal(number, usual)
+    try:
+        result, workcell = go(profile(), clock=KillingClock(number))
+        assert signal.getsignal(number) is usual
+    finally:
+        signal.signal(number, before)
     assert (result.reason, result.detail, result.is_fault) == ("stopped", signal.Signals(number).name, False)
     assert result.end_state == "the arm was stopped and holds its position"
-    assert signal.getsignal(number) is before
 
 
 def test_a_run_that_was_started_by_nohup_goes_on_when_its_terminal_closes() -> None:

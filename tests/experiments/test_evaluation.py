@@ -278,6 +278,8 @@ def test_without_vulkan_an_evaluation_still_reports_and_names_the_remedy(
     monkeypatch.setattr(evaluation, "find_policy", lambda policy, env_id: "forward")
     monkeypatch.setattr(evaluation, "open_policy", lambda policy, **options: as_policy(Forward()))
     monkeypatch.setattr(vulkan_probe, "render_backend", lambda: "none")
+    # Without its memory of an answer that an earlier test got.
+    monkeypatch.setattr(vulkan_probe, "_ask_for_a_picture", vulkan_probe._ask_for_a_picture.__wrapped__)
     monkeypatch.setenv("VK_DRIVER_FILES", "/nonexistent")
     monkeypatch.setenv("VK_ICD_FILENAMES", "/nonexistent")
     config = EvaluationConfig(

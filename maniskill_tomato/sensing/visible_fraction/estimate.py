@@ -135,8 +135,9 @@ def surrounding_depth(depth_m: Float64, mask: BinaryMask) -> float:
 FARTHER_IMAGER: Final = float(T_color_optical_depth_optical[0, 3]) + STEREO_BASELINE
 """How far the second infrared imager sits beside the colour camera, in [m]."""
 
-SHADOW_MARGIN: Final = 3
-"""Holes may be so much wider than the shadow that explains them: edges of depth are smeared, in [px]."""
+SHADOW_MARGIN: Final = 3.0 / 640.0
+"""Holes may be so much wider than the shadow that explains them, as a share of the picture's width: edges of depth are
+smeared."""
 
 
 def filled_depth(depth_m: Float64, focal: float | None = None) -> Float64:
@@ -162,7 +163,8 @@ def filled_depth(depth_m: Float64, focal: float | None = None) -> Float64:
     if focal is not None:
         # What touches the edge of the picture has one side only.
         shifts = 1.0 / np.maximum(nearer, 1e-6) - 1.0 / np.maximum(farther, 1e-6)
-        is_shadow = (nearer > 0) & (after - first <= focal * FARTHER_IMAGER * shifts + SHADOW_MARGIN)
+        margin = SHADOW_MARGIN * depth_m.shape[1]
+        is_shadow = (nearer > 0) & (after - first <= focal * FARTHER_IMAGER * shifts + margin)
         farther = np.where(is_shadow, farther, 0.0)
     filled[hole] = np.repeat(farther, after - first)
     return filled
