@@ -173,7 +173,7 @@ class World:
         )
         self._plant_pose, self._plant_pose_noise = plant_pose, np.array(plant_pose_noise, dtype=np.float64)
         self._T_ee_camera = torch.tensor(
-            T_flange_camera_color_optical, dtype=torch.float32, device=self.device
+            T_flange_camera_color_optical, dtype=torch.float64, device=self.device
         )
         self.rngs = [np.random.RandomState(FIRST_SEED + i) for i in range(num_envs)]
         """The random generator of each environment."""
@@ -377,7 +377,8 @@ class World:
 
     def camera_poses(self, T_w_links: Tensor) -> Tensor:
         """Poses of the optical frames for poses of the links. Shape (N, 9, 4, 4) to (N, 4, 4)."""
-        return T_w_links[:, -1] @ self._T_ee_camera
+        # In double precision a batch rounds as its rows do alone, on every processor.
+        return (T_w_links[:, -1].double() @ self._T_ee_camera).to(T_w_links.dtype)
 
     # ---------------------------------------------------------------- outcome
 
