@@ -17,6 +17,7 @@ from maniskill_tomato.robot.arm_model import ArmModel
 from maniskill_tomato.robot.d435 import CameraIntrinsics
 from maniskill_tomato.robot.iiwa14 import IIWA14
 from maniskill_tomato.robot.kinematics import forward_kinematics, link_transforms
+from maniskill_tomato.robot.look_at import carried_pose
 from maniskill_tomato.robot.rotations import FORWARD_RPY, matrix_to_rpy
 from maniskill_tomato.segmentation.instances import Instances
 from maniskill_tomato.segmentation.masks import BinaryMask
@@ -314,8 +315,7 @@ class RobotBelief:
             model: Of the arm.
         """
         self._model = model
-        self._exact_mount = torch.as_tensor(np.array(T_flange_camera), dtype=torch.float64)
-        self._mount = self._exact_mount.float()
+        self._mount = torch.as_tensor(np.array(T_flange_camera), dtype=torch.float64)
         self._observer = ViewpointObserver(1, layout=layout, max_moves=max_moves, model=model)
         self._rpy = torch.tensor([FORWARD_RPY])
         self._has_views = False
@@ -328,7 +328,7 @@ class RobotBelief:
     def camera_position(self, joint_positions: Float64) -> Float64:
         """Where a move begins, in the precision of the task's `pd_look_at`, world frame, in [m]. Shape (3,)."""
         joints = torch.tensor(joint_positions[None], dtype=torch.float32).double()
-        pose = forward_kinematics(joints, self._model) @ self._exact_mount
+        pose = forward_kinematics(joints, self._model) @ self._mount
         position: Float64 = pose[0, :3, 3].numpy()
         return position
 
@@ -362,4 +362,4 @@ class RobotBelief:
     def _poses(self, joint_positions: Float64) -> tuple[torch.Tensor, torch.Tensor]:
         joints = torch.as_tensor(np.array(joint_positions)[None], dtype=torch.float32)
         flange = link_transforms(joints, self._model)[:, -1]
-        return flange, flange @ self._mount
+        return flange, carried_pose(flange, self._mount)

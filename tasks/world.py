@@ -18,6 +18,7 @@ from maniskill_tomato.raycast.scene import RayScene
 from maniskill_tomato.robot.d435 import CameraIntrinsics, T_flange_camera_color_optical
 from maniskill_tomato.robot.inverse_kinematics import Reach
 from maniskill_tomato.robot.kinematics import link_transforms
+from maniskill_tomato.robot.look_at import carried_pose
 from maniskill_tomato.robot.robot_description import link_meshes
 from maniskill_tomato.robot.viewpoint_move import viewpoint_of
 from maniskill_tomato.sensing.belief import Belief
@@ -377,8 +378,7 @@ class World:
 
     def camera_poses(self, T_w_links: Tensor) -> Tensor:
         """Poses of the optical frames for poses of the links. Shape (N, 9, 4, 4) to (N, 4, 4)."""
-        # In double precision a batch rounds as its rows do alone, on every processor.
-        return (T_w_links[:, -1].double() @ self._T_ee_camera).to(T_w_links.dtype)
+        return carried_pose(T_w_links[:, -1], self._T_ee_camera)
 
     # ---------------------------------------------------------------- outcome
 

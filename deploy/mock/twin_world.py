@@ -25,6 +25,7 @@ from maniskill_tomato.robot.arm_model import ArmModel
 from maniskill_tomato.robot.d435 import CameraIntrinsics, T_flange_camera_color_optical, color_intrinsics
 from maniskill_tomato.robot.iiwa14 import IIWA14, LINK_NAMES
 from maniskill_tomato.robot.kinematics import link_transforms
+from maniskill_tomato.robot.look_at import carried_pose
 from maniskill_tomato.robot.robot_description import link_meshes
 
 ArmFault = Literal["silent", "slow", "nan", "jump", "drop", "stuck", "refuse"]
@@ -126,7 +127,7 @@ class TwinWorld:
         # Rays call links by the names of the iiwa 14.
         meshes = dict(zip(LINK_NAMES, link_meshes(model).values(), strict=True))
         self.scene = RayScene([episode.plant], intrinsics, robot_meshes=meshes)
-        self._mount = torch.tensor(T_flange_camera_color_optical, dtype=torch.float32)
+        self._mount = torch.tensor(T_flange_camera_color_optical, dtype=torch.float64)
         organs = [organ.semantic_class for organ in episode.plant.organs]
         classes = [SemanticClass.BACKGROUND, SemanticClass.ROBOT, *organs]
         self._palette = np.array([COLORS[c] for c in classes], dtype=np.float64)
@@ -198,7 +199,7 @@ class TwinWorld:
     def _poses(self, joints: Float64) -> tuple[Tensor, Tensor]:
         """Poses of the optical frame and of the links, in single precision as in the simulated task."""
         links = link_transforms(torch.tensor(joints[None], dtype=torch.float32), self.model)
-        return links[:, -1] @ self._mount, links
+        return carried_pose(links[:, -1], self._mount), links
 
 
 def twin_options(options: Mapping[str, Any]) -> TwinOptions:

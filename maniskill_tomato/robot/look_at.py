@@ -93,6 +93,21 @@ def flange_to_camera(T_world_flange: Tensor) -> Tensor:
     return T_world_flange @ mount
 
 
+def carried_pose(T_world_flange: Tensor, T_flange_camera: Tensor) -> Tensor:
+    """The pose of a camera that the flange carries, multiplied in double precision: so a batch rounds as its rows do
+    alone, on every processor.
+
+    Args:
+        T_world_flange: Of any floating-point type. Shape (..., 4, 4).
+        T_flange_camera: Where it is mounted, in double precision. Shape (4, 4).
+
+    Returns:
+        Of the type of `T_world_flange`. Shape (..., 4, 4).
+    """
+    pose: Tensor = (T_world_flange.double() @ T_flange_camera).to(T_world_flange.dtype)
+    return pose
+
+
 def camera_to_viewpoint(T_world_camera: Tensor, reference_rpy: Tensor) -> Tensor:
     """The viewpoint (of the flange) that puts the colour camera's optical frame at a pose.
 
