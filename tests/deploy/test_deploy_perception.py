@@ -14,6 +14,7 @@ from maniskill_tomato.raycast.scene import RayScene
 from maniskill_tomato.raycast.view_rays import ViewRays
 from maniskill_tomato.robot.d435 import T_flange_camera_color_optical, color_intrinsics
 from maniskill_tomato.robot.kinematics import link_transforms
+from maniskill_tomato.robot.look_at import carried_pose
 from maniskill_tomato.robot.look_at_move import LookAtMover
 from maniskill_tomato.robot.robot_description import link_meshes
 from maniskill_tomato.robot.rotations import FORWARD_RPY, matrix_to_rpy
@@ -83,7 +84,7 @@ def assert_same_map(robot: FruitMap, simulated: FruitMap) -> None:
 def test_the_same_frames_give_the_same_observation_in_the_simulator_and_on_the_robot(masks: str) -> None:
     """Two environments at once against a robot before each plant: fruits, V_f, position, rays, observation."""
     episodes = [load_episode("held_out", seed) for seed in SEEDS]
-    n, mount = len(episodes), torch.tensor(T_flange_camera_color_optical, dtype=torch.float32)
+    n, mount = len(episodes), torch.tensor(T_flange_camera_color_optical, dtype=torch.float64)
     scene = RayScene([e.plant for e in episodes], color_intrinsics(320, 240), robot_meshes=link_meshes())
     camera = SimulatedCamera(scene, picture=lambda k: RED)
     segmenter = None if masks == "true" else FrameSegmenter()
@@ -106,7 +107,7 @@ def test_the_same_frames_give_the_same_observation_in_the_simulator_and_on_the_r
     mover, seen, recalled = LookAtMover(), 0, 0
     for step in range(len(MOVES) + 1):
         links = link_transforms(qpos)
-        T_world_camera = links[:, -1] @ mount
+        T_world_camera = carried_pose(links[:, -1], mount)
         frames = camera.take(T_world_camera, T_world_plant, links)
         if segmenter is not None:
             segmenter.known = [frame for frame in frames if frame is not None]
