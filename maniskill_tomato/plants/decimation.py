@@ -1,6 +1,6 @@
 """Fewer triangles for a surface: edges collapse by quadric error (Garland and Heckbert 1997), outlines stay."""
 
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 
@@ -106,9 +106,8 @@ def _collapsed(points: Float64, faces: Int64, target: int) -> tuple[Float64, Int
     """Points at their old numbers, faces that are left, and which they were."""
     from fast_simplification import simplify
 
-    moved, _, collapses = simplify(
-        points, faces.astype(np.int32), target_count=max(target, 1), return_collapses=True
-    )
+    found: Any = simplify(points, faces.astype(np.int32), target_count=max(target, 1), return_collapses=True)
+    moved, _, collapses = found
     into = np.arange(len(points))
     into[collapses[:, 1]] = collapses[:, 0]
     while not np.array_equal(into, further := into[into]):

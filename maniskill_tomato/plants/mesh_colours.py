@@ -39,7 +39,7 @@ def paint_of(visual: Any, faces: Int64, images: dict[object, UInt8], *, linear: 
     shades = _corner_colours(visual, faces)
     uv: Any = getattr(visual, "uv", None)
     picture = _picture(material) if uv is not None and len(uv) else None
-    if picture is not None:
+    if uv is not None and picture is not None:
         # glTF multiplies the two; an OBJ's texture stands in place of the colour.
         factor = tint if linear and tint is not None else np.ones(3)
         if (key := (id(picture), *factor.tolist())) not in images:

@@ -210,10 +210,10 @@ def _welded(surface: _Surface) -> _Surface:
     """The triangles that have an area, with vertices that are nearer to each other than `WELD` as one."""
     from scipy.sparse import coo_array
     from scipy.sparse.csgraph import connected_components
-    from scipy.spatial import cKDTree
+    from scipy.spatial import KDTree
 
     count = len(surface.vertices)
-    pairs = cKDTree(surface.vertices).query_pairs(WELD, output_type="ndarray")
+    pairs = KDTree(surface.vertices).query_pairs(WELD, output_type="ndarray")
     graph = coo_array((np.ones(len(pairs), np.int8), (pairs[:, 0], pairs[:, 1])), shape=(count, count))
     labels = connected_components(graph, directed=False)[1]
     _, first = np.unique(labels, return_index=True)

@@ -206,11 +206,9 @@ def test_an_arm_that_does_not_begin_a_slow_move_is_noticed_long_before_its_end(f
     seconds = 1.875 * 0.4 / (fraction * math.radians(85.0))
     move = JointMove(joint_positions=STRAIGHT, speed_fraction=fraction)
     watch = MoveWatch(np.zeros(7), move, seconds, 100.0, IIWA14)
-    for t in np.arange(0.1, seconds, 0.1):
-        departure = watch.see(np.zeros(7), 100.0 + t, 100.0 + t)
-        if departure is not None:
-            break
-    assert departure is not None and departure.is_late
+    seen = ((t, watch.see(np.zeros(7), 100.0 + t, 100.0 + t)) for t in np.arange(0.1, seconds, 0.1))
+    t, departure = next((t, departure) for t, departure in seen if departure is not None)
+    assert departure.is_late
     assert t <= max(2.2, seconds / 8.0)
 
 

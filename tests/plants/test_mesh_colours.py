@@ -40,7 +40,7 @@ def two_halves() -> Image.Image:
 
 def write_glb(path: Path, meshes: dict[str, trimesh.Trimesh]) -> Path:
     scene = trimesh.Scene()
-    turn = trimesh.transformations.rotation_matrix(-np.pi / 2, [1, 0, 0])
+    turn: Any = trimesh.transformations.rotation_matrix(-np.pi / 2, [1, 0, 0])
     for name, mesh in meshes.items():
         scene.add_geometry(mesh, node_name=name, geom_name=f"mesh of {name}", transform=turn)
     scene.export(path)
@@ -156,7 +156,7 @@ def test_a_leaf_with_another_material_below_shows_each_on_its_own_side(tmp_path:
 
 @pytest.mark.parametrize("suffix", ["glb", "ply"])
 def test_colours_of_vertices_paint_each_triangle_with_their_mean(tmp_path: Path, suffix: str) -> None:
-    meshes = parts()
+    meshes: dict[str, Any] = parts()
     meshes["leaf"].visual.vertex_colors = [RED, RED, BLUE, BLUE]
     meshes["fruit"].visual.vertex_colors = [RED] * len(meshes["fruit"].vertices)
     rules: dict[str, Any] = {}
@@ -184,7 +184,7 @@ def test_colours_of_vertices_paint_each_triangle_with_their_mean(tmp_path: Path,
         assert of(plant, "stem").texture is None
 
 
-def write_ply(path: Path, meshes: dict[str, trimesh.Trimesh]) -> None:
+def write_ply(path: Path, meshes: dict[str, Any]) -> None:
     vertices = [
         (*v, *c[:3]) for m in meshes.values() for v, c in zip(m.vertices, m.visual.vertex_colors, strict=True)
     ]
@@ -210,7 +210,7 @@ def write_ply(path: Path, meshes: dict[str, trimesh.Trimesh]) -> None:
 
 def test_triangles_that_decimation_leaves_keep_their_colours(tmp_path: Path) -> None:
     meshes = parts()
-    fruit = meshes["fruit"].subdivide_loop(2)
+    fruit: Any = meshes["fruit"].subdivide_loop(2)
     upper = fruit.triangles_center[:, 2] > 0.7
     fruit.visual.face_colors = np.where(upper[:, None], RED, BLUE)
     meshes["fruit"] = fruit

@@ -188,7 +188,8 @@ def test_only_the_open_pieces_of_an_object_are_drawn_from_both_sides(tmp_path: P
     stalk = trimesh.creation.cylinder(radius=0.002, height=0.1, sections=6).apply_translation(
         [-0.2, 0.0, 0.7]
     )
-    meshes["leaf_00"] = trimesh.util.concatenate([meshes["leaf_00"], stalk])
+    joined: Any = trimesh.util.concatenate([meshes["leaf_00"], stalk])
+    meshes["leaf_00"] = joined
     plant = plant_from_mesh(write_npz(tmp_path / "vine.npz", meshes), MeshRules())
     leaf = next(organ for organ in plant.organs if organ.name == "leaf_00")
     assert {part.two_sided: len(part.faces) for part in leaf.parts} == {False: len(stalk.faces), True: 2}

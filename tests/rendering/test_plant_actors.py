@@ -1,6 +1,7 @@
 """Plants in a ManiSkill scene: every organ has its own segmentation id, with and without a renderer."""
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -151,10 +152,9 @@ def test_a_picture_shows_the_colours_of_a_file(tmp_path: Path) -> None:
     ball = trimesh.creation.icosphere(subdivisions=2, radius=0.03).apply_translation([0.0, 0.0, 0.8])
     ball.visual = TextureVisuals(material=PBRMaterial(name="skin", baseColorFactor=[0.0, 0.6, 0.0, 1.0]))
     turned = trimesh.Scene()
+    turn: Any = trimesh.transformations.rotation_matrix(-np.pi / 2, [1, 0, 0])
     for name, mesh in {"leaf": leaf, "fruit": ball}.items():
-        turned.add_geometry(
-            mesh, node_name=name, transform=trimesh.transformations.rotation_matrix(-np.pi / 2, [1, 0, 0])
-        )
+        turned.add_geometry(mesh, node_name=name, transform=turn)
     turned.export(tmp_path / "a.glb")
     plant = plant_from_mesh(tmp_path / "a.glb", MeshRules())
     scene = make_scene("cpu")
