@@ -69,8 +69,12 @@ type: $(STAMP) ## Check the types (mypy, pyright)
 	@$(BIN)/mypy
 	@$(BIN)/pyright
 
+.PHONY: docs
+docs: $(STAMP) ## Build the documentation as a site into build/docs
+	@$(BIN)/python tools/build_docs.py
+
 .PHONY: check
-check: lint licences type test ## Everything that must pass before a commit
+check: lint licences type docs test ## Everything that must pass before a commit
 
 .PHONY: build
 build: $(STAMP) ## Build the wheel and try it in a clean environment

@@ -12,12 +12,12 @@ work="$(mktemp -d)"
 trap 'rm -rf "$work"' EXIT
 
 say "building (a log appears only if that fails)"
-rm -rf build dist
+rm -rf build/lib build/bdist.* dist
 if ! "$root/.venv/bin/python" -m build --installer uv --outdir dist . >"$work/log" 2>&1; then
     tail -n 40 "$work/log" >&2
     exit 1
 fi
-rm -rf build
+rm -rf build/lib build/bdist.*
 wheel="$(ls dist/*.whl)"
 
 say "installing $wheel into a clean environment"
