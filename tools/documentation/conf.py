@@ -43,7 +43,7 @@ html_css_files = ["site.css"]
 html_show_sphinx = False
 html_show_copyright = False
 html_sourcelink_suffix = ""
-html_theme_options = {"footer_icons": []}
+html_theme_options: dict[str, list[str]] = {"footer_icons": []}
 copybutton_exclude = ".linenos, .gp, .go"
 
 
