@@ -9,7 +9,7 @@ import pytest
 from maniskill_tomato.cli import parse
 from maniskill_tomato.cli.command_table import COMMANDS, FAMILIES
 
-ROOT = Path(__file__).resolve().parents[2]
+ROOT = Path(__file__).resolve().parent.parent
 PAGES = [*sorted((ROOT / "docs").rglob("*.md")), ROOT / "README.md", ROOT / "CONTRIBUTING.md"]
 READS_A_FILE = ("--resume", "--config")
 """Options of `train` whose file is read with the command line."""
