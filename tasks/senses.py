@@ -17,6 +17,7 @@ from maniskill_tomato.errors import InvalidInputError
 from maniskill_tomato.raycast.view_rays import ViewRays
 from maniskill_tomato.robot.kinematics import link_transforms
 from maniskill_tomato.sensing.camera_perception import CameraPerception
+from maniskill_tomato.sensing.fruit_map import NO_TRACK
 from maniskill_tomato.sensing.inspection import STALE_AFTER
 from maniskill_tomato.sensing.inspection_judge import NO_FRUIT
 from maniskill_tomato.sensing.observation import ViewpointObserver
@@ -419,7 +420,8 @@ class CameraSenses:
         """Names the track that holds most of the target's pixels, if one does; whether it stands elsewhere.
 
         A detection of which less than half shows the target holds it by accident and is not named, nor is one without a
-        depth of its own, which says too little of where it is.
+        depth of its own, which says too little of where it is. A second picture from one place makes no tracks, so what
+        it alone shows has none to name.
         """
         last = self._perception.last_view(env_index)
         target = int(self._world.state.target[env_index])
@@ -431,7 +433,7 @@ class CameraSenses:
         for k, number in enumerate(last.tracks):
             mask = last.measurement.mask(k)
             is_measured = last.measurement.fruits[k].is_depth_measured
-            if is_measured and frame.shown_fruit(mask) == target:
+            if number != NO_TRACK and is_measured and frame.shown_fruit(mask) == target:
                 held[number] = int(np.count_nonzero(mask & true))
         if not held:
             return False

@@ -142,7 +142,7 @@ class MappedView:
     measurement: Measurement
     """The detections, a mask that covered several tracks divided."""
     tracks: tuple[int, ...]
-    """Number of each detection's track."""
+    """Number of each detection's track; `NO_TRACK` where there is none, in a second picture from one place."""
 
     def detection(self, number: int | None) -> int | None:
         """Index of a track's detection; None if the view has none."""
