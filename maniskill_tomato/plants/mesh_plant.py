@@ -1,7 +1,6 @@
 """A plant of somebody else's making: the objects of a mesh file as organs and fruits."""
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Final
 
@@ -9,14 +8,23 @@ import numpy as np
 from numpy.typing import NDArray
 
 from maniskill_tomato.errors import InvalidInputError
-from maniskill_tomato.plants.decimation import decimated
 from maniskill_tomato.plants.fruit import SKIN_VARIANTS
 from maniskill_tomato.plants.generator import FRUIT_CLASS
 from maniskill_tomato.plants.leaf import LEAF_VARIANTS
-from maniskill_tomato.plants.mesh_colours import Paint
-from maniskill_tomato.plants.mesh_files import MeshObject, joined_corners, read_objects
+from maniskill_tomato.plants.mesh_files import MeshObject, read_objects
 from maniskill_tomato.plants.mesh_rules import METRES, MeshRules, OrganKind
-from maniskill_tomato.plants.meshing import Float64, Int64, cross, normalized
+from maniskill_tomato.plants.mesh_surface import (
+    Surface,
+    across_faces,
+    is_below,
+    is_open,
+    joined,
+    pieces_of,
+    placed,
+    split_at_seams,
+    within_budget,
+)
+from maniskill_tomato.plants.meshing import Float64, Int64, normalized
 from maniskill_tomato.plants.organs import Fruit, MeshPart, Organ, Plant, SemanticClass
 
 FRUIT_RADII: Final = (0.004, 0.15)
@@ -28,42 +36,8 @@ PLANT_HEIGHTS: Final = (0.05, 6.0)
 FARTHEST_AXIS: Final = 1.0
 """How far the middle of a plant may be from its origin, along the ground, in [m]."""
 
-OPPOSED: Final = 0.2
-"""Where normals cancel out to less than this share, the triangles about a vertex are two sides of a sheet."""
-
-WELD: Final = 5e-6
-"""Vertices of one object that are nearer to each other are one where it is decimated, in [m]; single precision moves
-them by less."""
-
 TEXTURE_LENGTH: Final = 0.1
 """Length of a stem over which its texture repeats, in [m]."""
-
-
-@dataclass(frozen=True, eq=False)
-class _Surface:
-    """The triangles of an object, in the plant frame, and what its file paints them with."""
-
-    vertices: Float64
-    """In [m]. Shape (V, 3)."""
-    faces: Int64
-    """Shape (F, 3)."""
-    paints: tuple[Paint | None, ...]
-    """Those of the object's parts; the places of a part's triangles stand in `uvs`."""
-    paint_of_face: Int64
-    """Which of them each triangle has. Shape (F,)."""
-    uvs: Float64
-    """Where the corners of each triangle are in its image. Shape (F, 3, 2)."""
-
-    def of(self, rows: NDArray[np.int64] | NDArray[np.bool_]) -> "_Surface":
-        """Some of the triangles, and the vertices that they need."""
-        used, inverse = np.unique(self.faces[rows], return_inverse=True)
-        return replace(
-            self,
-            vertices=self.vertices[used],
-            faces=inverse.reshape(-1, 3),
-            paint_of_face=self.paint_of_face[rows],
-            uvs=self.uvs[rows],
-        )
 
 
 def plant_from_mesh(path: Path, rules: MeshRules, seed: int = 0) -> Plant:
@@ -87,9 +61,9 @@ def plant_from_mesh(path: Path, rules: MeshRules, seed: int = 0) -> Plant:
     """
     T = rules.T_plant_file(path.suffix)
     kinds = _sorted_by_kind(path, read_objects(path), rules)
-    surfaces = [_placed(_joined(parts), T) for _, _, parts in kinds]
+    surfaces = [placed(joined(parts), T) for _, _, parts in kinds]
     if rules.triangles is not None:
-        surfaces = _within(path, surfaces, [name for _, name, _ in kinds], rules.triangles)
+        surfaces = within_budget(path, surfaces, [name for _, name, _ in kinds], rules.triangles)
     organs: list[Organ] = []
     fruits: list[Fruit] = []
     for index, ((kind, name, parts), surface) in enumerate(zip(kinds, surfaces, strict=True)):
@@ -142,89 +116,10 @@ def _sorted_by_kind(
     ]
 
 
-def _joined(parts: Sequence[MeshObject]) -> _Surface:
-    """Parts as one object: what two of them have in the same place, such as both sides of a leaf, is one vertex."""
-    vertices, faces = parts[0].vertices, parts[0].faces
-    if len(parts) > 1:
-        vertices, faces = joined_corners(np.concatenate([part.vertices[part.faces] for part in parts]))
-    plain = [np.zeros((len(part.faces), 3, 2)) for part in parts]
-    return _Surface(
-        vertices=vertices,
-        faces=faces,
-        paints=tuple(part.paint for part in parts),
-        paint_of_face=np.repeat(np.arange(len(parts)), [len(part.faces) for part in parts]),
-        uvs=np.concatenate(
-            [p.paint.uvs if p.paint else zeros for p, zeros in zip(parts, plain, strict=True)]
-        ),
-    )
-
-
-def _placed(surface: _Surface, T: Float64) -> _Surface:
-    """In the plant frame, rounded to a micrometre."""
-    return replace(surface, vertices=np.round(surface.vertices @ T[:3, :3].T + T[:3, 3], 6) + 0.0)
-
-
-def _within(path: Path, surfaces: Sequence[_Surface], names: Sequence[str], triangles: int) -> list[_Surface]:
-    """The surfaces with no more than so many triangles in all; what matters least to their shapes goes first.
-
-    Of the smallest, such as buds, nothing would be left: they keep all that they have.
-    """
-    whole = [_welded(surface) for surface in surfaces]
-    sizes = np.array([len(surface.faces) for surface in whole])
-    firsts, starts = (np.cumsum([0, *counts]) for counts in ([len(s.vertices) for s in whole], sizes))
-    owner = np.repeat(np.arange(len(whole)), sizes)
-    vertices = np.concatenate([surface.vertices for surface in whole])
-    faces = np.concatenate([surface.faces for surface in whole]) + firsts[owner, None]
-    is_whole = np.zeros(len(whole), np.bool_)
-    while True:
-        rest = np.flatnonzero(~is_whole[owner])
-        moved, left, kept = decimated(vertices, faces[rest], triangles - int(sizes[is_whole].sum()))
-        gone = (np.bincount(owner[rest[kept]], minlength=len(whole)) == 0) & ~is_whole & (sizes > 0)
-        fewest = int(sizes[is_whole | gone].sum()) + len(kept)
-        if not gone.any() or sizes[is_whole | gone].sum() >= triangles:
-            break
-        is_whole |= gone
-    if fewest > triangles:
-        named = (
-            f", among them all of {names[int(np.argmax(is_whole | gone))]!r}"
-            if (is_whole | gone).any()
-            else ""
-        )
-        raise InvalidInputError(
-            f"{path} has {len(faces)} triangles and cannot be decimated to triangles={triangles}: its shapes need "
-            f"{fewest}{named}; allow more, or leave triangles out"
-        )
-    is_kept = is_whole[owner]
-    is_kept[rest[kept]] = True
-    faces[rest[kept]] = left
-    found = []
-    for k, surface in enumerate(whole):
-        own = slice(starts[k], starts[k + 1])
-        points = np.round(moved[firsts[k] : firsts[k + 1]], 6) + 0.0
-        organ = replace(surface, vertices=points, faces=faces[own] - firsts[k])
-        found.append(organ.of(np.flatnonzero(is_kept[own])))
-    return found
-
-
-def _welded(surface: _Surface) -> _Surface:
-    """The triangles that have an area, with vertices that are nearer to each other than `WELD` as one."""
-    from scipy.sparse import coo_array
-    from scipy.sparse.csgraph import connected_components
-    from scipy.spatial import KDTree
-
-    count = len(surface.vertices)
-    pairs = KDTree(surface.vertices).query_pairs(WELD, output_type="ndarray")
-    graph = coo_array((np.ones(len(pairs), np.int8), (pairs[:, 0], pairs[:, 1])), shape=(count, count))
-    labels = connected_components(graph, directed=False)[1]
-    _, first = np.unique(labels, return_index=True)
-    faces = first[labels][surface.faces]
-    return replace(surface, faces=faces).of(np.flatnonzero(_across(surface.vertices, faces).any(1)))
-
-
-def _green_organ(kind: OrganKind, name: str, surface: _Surface, index: int) -> Organ:
+def _green_organ(kind: OrganKind, name: str, surface: Surface, index: int) -> Organ:
     vertices = surface.vertices
     if kind == "leaf":
-        uvs = _blade_uvs(vertices, _pieces(len(vertices), surface.faces))
+        uvs = _blade_uvs(vertices, pieces_of(len(vertices), surface.faces))
         parts = _mesh_parts(surface, uvs, f"leaf_upper_{index % LEAF_VARIANTS}", sheet=True)
         return Organ(name, SemanticClass.LEAF, parts)
     uvs = np.stack([vertices[:, 0] + vertices[:, 1], vertices[:, 2]], 1) / TEXTURE_LENGTH
@@ -232,7 +127,7 @@ def _green_organ(kind: OrganKind, name: str, surface: _Surface, index: int) -> O
 
 
 def _mesh_parts(
-    surface: _Surface, uvs: Float64, material: str, *, sheet: bool = False
+    surface: Surface, uvs: Float64, material: str, *, sheet: bool = False
 ) -> tuple[MeshPart, ...]:
     """Parts of one image of the file, or of none, that are drawn from one or from both sides; with smooth normals.
 
@@ -242,25 +137,25 @@ def _mesh_parts(
         material: Its name.
         sheet: Whether pieces may be open surfaces, which are then drawn from both sides.
     """
-    across = _across(surface.vertices, surface.faces)
+    across = across_faces(surface.vertices, surface.faces)
     kept = np.flatnonzero((across * across).sum(1) > 0.0)
     count = len(surface.vertices)
     # Numbers from `count` on are the same vertices on the lower side of a sheet that is modelled from both.
     corners = surface.faces.copy()
-    corners[kept] += count * _is_below(count, surface.faces[kept], across[kept])
+    corners[kept] += count * is_below(count, surface.faces[kept], across[kept])
     normals = np.zeros((2 * count, 3))
     for k in range(3):
         np.add.at(normals, corners[kept, k], across[kept])
     normals = normalized(normals)
     paint_of_kept = surface.paint_of_face[kept]
-    two_sided = _is_open(count, surface.faces[kept]) & sheet
+    two_sided = is_open(count, surface.faces[kept]) & sheet
     groups = np.unique(np.stack([paint_of_kept, two_sided], 1), axis=0).tolist() or [[0, False]]
     parts = []
     for number, side in groups:
         own = kept[(paint_of_kept == number) & (two_sided == side)]
         faces, paint = corners[own], surface.paints[number]
         if paint is not None:
-            used, places, faces = _split_at_seams(faces, surface.uvs[own])
+            used, places, faces = split_at_seams(faces, surface.uvs[own])
         else:
             used = np.arange(count)
             if len(groups) > 1 or (faces >= count).any():
@@ -281,86 +176,7 @@ def _mesh_parts(
     return tuple(parts)
 
 
-def _is_below(count: int, faces: Int64, across: Float64) -> NDArray[np.bool_]:
-    """Which corners are on the lower side of a vertex whose triangles face opposite ways, as on a sheet of two sides.
-
-    Args:
-        count: Number of vertices.
-        faces: Shape (F, 3).
-        across: Their normals, of any length above 0. Shape (F, 3).
-
-    Returns:
-        Shape (F, 3).
-    """
-    length = np.linalg.norm(across, axis=1)
-    total, size, upward = np.zeros((count, 3)), np.zeros(count), np.zeros((count, 3))
-    for k in range(3):
-        np.add.at(total, faces[:, k], across)
-        np.add.at(size, faces[:, k], length)
-        upward[faces[:, k]] = across
-    opposed = np.linalg.norm(total, axis=1) < OPPOSED * size
-    return np.asarray(opposed[faces] & (np.einsum("fi,fki->fk", across, upward[faces]) < 0.0))
-
-
-def _split_at_seams(faces: Int64, uvs: Float64) -> tuple[Int64, Float64, Int64]:
-    """Vertices of which each has one place in an image.
-
-    Args:
-        faces: Shape (F, 3).
-        uvs: Places of their corners. Shape (F, 3, 2).
-
-    Returns:
-        Which of the old vertices each is, its place, and the faces. Shapes (V,), (V, 2), (F, 3).
-    """
-    from trimesh.grouping import unique_rows
-
-    corners, places = faces.reshape(-1), uvs.reshape(-1, 2)
-    first, inverse = unique_rows(np.column_stack([corners, np.round(places * 1e5).astype(np.int64)]))
-    return corners[first], places[first], inverse.reshape(-1, 3).astype(np.int64)
-
-
-def _across(vertices: Float64, faces: Int64) -> Float64:
-    """Normals of triangles, twice as long as their areas are large. Shape (F, 3)."""
-    corners = vertices[faces]
-    return cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-
-
-def _is_open(count: int, faces: Int64) -> NDArray[np.bool_]:
-    """Whether the connected piece of each triangle has an edge that is not met as often in the other direction.
-
-    A solid body has none, and neither has a sheet that is modelled from both sides.
-
-    Args:
-        count: Number of vertices.
-        faces: Shape (F, 3).
-
-    Returns:
-        Shape (F,).
-    """
-    edges = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
-    there, back = edges[:, 0] * count + edges[:, 1], edges[:, 1] * count + edges[:, 0]
-    found, times = np.unique(there, return_counts=True)
-    places = np.searchsorted(found, np.stack([there, back]))
-    places = np.minimum(places, len(found) - 1)
-    met = np.where(found[places] == np.stack([there, back]), times[places], 0) if len(found) else places
-    pieces = _pieces(count, faces)
-    is_open = np.zeros(count, np.bool_)
-    is_open[pieces[edges[met[0] != met[1], 0]]] = True
-    return is_open[pieces[faces[:, 0]]]
-
-
-def _pieces(vertices: int, faces: Int64) -> Int64:
-    """Which connected piece each vertex belongs to. Shape (V,)."""
-    from scipy.sparse import coo_array
-    from scipy.sparse.csgraph import connected_components
-
-    start = np.concatenate([faces[:, 0], faces[:, 1]])
-    end = np.concatenate([faces[:, 1], faces[:, 2]])
-    graph = coo_array((np.ones(len(start), np.int8), (start, end)), shape=(vertices, vertices))
-    return np.asarray(connected_components(graph, directed=False)[1], dtype=np.int64)
-
-
-def _fruit_surfaces(surface: _Surface, fruits: str) -> Iterable[_Surface]:
+def _fruit_surfaces(surface: Surface, fruits: str) -> Iterable[Surface]:
     """Each fruit of an object, from the lowest up.
 
     A piece whose middle lies in a larger one, such as a seed or a calyx, is part of that.
@@ -368,7 +184,7 @@ def _fruit_surfaces(surface: _Surface, fruits: str) -> Iterable[_Surface]:
     if fruits == "objects":
         return [surface]
     vertices, faces = surface.vertices, surface.faces
-    labels = _pieces(len(vertices), faces)
+    labels = pieces_of(len(vertices), faces)
     kinds = np.unique(labels[faces[:, 0]])
     centres = np.stack([vertices[labels == kind].mean(0) for kind in kinds])
     radii = np.array(
@@ -387,7 +203,7 @@ def _fitted(
 ) -> tuple[Float64, float]:
     """Centre of a fruit's surface and the radius of the sphere about it that holds every vertex, in [m]."""
     corners = vertices[faces]
-    weights = np.linalg.norm(_across(vertices, faces), axis=1)
+    weights = np.linalg.norm(across_faces(vertices, faces), axis=1)
     if not weights.sum() > 0.0:
         raise InvalidInputError(f"{path}: fruit {name!r} has no surface; all its triangles are flat")
     centre = np.round((corners.mean(1) * weights[:, None]).sum(0) / weights.sum(), 6)
@@ -395,7 +211,7 @@ def _fitted(
     radius = round(float(np.sqrt((away * away).sum(1).max())), 6) + 1e-6
     low, high = FRUIT_RADII
     if not low <= radius <= high:
-        pieces = len(np.unique(_pieces(len(vertices), faces)[faces[:, 0]]))
+        pieces = len(np.unique(pieces_of(len(vertices), faces)[faces[:, 0]]))
         many = pieces > 1 and radius > high and rules.fruits == "objects"
         hint = (
             f"it is of {pieces} pieces: if each is a fruit, say fruits='pieces'"
