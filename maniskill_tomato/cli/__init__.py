@@ -14,7 +14,15 @@ import traceback
 from collections.abc import Sequence
 from typing import Any
 
-from maniskill_tomato.cli.command_table import COMMANDS, FAMILIES, PROGRAM, command_list, family_list, unknown
+from maniskill_tomato.cli.command_table import (
+    COMMANDS,
+    FAMILIES,
+    PRINT_COMPLETION,
+    PROGRAM,
+    command_list,
+    family_list,
+    unknown,
+)
 from maniskill_tomato.errors import (
     InvalidInputError,
     NotWrittenError,
@@ -75,6 +83,10 @@ def run(argv: list[str]) -> None:
         from maniskill_tomato import __version__
 
         print(f"{PROGRAM} {__version__}")
+    elif PRINT_COMPLETION in argv:
+        from maniskill_tomato.cli.completion import print_completion
+
+        print_completion(argv)
     elif argv[0] in FAMILIES and (len(argv) == 1 or argv[1] in HELP):
         print(family_list(argv[0]))
     else:

@@ -37,6 +37,9 @@ Flat = tyro.conf.arg(name="")
 
 _REGISTRY = ConstructorRegistry()
 
+DOCUMENTED = ConstructorRegistry()
+"""The sentences under fields as help, and nothing else of this module: for the completion of shells."""
+
 
 class UsageError(Exception):
     """A value that a dataclass refuses; not a `ValueError`, so that tyro lets it pass."""
@@ -205,11 +208,14 @@ def _tuple(info: PrimitiveTypeInfo) -> PrimitiveConstructorSpec[Any] | Unsupport
     )
 
 
+@DOCUMENTED.struct_rule
 @_REGISTRY.struct_rule
 def _documented(info: StructTypeInfo) -> StructConstructorSpec | None:
     """A dataclass: the sentences under its fields are their help, and a default is told where there is one."""
     kind = info.type
-    if not dataclasses.is_dataclass(kind):
+    if not dataclasses.is_dataclass(kind) or kind.__module__.startswith(
+        "tyro."
+    ):  # It wraps choices of commands.
         return None
     texts = field_texts(kind)
     hints = get_type_hints(kind, include_extras=True)
@@ -244,7 +250,11 @@ def field_texts(kind: type[Any]) -> dict[str, str]:
     for base in reversed(kind.__mro__):
         if not dataclasses.is_dataclass(base):
             continue
-        (body,) = ast.parse(textwrap.dedent(inspect.getsource(base))).body
+        try:
+            source = inspect.getsource(base)
+        except OSError:  # Made at run time, as those of `completion`.
+            continue
+        (body,) = ast.parse(textwrap.dedent(source)).body
         assert isinstance(body, ast.ClassDef)
         for line, after in zip(body.body, body.body[1:], strict=False):
             if (
