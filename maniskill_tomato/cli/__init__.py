@@ -83,7 +83,7 @@ def run(argv: list[str]) -> None:
         from maniskill_tomato import __version__
 
         print(f"{PROGRAM} {__version__}")
-    elif PRINT_COMPLETION in argv:
+    elif any(flag in argv for flag in PRINT_COMPLETION):
         from maniskill_tomato.cli.completion import print_completion
 
         print_completion(argv)

@@ -11,8 +11,8 @@ from maniskill_tomato.errors import did_you_mean
 
 PROGRAM: Final = "maniskill-tomato"
 
-PRINT_COMPLETION: Final = "--tyro-print-completion"
-"""Followed by the name of a shell, prints a script by which it completes commands and options."""
+PRINT_COMPLETION: Final = ("--print-completion", "--tyro-print-completion")
+"""Followed by the name of a shell, prints a script by which it completes commands and options; tyro's own flag too."""
 
 DESCRIPTION: Final = "Active perception for tomato harvesting: a robot arm learns where to look."
 
@@ -122,7 +122,7 @@ def command_list() -> str:
         "",
         f"{PROGRAM} COMMAND --help shows the options of a command.",
         f"{PROGRAM} --version shows the version.",
-        f"{PROGRAM} {PRINT_COMPLETION} bash (zsh, fish): for the Tab key.",
+        f"{PROGRAM} {PRINT_COMPLETION[0]} bash (zsh, fish): for the Tab key.",
         "Exit status: 0 done, 1 failed on its way, 2 cannot be done as asked.",
     ]
     return "\n".join(lines)

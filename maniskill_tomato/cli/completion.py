@@ -45,10 +45,11 @@ def print_completion(argv: Sequence[str]) -> None:
     Raises:
         InvalidInputError: It names no shell, or another one.
     """
-    shell = "".join(argv[argv.index(PRINT_COMPLETION) + 1 :][:1])
+    at = next(k for k, word in enumerate(argv) if word in PRINT_COMPLETION)
+    shell = "".join(argv[at + 1 : at + 2])
     if shell not in SHELLS:
         raise InvalidInputError(
-            f"{PRINT_COMPLETION} must be followed by one of {', '.join(SHELLS)}, got {shell or 'nothing'}"
+            f"{argv[at]} must be followed by one of {', '.join(SHELLS)}, got {shell or 'nothing'}"
             f"{did_you_mean(shell, SHELLS)}"
         )
     written = io.StringIO()
@@ -59,7 +60,7 @@ def print_completion(argv: Sequence[str]) -> None:
         tyro.cli(
             _all_commands(),
             prog=PROGRAM,
-            args=[PRINT_COMPLETION, shell],
+            args=[PRINT_COMPLETION[1], shell],
             registry=DOCUMENTED,
             config=(tyro.conf.OmitSubcommandPrefixes,),
         )

@@ -12,7 +12,7 @@ from maniskill_tomato.tasks import TASK_IDS
 
 
 def script_of(shell: str, capsys: pytest.CaptureFixture[str], *before: str) -> str:
-    main([*before, "--tyro-print-completion", shell])
+    main([*before, "--print-completion", shell])
     return capsys.readouterr().out
 
 
@@ -70,6 +70,8 @@ def test_a_script_is_for_all_commands_whichever_stands_before_it(
 ) -> None:
     script = script_of(shell, capsys)
     assert script == script_of(shell, capsys, "train")
+    main(["--tyro-print-completion", shell])
+    assert script == capsys.readouterr().out
     assert all(re.search(rf"['\"]{name.split()[-1]}['\"]", script) for name in COMMANDS)
     # The helper is called by its short name: a script for `maniskill-tomato train` would never be asked.
     assert {
@@ -84,6 +86,6 @@ def test_another_shell_is_refused_with_those_that_there_are(
     words: list[str], told: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     with pytest.raises(SystemExit) as end:
-        main(["--tyro-print-completion", *words])
+        main(["--print-completion", *words])
     assert end.value.code == 2
     assert f"must be followed by one of bash, zsh, fish, {told}" in capsys.readouterr().err
