@@ -69,6 +69,10 @@ type: $(STAMP) ## Check the types (mypy, pyright)
 	@$(BIN)/mypy
 	@$(BIN)/pyright
 
+.PHONY: reference
+reference: $(STAMP) ## Write the pages of docs/ that come from the code (commands, profiles)
+	@$(BIN)/python tools/write_reference.py
+
 .PHONY: docs
 docs: $(STAMP) ## Build the documentation as a site into build/docs
 	@$(BIN)/python tools/build_docs.py

@@ -22,6 +22,8 @@ NAVIGATION: Final[dict[str, tuple[str, ...]]] = {
         "detection",
         "perception",
         "deploy",
+        "profiles",
+        "commands",
         "api/index",
     ),
     "Results": (
