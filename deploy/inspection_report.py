@@ -27,7 +27,9 @@ from maniskill_tomato.report_design import (
     section,
     table,
     tile,
+    tiles,
 )
+from maniskill_tomato.run_facts import run_facts
 from maniskill_tomato.sensing.inspection import InspectedFruit
 
 SIDE: Final = 240
@@ -104,7 +106,7 @@ def write_page(
     """
     ripe = [fruit for fruit in fruits if fruit["ripeness"] == "ripe"]
     full = sum(fruit["fully_seen"] for fruit in ripe)
-    tiles = [
+    cells = [
         tile(str(full), "ripe fruits fully seen", f"{len(fruits)} fruits listed, {len(ripe)} of them ripe"),
         tile(str(facts["moves"]), "moves", f"{facts['refused_moves']} refused"),
         tile(f"{facts['device_seconds']:.0f} s", "by the run's clock", str(facts["reason"])),
@@ -114,7 +116,7 @@ def write_page(
         note = f"{seen} of {wanted} ripe fruits in reach truly fully seen"
         precision = facts["true_precision"]
         told = "no ripe fruit listed" if precision is None else f"precision {percent(precision)}"
-        tiles.append(tile(percent(facts["true_recall"]), "recall by the twin's truth", note, told))
+        cells.append(tile(percent(facts["true_recall"]), "recall by the twin's truth", note, told))
     head = ["Fruit", "Ripeness", "V_f", "Fully seen", "x", "y", "z [m]", "+- [mm]", "Radius [mm]", "Views"]
     has_truth = any("true_visible_fraction" in fruit for fruit in fruits)
     rows = [_row(fruit, has_truth) for fruit in fruits]
@@ -129,7 +131,7 @@ def write_page(
         "Inspection of a row",
         f"{facts['profile']}, seed {facts['seed']}, {facts['policy_name']}",
         [
-            f'<section class="tiles">{"".join(tiles)}</section>',
+            tiles(*cells),
             section(
                 "The row",
                 paragraph(outcome),
@@ -139,8 +141,8 @@ def write_page(
             ),
             section("Fruits", table([*head, *(["True V_f", "Off [mm]"] if has_truth else [])], rows)),
             section("Pictures", f'<div class="pairs">{"".join(shown)}</div>') if shown else "",
-            section("The run", table(["", ""], [[key, str(facts[key])] for key in keys])),
         ],
+        {**{key.replace("_", " "): str(facts[key]) for key in keys}, **run_facts()},
     ).encode()
 
 

@@ -1,120 +1,132 @@
-"""How every report looks: colours, the style of plots, a page that needs no other file, tables."""
+"""How every report looks: one page in one file, light and dark, wide and narrow; tiles, tables, figures, films."""
 
 import base64
+import hashlib
 import html
-import io
-from collections.abc import Sequence
+import os
+import re
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
+from typing import Final
 
 import maniskill_tomato
-from maniskill_tomato.files import write_atomically
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
 
 INK, MUTED, GRID, PAPER = "#1f2a24", "#6b7770", "#e3e7e2", "#fafaf7"
-TOMATO, LEAF, STRAW, SKY, PLUM = "#c8402c", "#3f7d4e", "#d9a441", "#3b6ea5", "#8a5aa5"
-SERIES: Final = (TOMATO, SKY, LEAF, STRAW, PLUM, "#4a9a9a", "#8c6d4f", MUTED)
+CARD, AXIS = "#ffffff", "#b9c2bb"
+TOMATO, LEAF, STRAW, SKY, PLUM = "#c8402c", "#3f7d4e", "#c98a1b", "#3b6ea5", "#8a5aa5"
+TEAL, BARK = "#3a8f8f", "#8c6d4f"
+SERIES: Final = (TOMATO, SKY, LEAF, STRAW, PLUM, TEAL, BARK, MUTED)
 """Colours of lines that stay apart."""
-TEN: Final = (
-    "#1f77b4",
-    "#ff7f0e",
-    "#2ca02c",
-    "#d62728",
-    "#9467bd",
-    "#8c564b",
-    "#e377c2",
-    "#7f7f7f",
-    "#bcbd22",
-    "#17becf",
-)
-"""Matplotlib's ten, for more lines than `SERIES` has."""
 
-PLOT_STYLE: Final[Any] = {
-    "axes.edgecolor": "#b9c2bb",
-    "axes.labelcolor": INK,
-    "axes.spines.right": False,
-    "axes.spines.top": False,
-    "axes.grid": True,
-    "axes.axisbelow": True,
-    "axes.titlesize": 10.5,
-    "axes.titleweight": "bold",
-    "axes.titlelocation": "left",
-    "axes.titlecolor": INK,
-    "axes.labelsize": 9,
-    "grid.color": GRID,
-    "grid.linewidth": 0.8,
-    "xtick.color": MUTED,
-    "ytick.color": MUTED,
-    "xtick.labelsize": 8.5,
-    "ytick.labelsize": 8.5,
-    "legend.frameon": False,
-    "legend.fontsize": 8.5,
-    "savefig.dpi": 150,
-    "figure.constrained_layout.use": True,
+LARGEST_PICTURE: Final = 160_000
+"""A PNG file of more bytes is packed as JPEG where it is copied into a page and JPEG is smaller."""
+
+LARGEST_FILM: Final = 6_000_000
+"""A film of at most so many bytes is copied into the page; a larger one is linked."""
+
+TEXT_PX_PER_PT: Final = 1.1
+"""A plot is never shown smaller than so many pixels for each of its points: its texts of 8.5 pt have 9 px or more."""
+
+_THEMED: Final = {
+    INK: "ink",
+    MUTED: "muted",
+    GRID: "grid",
+    CARD: "card",
+    AXIS: "axis",
+    TOMATO: "tomato",
+    LEAF: "leaf",
+    STRAW: "straw",
+    SKY: "sky",
+    PLUM: "plum",
+    TEAL: "teal",
+    BARK: "bark",
 }
-"""For `matplotlib.rc_context`."""
+"""Colours of a plot that a page shows lighter on dark ground, with their variables."""
 
 _STYLE: Final = """
 :root {
-  --ink: #1f2a24; --muted: #5f6b64; --paper: #fafaf7; --card: #ffffff; --line: #e1e6e0;
-  --tomato: #b8392a; --leaf: #2f6b42;
+  color-scheme: light dark;
+  --ink: #1f2a24; --muted: #5f6b64; --paper: #fafaf7; --card: #ffffff; --line: #e1e6e0; --grid: #e3e7e2;
+  --axis: #b9c2bb; --head: #1f2a24; --note: #fdf4e3; --note-line: #ecd9ae;
+  --tomato: #c8402c; --leaf: #3f7d4e; --straw: #c98a1b; --sky: #3b6ea5; --plum: #8a5aa5; --teal: #3a8f8f;
+  --bark: #8c6d4f; --link: #2f6b42;
+}
+@media (prefers-color-scheme: dark) {
+  :root {
+    --ink: #e4eae6; --muted: #9faba4; --paper: #141916; --card: #1c231f; --line: #313b35; --grid: #2b342f;
+    --axis: #56625b; --head: #0d110f; --note: #2d2716; --note-line: #5b4c21;
+    --tomato: #f0806b; --leaf: #7cc48e; --straw: #e6b75c; --sky: #7fb2e6; --plum: #c7a1de; --teal: #6cc4c4;
+    --bark: #c9ab8c; --link: #8fd0a0;
+  }
 }
 * { box-sizing: border-box; }
 body {
   margin: 0; background: var(--paper); color: var(--ink);
   font: 16px/1.55 system-ui, -apple-system, "Segoe UI", Roboto, "Helvetica Neue", Arial, sans-serif;
+  overflow-wrap: break-word;
 }
-header { background: var(--ink); color: #f4f6f2; border-bottom: 4px solid var(--tomato); }
-header div, main, footer { max-width: 980px; margin: 0 auto; padding: 0 24px; }
+header { background: var(--head); color: #f4f6f2; border-bottom: 4px solid #c8402c; }
+header div, main, footer { max-width: 1020px; margin: 0 auto; padding: 0 24px; }
 header div { padding-top: 34px; padding-bottom: 28px; }
 h1 { margin: 0; font-size: 30px; line-height: 1.2; letter-spacing: -0.01em; }
 header p { margin: 8px 0 0; color: #c3cdc6; }
 main { padding-bottom: 40px; }
 section { margin-top: 38px; }
 h2 { margin: 0 0 10px; font-size: 20px; }
-p { margin: 0 0 14px; max-width: 70ch; }
-a { color: var(--leaf); }
+p { margin: 0 0 14px; max-width: 72ch; }
+a { color: var(--link); }
+code { font: 13px/1.5 ui-monospace, SFMono-Regular, Menlo, Consolas, monospace; user-select: all; }
 .tiles { display: grid; grid-template-columns: repeat(auto-fit, minmax(205px, 1fr)); gap: 14px; }
 .tile {
   background: var(--card); border: 1px solid var(--line); border-radius: 10px; padding: 16px 18px;
   display: flex; flex-direction: column;
 }
-.tile b { font-size: 34px; line-height: 1.1; font-variant-numeric: tabular-nums; }
+.tile b { font-size: 32px; line-height: 1.1; font-variant-numeric: tabular-nums; }
 .tile:first-child b { color: var(--leaf); }
 .tile span { margin: 6px 0 8px; font-weight: 600; line-height: 1.35; }
 .tile small { color: var(--muted); }
 .notice {
-  background: #fdf4e3; border: 1px solid #ecd9ae; border-left: 5px solid #d9a441; border-radius: 8px; padding:
-  14px 18px;
+  background: var(--note); border: 1px solid var(--note-line); border-left: 5px solid #d9a441; border-radius: 8px;
+  padding: 14px 18px;
 }
 figure {
-  margin: 0 0 18px; background: var(--card); border: 1px solid var(--line); border-radius: 10px; padding:
-  14px;
+  margin: 0 0 18px; background: var(--card); border: 1px solid var(--line); border-radius: 10px; padding: 14px;
 }
-img, video { display: block; width: 100%; height: auto; border-radius: 6px; }
+.scroll { overflow-x: auto; }
+.tall { max-height: 560px; overflow: auto; }
+.card { background: var(--card); border: 1px solid var(--line); border-radius: 10px; margin-bottom: 14px; }
+img, video, svg { display: block; width: 100%; height: auto; }
+img, video { border-radius: 6px; }
 figcaption, .caption { color: var(--muted); font-size: 14px; margin: 10px 2px 0; }
 .pairs { display: grid; grid-template-columns: repeat(auto-fit, minmax(min(100%, 380px), 1fr)); gap: 0 16px; }
-.scroll { overflow-x: auto; }
-table {
-  width: 100%; border-collapse: collapse; background: var(--card); border: 1px solid var(--line);
-  font-variant-numeric: tabular-nums;
-}
+.small { display: grid; grid-template-columns: repeat(auto-fill, minmax(min(46%, 190px), 1fr)); gap: 0 12px; }
+table { width: 100%; border-collapse: collapse; font-variant-numeric: tabular-nums; }
 th, td { padding: 9px 14px; border-bottom: 1px solid var(--line); text-align: right; white-space: nowrap; }
-tbody th { text-align: left; font-weight: 500; white-space: normal; }
-thead th { color: var(--muted); font-weight: 600; font-size: 14px; }
+tbody th { text-align: left; font-weight: 500; white-space: normal; min-width: 7em; }
+thead th { color: var(--muted); font-weight: 600; font-size: 14px; vertical-align: bottom; white-space: normal; }
+thead th:first-child, .words { text-align: left; }
+.tall thead th { position: sticky; top: 0; background: var(--card); }
+td.words { white-space: normal; min-width: 15em; }
+td.command { text-align: left; }
 tbody tr:last-child > * { border-bottom: 0; }
+.bad { color: var(--tomato); font-weight: 600; }
+.good { color: var(--leaf); font-weight: 600; }
+details { margin-bottom: 12px; }
+summary { cursor: pointer; font-weight: 600; padding: 6px 0; }
 dl { display: grid; grid-template-columns: minmax(130px, max-content) 1fr; gap: 6px 22px; margin: 0; }
 dt { color: var(--muted); }
 dd { margin: 0; overflow-wrap: anywhere; }
 footer { padding-top: 18px; padding-bottom: 34px; color: var(--muted); font-size: 14px; }
 @media (max-width: 560px) {
+  header div, main, footer { padding-left: 14px; padding-right: 14px; }
   h1 { font-size: 24px; }
-  th, td { padding: 8px 8px; }
+  .tiles { grid-template-columns: 1fr; }
+  figure { padding: 10px; }
+  th, td { padding: 8px 8px; font-size: 15px; }
   dl { grid-template-columns: 1fr; gap: 0; }
   dd { margin-bottom: 10px; }
 }
+@media print { .tall { max-height: none; } section { break-inside: avoid; } }
 """
 
 _PAGE: Final = """<!DOCTYPE html>
@@ -136,37 +148,30 @@ _PAGE: Final = """<!DOCTYPE html>
 """
 
 
-def save_figure(figure: "Figure", path: Path, dpi: float | None = None) -> None:
-    """Writes a figure in the format that the file's name says, whole or not at all.
-
-    Raises:
-        NotWrittenError: The file cannot be written.
-    """
-    content = io.BytesIO()
-    options: dict[str, Any] = {} if dpi is None else {"dpi": dpi}
-    figure.savefig(content, format=path.suffix[1:], **options)
-    write_atomically(path, content.getvalue())
-
-
 def rgb(colour: str) -> tuple[int, int, int]:
     """Red, green and blue from 0 to 255 of a colour such as `#1f2a24`."""
     red, green, blue = bytes.fromhex(colour.removeprefix("#"))
     return red, green, blue
 
 
-def page(title: str, subtitle: str, sections: Sequence[str]) -> str:
-    """An HTML page.
+def page(title: str, subtitle: str, sections: Sequence[str], facts: Mapping[str, str]) -> str:
+    """An HTML page that needs no other file.
 
     Args:
         title: As text.
         subtitle: As text.
         sections: HTML; empty ones are left out.
+        facts: What the reader should know about the run, in order; see `run_facts.run_facts`.
     """
+    about = "".join(
+        f"<dt>{html.escape(name)}</dt><dd>{_fact(name, value)}</dd>" for name, value in facts.items()
+    )
+    every = [*sections, section("About this run", f"<dl>{about}</dl>")]
     return _PAGE.format(
         style=_STYLE,
         title=html.escape(title),
         subtitle=html.escape(subtitle),
-        body="\n".join(section for section in sections if section),
+        body="\n".join(part for part in every if part),
         version=html.escape(maniskill_tomato.__version__),
     )
 
@@ -193,32 +198,116 @@ def notice(text: str | None) -> str:
 
 
 def figure(path: Path, caption: str) -> str:
-    """A PNG or JPEG file, copied into the page, with its caption below."""
-    kind = "jpeg" if path.suffix.lower() in (".jpg", ".jpeg") else "png"
-    data = base64.b64encode(path.read_bytes()).decode()
+    """A picture, copied into the page, with its caption below.
+
+    A plot (SVG, or PNG with an SVG file beside it) takes the page's colours and keeps a size at which it can be read;
+    on a phone it is scrolled where it is wider. Photos (PNG, JPEG) are as wide as the page.
+
+    Args:
+        path: The file.
+        caption: As text: what is shown, its units, and of how many.
+    """
     text = html.escape(caption)
-    image = f'<img alt="{text}" src="data:image/{kind};base64,{data}">'
-    return f"<figure>{image}<figcaption>{text}</figcaption></figure>"
+    plot = path.with_suffix(".svg")
+    shown = _plot(plot, text) if plot.is_file() else f'<img alt="{text}" src="{_picture_data(path)}">'
+    return f"<figure>{shown}<figcaption>{text}</figcaption></figure>"
 
 
-def table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    """A table of texts whose first column names the rows."""
-    cells = "".join(f"<th>{html.escape(cell)}</th>" for cell in head)
-    body = "".join(
-        f"<tr><th scope='row'>{html.escape(first)}</th>{''.join(f'<td>{html.escape(c)}</td>' for c in rest)}</tr>"
-        for first, *rest in rows
+def film(path: Path, poster: Path | None, caption: str, folder: Path) -> str:
+    """A film with the picture that is shown before it plays.
+
+    Args:
+        path: MP4 file. It is copied into the page if it has at most `LARGEST_FILM` bytes, else linked.
+        poster: A PNG or JPEG file.
+        caption: As text.
+        folder: Of the page.
+    """
+    link = html.escape(relative_path(path, folder))
+    size = path.stat().st_size
+    if size <= LARGEST_FILM:
+        source = f"data:video/mp4;base64,{base64.b64encode(path.read_bytes()).decode()}"
+        where = f"It is in this page, {size / 1e6:.1f} MB, and beside it as "
+    else:
+        source = link
+        limit = LARGEST_FILM / 1e6
+        where = f"It has {size / 1e6:.1f} MB; above {limit:.0f} MB it is not in this page but beside it: "
+    shown = "" if poster is None else f' poster="{_picture_data(poster)}"'
+    return (
+        f'<figure><video controls preload="metadata"{shown} src="{source}"></video>'
+        f'<figcaption>{html.escape(caption)} {html.escape(where)}<a href="{link}">{link}</a>.</figcaption></figure>'
     )
-    return f"<div class='scroll'><table><thead><tr>{cells}</tr></thead><tbody>{body}</tbody></table></div>"
+
+
+def relative_path(path: Path, folder: Path) -> str:
+    """The way to a file from a page's folder, as text."""
+    return Path(os.path.relpath(path.resolve(), folder.resolve())).as_posix()
+
+
+def table(
+    head: Sequence[str],
+    rows: Sequence[Sequence[str]],
+    words: Sequence[int] = (),
+    commands: Sequence[int] = (),
+    tall: bool = False,
+) -> str:
+    """A table of texts whose first column names the rows; it is scrolled within its card where it is wide.
+
+    Args:
+        head: Names of the columns.
+        rows: As many texts each.
+        words: Columns with sentences, which may take several lines.
+        commands: Columns with commands to copy.
+        tall: Whether a long table is scrolled within its card, too.
+    """
+    kinds = {**dict.fromkeys(words, "words"), **dict.fromkeys(commands, "command")}
+
+    def cell(column: int, text: str) -> str:
+        kind = f' class="{kinds[column]}"' if column in kinds else ""
+        escaped = html.escape(text)
+        return f"<td{kind}>{f'<code>{escaped}</code>' if column in commands and text else escaped}</td>"
+
+    cells = "".join(
+        f'<th scope="col"{" class=words" if column in kinds else ""}>{html.escape(text)}</th>'
+        for column, text in enumerate(head)
+    )
+    body = "".join(
+        f'<tr><th scope="row">{html.escape(row[0])}</th>'
+        f"{''.join(cell(column, text) for column, text in enumerate(row[1:], start=1))}</tr>"
+        for row in rows
+    )
+    kind = "card scroll tall" if tall else "card scroll"
+    return f'<div class="{kind}"><table><thead><tr>{cells}</tr></thead><tbody>{body}</tbody></table></div>'
+
+
+def folded(title: str, *parts: str, is_open: bool = False) -> str:
+    """Parts that the reader unfolds; the title is text."""
+    state = " open" if is_open else ""
+    return f"<details{state}><summary>{html.escape(title)}</summary>{''.join(parts)}</details>"
+
+
+def tiles(*cells: str) -> str:
+    """A row of `tile`s, one below the other on a phone."""
+    return f'<section class="tiles">{"".join(cells)}</section>'
 
 
 def tile(value: str, label: str, *notes: str) -> str:
-    """A large figure with what it is and remarks below."""
-    small = "".join(f"<small>{html.escape(note)}</small>" for note in notes)
+    """A large figure with its unit, what it is, and remarks below: of how many, and its interval."""
+    small = "".join(f"<small>{html.escape(note)}</small>" for note in notes if note)
     return f'<div class="tile"><b>{html.escape(value)}</b><span>{html.escape(label)}</span>{small}</div>'
 
 
+def side_by_side(*figures: str) -> str:
+    """Figures two in a row, one below the other on a phone."""
+    return f'<div class="pairs">{"".join(figures)}</div>' if figures else ""
+
+
+def many_small(*figures: str) -> str:
+    """Many small pictures, five in a row, two on a phone."""
+    return f'<div class="small">{"".join(figures)}</div>' if figures else ""
+
+
 def markdown_table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    """The same as Markdown."""
+    """A table as Markdown, for the terminal and for files that people paste."""
     lines = [head, ("---",) * len(head), *rows]
     return "\n".join("| " + " | ".join(cell.replace("|", "\\|") for cell in line) + " |" for line in lines)
 
@@ -231,3 +320,45 @@ def percent(value: float, decimals: int = 1) -> str:
 def number(value: float | None, decimals: int) -> str:
     """A number as text, nothing where there is none."""
     return "" if value is None else f"{value:.{decimals}f}"
+
+
+def _fact(name: str, value: str) -> str:
+    escaped = html.escape(value)
+    return f"<code>{escaped}</code>" if name == "command" else escaped
+
+
+def _plot(path: Path, alt: str) -> str:
+    """An SVG file as a part of the page: in its colours, with names of its own."""
+    text = path.read_text(encoding="utf-8")
+    text = text[text.index("<svg") :]
+    # Names that the browser must not mix up with those of another plot of the page.
+    own = f"p{hashlib.sha256(str(path).encode()).hexdigest()[:8]}-"
+    text = re.sub(r'\bid="', f'id="{own}', text)
+    text = re.sub(r'(href="#|url\(#)', rf"\g<1>{own}", text)
+    text = re.sub(r"<metadata>.*?</metadata>", "", text, flags=re.DOTALL)
+    for colour, name in _THEMED.items():
+        text = text.replace(f": {colour}", f": var(--{name})")
+    match = re.search(r'width="([0-9.]+)pt"', text)
+    assert match is not None
+    least = float(match[1]) * TEXT_PX_PER_PT
+    # The size comes from the page; what is left is the picture's shape.
+    text = re.sub(r'(width|height)="[0-9.]+pt" ?', "", text, count=2)
+    text = text.replace("<svg ", f'<svg role="img" aria-label="{alt}" style="min-width: {least:.0f}px" ', 1)
+    text = text.replace(' xmlns="http://www.w3.org/2000/svg"', "")
+    text = re.sub(r' xmlns:xlink="[^"]*"', "", text).replace("xlink:href", "href")
+    return f'<div class="scroll">{text}</div>'
+
+
+def _picture_data(path: Path) -> str:
+    """A picture's file as the source of an image; large PNG files are packed as JPEG."""
+    content = path.read_bytes()
+    kind = "jpeg" if path.suffix.lower() in (".jpg", ".jpeg") else "png"
+    if kind == "png" and len(content) > LARGEST_PICTURE:
+        import cv2
+
+        picture = cv2.imread(str(path))
+        if picture is not None:
+            ok, packed = cv2.imencode(".jpg", picture, (cv2.IMWRITE_JPEG_QUALITY, 88))
+            if ok and len(packed) < len(content):
+                kind, content = "jpeg", packed.tobytes()
+    return f"data:image/{kind};base64,{base64.b64encode(content).decode()}"

@@ -20,6 +20,8 @@ FOUNDATION = frozenset(
         "folder_lock",
         "network_weights",
         "report_design",
+        "report_plots",
+        "run_facts",
         "tables",
         "text_files",
         "version",
@@ -28,8 +30,8 @@ FOUNDATION = frozenset(
     }
 )
 """What every room may import: files of arrays, asset files, errors, files on the disk, locks of folders, weights put
-into a network, the look of reports, tables of TOML and JSON, the reader of such files, the version, the start of Warp,
-the pool of processes."""
+into a network, the look of reports and plots, how a result came about, tables of TOML and JSON, the reader of such
+files, the version, the start of Warp, the pool of processes."""
 
 WORLD = FOUNDATION | {"robot", "plants", "raycast"}
 SENSES = WORLD | {"segmentation", "sensing"}

@@ -29,7 +29,7 @@ from maniskill_tomato.experiments.viewpoint_benchmark import run_benchmark
 from maniskill_tomato.files import write_atomically, write_json
 from maniskill_tomato.folder_lock import only_writer
 from maniskill_tomato.plants.episode_list import load_episodes, write_episodes
-from maniskill_tomato.report_design import save_figure
+from maniskill_tomato.report_plots import save_figure
 from maniskill_tomato.segmentation.datasets.picture_files import write_picture
 from maniskill_tomato.segmentation.synthesis.dataset_rendering import DatasetConfig, make_dataset
 

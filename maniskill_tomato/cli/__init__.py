@@ -31,6 +31,7 @@ from maniskill_tomato.errors import (
     TrainingDivergedError,
     UnsoundEnvironmentError,
 )
+from maniskill_tomato.run_facts import running_command
 
 HELP = ("-h", "--help", "help")
 
@@ -92,7 +93,8 @@ def run(argv: list[str]) -> None:
     else:
         command = parse(argv)
         try:
-            command.run()
+            with running_command([PROGRAM, *argv]):
+                command.run()
         except InvalidInputError as error:
             from maniskill_tomato.cli.arguments import with_flags
 

@@ -67,10 +67,6 @@ class Eval:
         from maniskill_tomato.experiments.configs import EvaluationConfig
         from maniskill_tomato.experiments.evaluation import evaluate
 
-        env_options = self.plants.env_options()
-        if self.episode_list is not None or (self.env_id == LISTED_ID and not env_options):
-            env_options["episodes"] = self.episode_list or "held_out"
-        env_options.update(self._camera_options())
         config = EvaluationConfig(
             env_id=self.env_id,
             policy=self.policy,
@@ -79,7 +75,7 @@ class Eval:
             out=self.out,
             num_envs=self.num_envs,
             allow_other_task=self.allow_other_task,
-            env_options=env_options,
+            env_options=self.options_of_task(),
             baseline=self.baseline,
             video=self.video,
             title="Where to look: evaluation",
@@ -95,6 +91,17 @@ class Eval:
             print(result.left_out)
         print(f"metrics {self.out / 'metrics.json'}")
         print(f"report  {result.report}")
+
+    def options_of_task(self) -> dict[str, Any]:
+        """The options for `gymnasium.make`.
+
+        Raises:
+            InvalidInputError: One is not allowed.
+        """
+        options = self.plants.env_options()
+        if self.episode_list is not None or (self.env_id == LISTED_ID and not options):
+            options["episodes"] = self.episode_list or "held_out"
+        return options | self._camera_options()
 
     def _camera_options(self) -> dict[str, Any]:
         """The options of camera perception; none for ground truth.

@@ -28,7 +28,7 @@ from maniskill_tomato.tasks import TASK_IDS
 
 @dataclass(frozen=True, kw_only=True)
 class Benchmark(BenchmarkConfig):
-    """Compare policies on the same held-out episodes: benchmark.json, benchmark.md and plots."""
+    """Compare policies on the same held-out episodes: benchmark.json, plots and report.html."""
 
     def run(self) -> None:
         """Runs what is missing and says where the results are."""
@@ -47,7 +47,7 @@ class Benchmark(BenchmarkConfig):
         counts = Counter(row["episodes"] for row in result.figures.rows)
         print(f"episodes {', '.join(str(count) for count in counts)}")
         print(f"numbers  {self.out / 'benchmark.json'}")
-        print(f"page     {result.page}")
+        print(f"report   {result.page}")
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -1,7 +1,8 @@
-"""What a benchmark found, as JSON, as a page of tables, and as plots."""
+"""What a benchmark found, as JSON, as plots, and as a page."""
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+import textwrap
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -11,11 +12,37 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
 import maniskill_tomato
+from maniskill_tomato.experiments.episode_listing import episode_list, list_episodes
 from maniskill_tomato.experiments.episode_record import EpisodeRecord
 from maniskill_tomato.experiments.metrics import THRESHOLDS, compare_policies, summarise_policy
 from maniskill_tomato.experiments.policy_runs import Condition
 from maniskill_tomato.files import write_atomically, write_json
-from maniskill_tomato.report_design import INK, PLOT_STYLE, TEN, markdown_table, number, percent, save_figure
+from maniskill_tomato.report_design import (
+    GRID,
+    INK,
+    figure,
+    markdown_table,
+    notice,
+    number,
+    page,
+    paragraph,
+    percent,
+    section,
+    side_by_side,
+    table,
+    tile,
+    tiles,
+)
+from maniskill_tomato.report_plots import (
+    MOST_LINES,
+    PANEL,
+    PLOT_STYLE,
+    label_ends,
+    line_style,
+    panel_size,
+    save_figure,
+)
+from maniskill_tomato.run_facts import run_facts
 
 HEAD = (
     "policy",
@@ -95,92 +122,220 @@ def summarise_runs(
     )
 
 
-def write_benchmark(
-    figures: BenchmarkFigures,
-    runs: Runs,
-    out: Path,
-    *,
-    threshold: float,
-    horizon: int,
-    privileged: Sequence[str] = (),
-    facts: Mapping[str, Any] | None = None,
-    pictures: Sequence[Path] = (),
-) -> tuple[str, Path]:
-    """Writes benchmark.json, benchmark_details.json, benchmark.md and the plots.
+@dataclass(frozen=True, kw_only=True)
+class BenchmarkInput:
+    """What the page of a benchmark is made of, beside the figures."""
+
+    runs: Runs
+    """The episodes of the main condition by policy."""
+    threshold: float
+    """V_f above which an episode succeeds."""
+    horizon: int
+    """Most moves of an episode."""
+    privileged: Sequence[str] = ()
+    """Policies that know the truth."""
+    facts: Mapping[str, Any] = field(default_factory=dict)
+    """What else to say about how it was run."""
+    pictures: Sequence[Path] = ()
+    """Further pictures in the folder."""
+    left_out: str | None = None
+    """Which pictures are missing, and how to get them."""
+    replay: Callable[[str, int], str | None] = lambda policy, seed: None
+    """The command that runs an episode of a policy again, by its label."""
+
+
+def write_benchmark(figures: BenchmarkFigures, content: BenchmarkInput, out: Path) -> tuple[str, Path]:
+    """Writes benchmark.json, benchmark_details.json, the plots and report.html.
 
     Args:
         figures: What was found.
-        runs: The episodes of the main condition by policy, for the plots.
+        content: What else the page tells.
         out: Folder of the results.
-        threshold: V_f above which an episode succeeds.
-        horizon: Most moves of an episode.
-        privileged: Policies that know the truth.
-        facts: What else to say about how it was run.
-        pictures: Further pictures in `out`.
 
     Returns:
-        The main table and the path of benchmark.md.
+        The main table as Markdown, and the path of report.html.
     """
-    facts = facts or {}
-    version = maniskill_tomato.__version__
     write_json(out / "benchmark.json", figures.rows)
     details = {
-        "package_version": version,
-        "success_threshold": threshold,
-        "horizon": horizon,
-        **facts,
+        "package_version": maniskill_tomato.__version__,
+        "success_threshold": content.threshold,
+        "horizon": content.horizon,
+        **content.facts,
         "tests": figures.tests,
         "sweeps": figures.sweeps,
     }
     write_json(out / "benchmark_details.json", details)
-    shown = [out / "progress.png", out / "thresholds.png"]
-    plot_progress(runs, horizon, shown[0])
-    plot_thresholds(figures.rows, threshold, shown[1])
-    if figures.sweeps:
-        shown.append(out / "sweeps.png")
-        plot_sweeps(figures.sweeps, shown[-1])
-    table = markdown_table(HEAD, [_cells(row, row["policy"] in privileged) for row in figures.rows])
-    count = max(row["episodes"] for row in figures.rows)
-    told = "".join(f"; {name.replace('_', ' ')}: {value}" for name, value in facts.items())
-    parts = [
-        "# Benchmark",
-        f"{count} episodes, at most {horizon} moves, success at V_f > {threshold:g}; maniskill-tomato {version}{told}.",
-        table,
-        METHOD,
-        *(f"![{path.stem.replace('_', ' ')}]({path.name})" for path in (*shown, *pictures)),
-    ]
-    if figures.tests:
-        parts += ["## Paired tests", _tests_table(figures.tests), TESTS]
+    drawn = best_rows(figures.rows)
+    names = [row["policy"] for row in drawn]
+    plots = [out / name for name in ("progress.png", "best_view.png", "thresholds.png")]
+    shown = {name: content.runs[name] for name in names}
+    plot_progress(shown, content.horizon, plots[0])
+    plot_best_view(shown, content.horizon, plots[1])
+    plot_thresholds(drawn, content.threshold, plots[2])
+    sweeps = {}
     for axis in dict.fromkeys(row["axis"] for row in figures.sweeps):
-        rows = [row for row in figures.sweeps if row["axis"] == axis]
-        parts += [f"## Sweep: {axis.replace('_', ' ')}", _sweep_table(rows)]
-    page = out / "benchmark.md"
-    write_atomically(page, ("\n\n".join(parts) + "\n").encode())
-    return table, page
+        sweeps[axis] = out / f"sweep_{axis}.png"
+        plot_sweep([row for row in figures.sweeps if row["axis"] == axis], sweeps[axis])
+    cells = [_cells(row, row["policy"] in content.privileged) for row in figures.rows]
+    path = out / "report.html"
+    write_atomically(path, _page(figures, content, cells, plots, sweeps).encode())
+    return markdown_table(HEAD, cells), path
 
 
-def plot_progress(runs: Mapping[str, Sequence[EpisodeRecord]], horizon: int, path: Path) -> None:
-    """Share of solved episodes and mean of the best V_f so far, over the moves.
+def best_rows(rows: Sequence[Mapping[str, Any]]) -> list[Mapping[str, Any]]:
+    """The policies that a plot draws: at most `MOST_LINES`, those that solve most in the fewest moves, in the given
+    order."""
+    ranked = sorted(rows, key=lambda row: (-row["success_rate"], row["mean_moves"]))
+    kept = {row["policy"] for row in ranked[:MOST_LINES]}
+    return [row for row in rows if row["policy"] in kept]
+
+
+def _page(
+    figures: BenchmarkFigures,
+    content: BenchmarkInput,
+    cells: Sequence[Sequence[str]],
+    plots: Sequence[Path],
+    sweeps: Mapping[str, Path],
+) -> str:
+    rows = figures.rows
+    counts = sorted({row["episodes"] for row in rows})
+    episodes = " or ".join(str(count) for count in counts)
+    drawn = len(best_rows(rows))
+    lines = "" if drawn == len(rows) else f" The {drawn} best of {len(rows)} policies; the table names all."
+    of = f"n = {episodes} episodes a policy.{lines}"
+    captions = (
+        f"Share of episodes solved (0 to 1) within so many moves; {of}",
+        f"Largest V_f so far (0 to 1), mean over the episodes; {of}",
+        f"Share of episodes (0 to 1) that reach a V_f within {content.horizon} moves; {of}",
+    )
+    facts = {
+        **{name.replace("_", " "): str(value) for name, value in content.facts.items()},
+        **run_facts(),
+    }
+    tests = (
+        section("Paired tests", _tests_table(figures.tests), paragraph(TESTS, "caption"))
+        if figures.tests
+        else ""
+    )
+    listed = [
+        episode_list(
+            list_episodes(
+                found,
+                content.threshold,
+                content.horizon,
+                lambda seed, label=label: content.replay(label, seed),
+            ),
+            label,
+        )
+        for label, found in content.runs.items()
+        if found
+    ]
+    return page(
+        "Benchmark of policies",
+        f"{len(rows)} policies on the same {episodes} episodes, at most {content.horizon} moves, success at "
+        f"V_f > {content.threshold:g}",
+        [
+            _tiles(rows, content.privileged),
+            notice(content.left_out),
+            section(
+                f"Policies, n = {episodes} episodes each",
+                table(HEAD, cells, tall=len(cells) > 20),
+                paragraph(METHOD, "caption"),
+            ),
+            section(
+                "Over the moves",
+                side_by_side(*(figure(path, text) for path, text in zip(plots, captions, strict=True))),
+                *(
+                    figure(
+                        path,
+                        "Start view, and the last view of every policy, with V_f (0 to 1); the first of "
+                        f"n = {episodes} episodes.",
+                    )
+                    for path in content.pictures
+                ),
+            ),
+            *(_sweep_section(axis, figures.sweeps, path) for axis, path in sweeps.items()),
+            tests,
+            section(
+                "Episodes, failures first",
+                paragraph(
+                    "V_f is the visible fraction of the target, from 0 to 1. The command runs the episode again, with "
+                    "its film where this machine can render."
+                ),
+                *listed,
+            ),
+        ],
+        facts,
+    )
+
+
+def _tiles(rows: Sequence[Mapping[str, Any]], privileged: Sequence[str]) -> str:
+    """The best policy that does not know the truth, and the best of all."""
+    fair = [row for row in rows if row["policy"] not in privileged] or list(rows)
+    best = min(fair, key=lambda row: (-row["success_rate"], row["mean_moves"]))
+    low, high = best["success_rate_interval_95"]
+    moves_low, moves_high = best["mean_moves_interval_95"]
+    count = f"n = {best['episodes']} episodes"
+    decision = best["decision_ms"]
+    return tiles(
+        tile(
+            percent(best["success_rate"]),
+            f"solved by {best['policy']}, the best that does not know the truth",
+            count,
+            f"95 % interval {percent(low)} to {percent(high)}",
+        ),
+        tile(
+            f"{best['mean_moves']:.2f} moves",
+            "an episode, mean",
+            f"{count}; a failed one counts as the whole horizon",
+            f"95 % interval {moves_low:.2f} to {moves_high:.2f}",
+        ),
+        tile(f"{best['mean_path_m']:.2f} m", "way of the camera an episode, mean", count),
+        tile("none" if decision is None else f"{decision:.1f} ms", "for a decision, mean wall time", count),
+    )
+
+
+def _sweep_section(axis: str, every: Sequence[Mapping[str, Any]], path: Path) -> str:
+    rows = [row for row in every if row["axis"] == axis]
+    counts = " or ".join(str(count) for count in sorted({row["episodes"] for row in rows}))
+    return section(
+        f"Sweep: {axis.replace('_', ' ')}",
+        figure(
+            path,
+            f"Share of episodes solved (0 to 1) over {AXIS_LABELS.get(axis, axis)}, with 95 % intervals (Wilson); "
+            f"n = {counts} episodes a point.",
+        ),
+        _sweep_table(rows),
+        paragraph(
+            f"Success and mean moves of each policy at each value; n = {counts} episodes a cell.", "caption"
+        ),
+    )
+
+
+def plot_progress(runs: Runs, horizon: int, path: Path) -> None:
+    """Share of solved episodes over the moves.
 
     Args:
         runs: Episodes by policy.
         horizon: Most moves of an episode.
         path: The picture to write.
     """
-    moves = np.arange(1, horizon + 1)
-    with mpl.rc_context(PLOT_STYLE):
-        figure = Figure(figsize=(9.6, 4.4))
-        left, right = figure.subplots(1, 2)
-        for (label, episodes), style in zip(runs.items(), _styles(len(runs)), strict=True):
-            needed = np.array([e.steps if e.success else np.inf for e in episodes])
-            left.plot(moves, [(needed <= k).mean() for k in moves], label=label, **style)
-            right.plot(moves, np.mean([e.best_so_far(horizon) for e in episodes], axis=0), **style)
-        left.set(title="Solved episodes", xlabel="moves", ylim=(-0.02, 1.02))
-        right.set(title="Best V_f so far, mean", xlabel="moves", ylim=(-0.02, 1.02))
-        for axes in (left, right):
-            axes.xaxis.set_major_locator(MaxNLocator(integer=True))
-        figure.legend(loc="outside lower center", ncols=5)
-        save_figure(figure, path)
+
+    def solved(episodes: Sequence[EpisodeRecord]) -> list[float]:
+        needed = np.array([e.steps if e.success else np.inf for e in episodes])
+        return [float((needed <= k).mean()) for k in range(1, horizon + 1)]
+
+    lines = {label: solved(episodes) for label, episodes in runs.items()}
+    _plot_lines(range(1, horizon + 1), lines, "Solved episodes", "moves", "share of episodes", path)
+
+
+def plot_best_view(runs: Runs, horizon: int, path: Path) -> None:
+    """Mean of the best V_f so far over the moves; arguments as for `plot_progress`."""
+    lines = {
+        label: np.mean([e.best_so_far(horizon) for e in episodes], axis=0).tolist()
+        for label, episodes in runs.items()
+    }
+    _plot_lines(range(1, horizon + 1), lines, "Best V_f so far, mean", "moves", "V_f", path)
 
 
 def plot_thresholds(rows: Sequence[Mapping[str, Any]], threshold: float, path: Path) -> None:
@@ -191,57 +346,86 @@ def plot_thresholds(rows: Sequence[Mapping[str, Any]], threshold: float, path: P
         threshold: The task's own, where episodes end.
         path: The picture to write.
     """
-    with mpl.rc_context(PLOT_STYLE):
-        figure = Figure(figsize=(6.6, 4.4))
-        axes = figure.subplots()
-        for row, style in zip(rows, _styles(len(rows)), strict=True):
-            shares = [row["success_rate_at_threshold"][f"{t:.2f}"] for t in THRESHOLDS]
-            axes.plot(THRESHOLDS, shares, label=row["policy"], **style)
-        axes.axvline(threshold, color=INK, linewidth=1.0, linestyle=(0, (4, 3)))
-        axes.annotate(
-            "episodes end here",
-            (threshold, 0.02),
-            xycoords=("data", "axes fraction"),
-            xytext=(4, 0),
-            textcoords="offset points",
-            fontsize=8,
-            color=INK,
-        )
-        axes.set(title="Episodes that reach a V_f", xlabel="V_f", ylim=(-0.02, 1.02))
-        figure.legend(loc="outside lower center", ncols=4)
-        save_figure(figure, path)
+    lines = {
+        row["policy"]: [row["success_rate_at_threshold"][f"{t:.2f}"] for t in THRESHOLDS] for row in rows
+    }
+    _plot_lines(
+        THRESHOLDS,
+        lines,
+        "Episodes that reach a V_f",
+        "V_f",
+        "share of episodes",
+        path,
+        ("ends here", threshold),
+    )
 
 
-def plot_sweeps(rows: Sequence[Mapping[str, Any]], path: Path) -> None:
-    """Success with its interval over each difficulty.
+def plot_sweep(rows: Sequence[Mapping[str, Any]], path: Path) -> None:
+    """Success with its interval over one difficulty, a panel for each policy with the others in grey.
 
     Args:
-        rows: Figures of the policies with `axis` and `value`.
+        rows: Figures of the policies with `axis` and `value`, of one axis.
         path: The picture to write.
     """
-    axes_names = list(dict.fromkeys(row["axis"] for row in rows))
     labels = list(dict.fromkeys(row["policy"] for row in rows))
+    name = rows[0]["axis"]
+    columns = min(len(labels), 4)
+    lines = -(-len(labels) // columns)
+    points = {label: [row for row in rows if row["policy"] == label] for label in labels}
     with mpl.rc_context(PLOT_STYLE):
-        columns = min(len(axes_names), 3)
-        lines = -(-len(axes_names) // columns)
-        figure = Figure(figsize=(3.4 * columns, 3.0 * lines + 0.5))
-        panels = figure.subplots(lines, columns, squeeze=False).flat
-        for axes, name in zip(panels, axes_names, strict=False):
-            for label, style in zip(labels, _styles(len(labels)), strict=True):
-                points = [r for r in rows if r["axis"] == name and r["policy"] == label]
-                if not points:
-                    continue
-                x = [r["value"] for r in points]
-                y = np.array([r["success_rate"] for r in points])
-                bounds = np.array([r["success_rate_interval_95"] for r in points]).T
-                first = label if name == axes_names[0] else None
-                axes.plot(x, y, label=first, **style)
-                axes.fill_between(x, *bounds, color=style["color"], alpha=0.12, linewidth=0)
-            axes.set(xlabel=AXIS_LABELS.get(name, name), ylim=(-0.02, 1.02), title="Success")
-        for axes in list(figure.axes)[len(axes_names) :]:
+        canvas = Figure(figsize=(max(2.3 * columns, PANEL[0]), 2.1 * lines + 0.4))
+        panels = canvas.subplots(lines, columns, squeeze=False, sharex=True, sharey=True)
+        for axes, (index, label) in zip(panels.flat, enumerate(labels), strict=False):
+            for other in labels:
+                x = [row["value"] for row in points[other]]
+                y = [row["success_rate"] for row in points[other]]
+                if other != label:
+                    axes.plot(x, y, color=GRID, linewidth=1.0, zorder=1)
+            x = [row["value"] for row in points[label]]
+            bounds = np.array([row["success_rate_interval_95"] for row in points[label]]).T
+            style = line_style(index)
+            axes.fill_between(x, *bounds, color=style["color"], alpha=0.15, linewidth=0)
+            axes.plot(x, [row["success_rate"] for row in points[label]], **style, zorder=3)
+            axes.set_title(textwrap.fill(label, 24), fontsize=9)
+            axes.set_ylim(-0.02, 1.04)
+        for axes in panels.flat[len(labels) :]:
             axes.set_visible(False)
-        figure.legend(loc="outside lower center", ncols=4)
-        save_figure(figure, path)
+        canvas.supxlabel(textwrap.fill(AXIS_LABELS.get(name, name), 60), fontsize=9)
+        canvas.supylabel("share of episodes solved", fontsize=9)
+        save_figure(canvas, path)
+
+
+def _plot_lines(
+    x: Sequence[float],
+    lines: Mapping[str, Sequence[float]],
+    title: str,
+    x_label: str,
+    y_label: str,
+    path: Path,
+    mark: tuple[str, float] | None = None,
+) -> None:
+    """Lines from 0 to 1 with their names at their ends; `mark` names a place on the x axis."""
+    with mpl.rc_context(PLOT_STYLE):
+        canvas = Figure(figsize=panel_size(lines))
+        axes = canvas.subplots()
+        for index, values in enumerate(lines.values()):
+            axes.plot(x, values, **line_style(index, len(x)))
+        axes.set(title=title, xlabel=x_label, ylabel=y_label, ylim=(-0.02, 1.04))
+        if all(isinstance(value, int) for value in x):
+            axes.xaxis.set_major_locator(MaxNLocator(integer=True))
+        if mark is not None:
+            axes.axvline(mark[1], color=INK, linewidth=1.0, linestyle=(0, (4, 3)))
+            axes.annotate(
+                mark[0],
+                (mark[1], 0.02),
+                xycoords=("data", "axes fraction"),
+                xytext=(-4, 0),
+                textcoords="offset points",
+                ha="right",
+                fontsize=8,
+            )
+        label_ends(axes, {label: (float(x[-1]), float(values[-1])) for label, values in lines.items()})
+        save_figure(canvas, path)
 
 
 def _cells(row: Mapping[str, Any], privileged: bool) -> tuple[str, ...]:
@@ -283,7 +467,7 @@ def _tests_table(tests: Sequence[Mapping[str, Any]]) -> str:
                 _p(test["moves_p"]),
             )
         )
-    return markdown_table(head, rows)
+    return table(head, rows, tall=len(rows) > 14)
 
 
 def _sweep_table(rows: Sequence[Mapping[str, Any]]) -> str:
@@ -297,16 +481,8 @@ def _sweep_table(rows: Sequence[Mapping[str, Any]]) -> str:
             for v in values
         ]
         lines.append((label, *cells))
-    return markdown_table(("policy", *(f"{v:g}" for v in values)), lines)
+    return table(("policy", *(f"{v:g}" for v in values)), lines)
 
 
 def _p(value: float) -> str:
     return "< 0.001" if value < 0.001 else f"{value:.3f}"
-
-
-def _styles(count: int) -> list[dict[str, Any]]:
-    """Colours that stay apart, solid for the first ten lines, then dashed."""
-    return [
-        {"color": TEN[i % 10], "linewidth": 1.7, "linestyle": "-" if i < 10 else (0, (4, 2))}
-        for i in range(count)
-    ]

@@ -58,7 +58,7 @@ class EvaluationConfig:
 
 @dataclass(frozen=True, kw_only=True)
 class BenchmarkConfig:
-    """Compare policies on the same held-out episodes: benchmark.json, benchmark.md and plots."""
+    """Compare policies on the same held-out episodes: benchmark.json, plots and report.html."""
 
     policies: str = DEFAULT_POLICIES
     """Names of planners, files of trained policies, or LABEL=FILE, with commas between them."""

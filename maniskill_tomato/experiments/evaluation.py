@@ -10,10 +10,12 @@ from typing import Any, cast
 
 import gymnasium as gym
 import numpy as np
+from gymnasium.envs.registration import registry
 
 from maniskill_tomato.errors import InvalidInputError
 from maniskill_tomato.experiments import plots
 from maniskill_tomato.experiments.configs import EvaluationConfig
+from maniskill_tomato.experiments.episode_listing import list_episodes, replay_with_eval
 from maniskill_tomato.experiments.episode_record import EpisodeRecord
 from maniskill_tomato.experiments.evaluation_report import ReportInput, ReportPicture, write_report
 from maniskill_tomato.experiments.metrics import make_metrics
@@ -28,6 +30,7 @@ from maniskill_tomato.policies.adapters import origin
 from maniskill_tomato.policies.opening import RANDOM, find_policy, open_policy, shipped_policy
 from maniskill_tomato.policies.protocol import Planner, Policy
 from maniskill_tomato.rendering import vulkan_probe
+from maniskill_tomato.run_facts import duration, is_command_running, run_facts
 from maniskill_tomato.segmentation.datasets.picture_files import write_picture
 
 logger = logging.getLogger(__name__)
@@ -51,6 +54,28 @@ class EvaluationResult:
     """What the policy is and where it was trained, in one line."""
 
 
+@dataclass(frozen=True, kw_only=True)
+class EpisodeLimits:
+    """When an episode of the task ends."""
+
+    threshold: float
+    """V_f above which the target is fully visible."""
+    horizon: int | None
+    """Most moves; None if the task does not say."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class FilmedEpisodes:
+    """What was filmed; nothing where this machine cannot render."""
+
+    video: Path | None = None
+    poster: Path | None = None
+    """The end of the first filmed episode that was solved, else of the first one."""
+    count: int = 0
+    """How many episodes."""
+    views: Sequence[ReportPicture] = ()
+
+
 def evaluate(config: EvaluationConfig) -> EvaluationResult:
     """Evaluates a policy and writes metrics.json, trajectories.npz, plots, pictures, a film and report.html.
 
@@ -60,7 +85,8 @@ def evaluate(config: EvaluationConfig) -> EvaluationResult:
     start = time.perf_counter()
     found = find_policy(config.policy or shipped_policy(config.env_id), _required_task(config))
     path = found if isinstance(found, Path) else None
-    episodes, baseline, threshold, policy = _run(config, found)
+    episodes, baseline, limits, policy = _run(config, found)
+    threshold = limits.threshold
     true_association = _with_true_association(config, found)
     seeable = _seeable(config, episodes)
     description = {
@@ -80,30 +106,40 @@ def evaluate(config: EvaluationConfig) -> EvaluationResult:
     )
     write_json(config.out / "metrics.json", metrics)
     write_trajectories(config.out / "trajectories.npz", episodes)
-    views: list[ReportPicture] = []
-    video = left_out = None
+    shown = FilmedEpisodes()
+    left_out = None
     if config.video:
         if (problem := vulkan_probe.rendering_problem()) is None:
-            video, views = _film(config, found)
+            shown = _film(config, found)
         else:
             left_out = LEFT_OUT.format(hint=problem)
     facts = {key.replace("_", " "): str(value) for key, value in description.items() if key != "path"}
-    facts["evaluation time"] = f"{metrics['wall_seconds']:.0f} s"
+    facts["evaluation time"] = duration(metrics["wall_seconds"])
+    source = str(config.policy or shipped_policy(config.env_id))
+
+    def replay(seed: int) -> str | None:
+        return replay_with_eval(
+            config.env_id, source, seed, config.env_options, allow_other_task=config.allow_other_task
+        )
+
     content = ReportInput(
         title=config.title,
         metrics=metrics,
-        facts=facts,
+        facts={**facts, **run_facts(None if is_command_running() else time.perf_counter() - start)},
         training=_plot_training(config, path),
         evaluation=_plot_episodes(config, episodes, threshold),
-        views=views,
-        video=video,
+        views=shown.views,
+        episodes=list_episodes(episodes, threshold, limits.horizon, replay),
+        video=shown.video,
+        poster=shown.poster,
+        filmed=shown.count,
         policy=path,
         left_out=left_out,
     )
     report = config.out / "report.html"
     write_report(report, content)
     return EvaluationResult(
-        metrics=metrics, report=report, video=video, left_out=left_out, origin=origin(policy)
+        metrics=metrics, report=report, video=shown.video, left_out=left_out, origin=origin(policy)
     )
 
 
@@ -177,28 +213,33 @@ def _open(config: EvaluationConfig, policy: str | Path, env: gym.Env[Any, Any]) 
 
 def _run(
     config: EvaluationConfig, found: str | Path
-) -> tuple[list[EpisodeRecord], list[EpisodeRecord] | None, float, Policy]:
-    """The policy's episodes, the baseline's if wanted, the task's threshold of V_f, and the policy."""
-    episodes, threshold, policy = _run_policy(config, found)
+) -> tuple[list[EpisodeRecord], list[EpisodeRecord] | None, EpisodeLimits, Policy]:
+    """The policy's episodes, the baseline's if wanted, when the task ends an episode, and the policy."""
+    episodes, limits, policy = _run_policy(config, found)
     baseline = None
     if config.baseline:
         logger.info("the same episodes with random actions, to compare")
         baseline = _run_policy(config, RANDOM)[0]
-    return episodes, baseline, threshold, policy
+    return episodes, baseline, limits, policy
 
 
-def _run_policy(config: EvaluationConfig, found: str | Path) -> tuple[list[EpisodeRecord], float, Policy]:
+def _run_policy(
+    config: EvaluationConfig, found: str | Path
+) -> tuple[list[EpisodeRecord], EpisodeLimits, Policy]:
     def make(num_envs: int) -> tuple[gym.Env[Any, Any], Policy]:
         env = make_env(config.env_id, num_envs, **config.env_options)
         return env, _open(config, found, env)
 
     env, policy = open_widest(make, min(config.num_envs, config.episodes))
     try:
-        threshold = float(cast(Any, env.unwrapped).task.full_visibility)
+        limits = EpisodeLimits(
+            threshold=float(cast(Any, env.unwrapped).task.full_visibility),
+            horizon=spec.max_episode_steps if (spec := registry.get(config.env_id)) else None,
+        )
         episodes = run_episodes(env, policy, config.episodes, config.seed, config.show_progress)
     finally:
         env.close()
-    return episodes, threshold, policy
+    return episodes, limits, policy
 
 
 def _with_true_association(config: EvaluationConfig, found: str | Path) -> list[EpisodeRecord] | None:
@@ -233,20 +274,24 @@ def _seeable(config: EvaluationConfig, episodes: Sequence[EpisodeRecord]) -> dic
 def _plot_episodes(
     config: EvaluationConfig, episodes: Sequence[EpisodeRecord], threshold: float
 ) -> list[ReportPicture]:
-    out = config.out
+    out, count = config.out, len(episodes)
     plots.plot_steps(episodes, out / "steps.png")
     plots.plot_visible_fraction(episodes, threshold, out / "visible_fraction.png")
     plots.plot_trajectories(episodes, "the first episodes", out / "trajectories.png")
+    drawn = min(count, plots.SHOWN_TRAJECTORIES)
     return [
-        ReportPicture(path=out / "steps.png", caption="Steps that each episode took (thesis Fig. 5-6)."),
+        ReportPicture(
+            path=out / "steps.png", caption=f"Moves that each of n = {count} episodes took (thesis Fig. 5-6)."
+        ),
         ReportPicture(
             path=out / "visible_fraction.png",
-            caption="Visible fraction of the target at the start and at its best in each episode (thesis Fig. 5-7).",
+            caption="Visible fraction V_f of the target (0 to 1) at the start and at its best in each of "
+            f"n = {count} episodes (thesis Fig. 5-7).",
         ),
         ReportPicture(
             path=out / "trajectories.png",
-            caption="Way of the end-effector in the first episodes, with the camera at the first, middle and last pose "
-            "(thesis Fig. 5-8).",
+            caption=f"Way of the end-effector in the first {drawn} of n = {count} episodes, in metres, from two "
+            "sides, with the camera at the first, middle and last pose (thesis Fig. 5-8).",
         ),
     ]
 
@@ -259,19 +304,21 @@ def _plot_training(config: EvaluationConfig, policy: Path | None) -> list[Report
     if run is None:
         return []
     path = config.out / "training_curves.png"
-    plots.plot_training_curves(load_history(run), path)
+    history = load_history(run)
+    plots.plot_training_curves(history, path)
+    episodes, steps = len(history.episodes["steps"]), len(history.step_reward)
     return [
         ReportPicture(
             path=path,
-            caption="Loss and reward of each episode, reward and visible fraction of each step (thesis Fig. 5-1 to "
-            "5-4).",
+            caption=f"Loss and reward of each of n = {episodes:,} training episodes, reward and visible fraction "
+            f"V_f (0 to 1) of each of {steps:,} steps; one training (thesis Fig. 5-1 to 5-4).",
         )
     ]
 
 
-def _film(config: EvaluationConfig, found: str | Path) -> tuple[Path, list[ReportPicture]]:
-    """Films the first episodes; returns the film and the first and last view of the first one."""
-    from maniskill_tomato.experiments.film import film_episodes, make_film_options
+def _film(config: EvaluationConfig, found: str | Path) -> FilmedEpisodes:
+    """Films the first episodes, with the first and last view of the first one."""
+    from maniskill_tomato.experiments.film import film_episodes, make_film_options, poster_of
 
     count = min(config.films, config.episodes)
     logger.info("filming %d episodes", count)
@@ -289,17 +336,19 @@ def _film(config: EvaluationConfig, found: str | Path) -> tuple[Path, list[Repor
         (
             "first_view",
             first.first.wrist,
-            f"First view of the wrist camera, V_f {first.first.visible_fraction:.2f}.",
+            f"First view of the wrist camera in episode {first.seed}, V_f {first.first.visible_fraction:.2f}.",
         ),
         (
             "last_view",
             first.last.wrist,
             f"Last view, after {steps}, V_f {first.last.visible_fraction:.2f} (thesis Fig. 5-9).",
         ),
-        ("first_pose", first.first.outside, "The robot and the plant at the start."),
-        ("last_pose", first.last.outside, "At the end of the episode."),
+        ("first_pose", first.first.outside, f"The robot and the plant at the start of episode {first.seed}."),
+        ("last_pose", first.last.outside, f"At its end, after {steps}."),
     ):
         picture = config.out / f"{name}.png"
         write_picture(picture, image)
         pictures.append(ReportPicture(path=picture, caption=caption))
-    return path, pictures
+    poster = config.out / "poster.jpg"
+    write_picture(poster, poster_of(films), 88)
+    return FilmedEpisodes(video=path, poster=poster, count=count, views=pictures)

@@ -1,14 +1,26 @@
 """The report of an evaluation: one page that needs no other file."""
 
-import html
-import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+from maniskill_tomato.experiments.camera_metrics import Cause
+from maniskill_tomato.experiments.episode_listing import CAUSES, ListedEpisode, episode_list
 from maniskill_tomato.files import write_atomically
-from maniskill_tomato.report_design import figure, notice, page, paragraph, section, table, tile
+from maniskill_tomato.report_design import (
+    figure,
+    film,
+    notice,
+    page,
+    paragraph,
+    relative_path,
+    section,
+    side_by_side,
+    table,
+    tile,
+    tiles,
+)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -33,15 +45,24 @@ class ReportInput:
     evaluation: Sequence[ReportPicture] = ()
     views: Sequence[ReportPicture] = ()
     """First and last views; two by two."""
+    episodes: Sequence[ListedEpisode] = ()
+    """What became of each episode."""
     video: Path | None = None
+    poster: Path | None = None
+    """What the video shows before it plays."""
+    filmed: int = 0
+    """How many episodes it has."""
     policy: Path | None = None
     left_out: str | None = None
     """Why pictures are missing, if they are, and how to get them."""
 
 
 def write_report(path: Path, content: ReportInput) -> None:
-    """Writes the page to `path`; pictures are embedded, the video and the policy are linked."""
+    """Writes the page to `path`; pictures and a small film are embedded, a large one and the policy are named."""
     metrics = content.metrics
+    facts = dict(content.facts)
+    if content.policy is not None:
+        facts["policy"] = relative_path(content.policy, path.parent)
     text = page(
         content.title,
         f"{metrics['env_id']}, {metrics['episodes']} evaluation episodes from seed {metrics['seed']}",
@@ -49,59 +70,82 @@ def write_report(path: Path, content: ReportInput) -> None:
             _summary(metrics),
             notice(content.left_out),
             _views(content, path.parent),
+            _episodes(content),
             _gallery("Evaluation", content.evaluation, _evaluation_text(metrics)),
             _gallery("Training", content.training, "Moving averages over the whole run."),
-            section("Metrics", _table(metrics)),
-            _facts(content, path.parent),
+            section(f"Metrics, n = {metrics['episodes']} episodes", _table(metrics)),
         ],
+        facts,
     )
     write_atomically(path, text.encode())
 
 
 def _summary(metrics: Mapping[str, Any]) -> str:
-    low, high = metrics["success_rate_interval_95"]
-    tiles = (
+    count = metrics["episodes"]
+    seen, unit = f"V_f > {metrics['success_threshold']:g}", f"n = {count} episodes"
+    camera = "true_success_rate" in metrics
+    shown = [
         (
-            "success_rate",
+            "true_success_rate" if camera else "success_rate",
             "{:.0%}",
-            f"target fully visible (V_f > {metrics['success_threshold']:g})",
-            f"95 % interval {low:.0%} to {high:.0%}",
+            f"target {'truly' if camera else 'fully'} visible ({seen})",
+            unit,
         ),
-        ("mean_steps", "{:.1f}", "steps per episode", "failures count with all their steps"),
+        ("mean_steps", "{:.1f} moves", "an episode, mean", f"{unit}; failures count with all their moves"),
         (
             "mean_max_visible_fraction",
-            "{:.2f}",
-            "largest visible fraction, mean",
-            f"from {metrics['mean_initial_visible_fraction']:.2f} at the start",
+            "{:.2f} of 1",
+            "largest visible fraction V_f, mean",
+            f"{unit}; {metrics['mean_initial_visible_fraction']:.2f} at the start",
         ),
-        ("mean_path_length_m", "{:.2f} m", "way of the camera, mean", "straight lines between views"),
-    )
-    random = metrics.get("random_actions")
-    cells = [
-        tile(
-            form.format(metrics[key]),
-            label,
-            note,
-            *([f"random actions: {form.format(random[key])}"] if random else []),
-        )
-        for key, form, label, note in tiles
+        (
+            "mean_path_length_m",
+            "{:.2f} m",
+            "way of the camera an episode, mean",
+            f"{unit}; straight lines between views",
+        ),
     ]
-    return f'<section class="tiles">{"".join(cells)}</section>'
+    random = metrics.get("random_actions")
+    cells = []
+    for key, form, label, note in shown:
+        low, high = metrics.get(f"{key}_interval_95", (None, None))
+        interval = "" if low is None else f"95 % interval {form.format(low)} to {form.format(high)}"
+        baseline = f"random actions: {form.format(random[key])}" if random and key in random else ""
+        cells.append(tile(form.format(metrics[key]), label, note, interval, baseline))
+    return tiles(*cells)
 
 
 def _views(content: ReportInput, folder: Path) -> str:
     if not content.views and content.video is None:
         return ""
-    figures = "".join(figure(picture.path, picture.caption) for picture in content.views)
-    film = ""
+    figures = side_by_side(*(figure(picture.path, picture.caption) for picture in content.views))
+    shown = ""
     if content.video is not None:
-        link = html.escape(_relative(content.video, folder))
-        film = (
-            f'<video controls preload="metadata" src="{link}"></video>'
-            f'<p class="caption">The first episodes: outside on the left, the wrist camera on the right, V_f below. '
-            f'<a href="{link}">{link}</a></p>'
+        episodes = "episode" if content.filmed == 1 else f"{content.filmed} episodes"
+        shown = film(
+            content.video,
+            content.poster,
+            f"The first {episodes}: outside on the left, the wrist camera on the right, V_f (0 to 1) below.",
+            folder,
         )
-    return section("What the camera sees", f'<div class="pairs">{figures}</div>' if figures else "", film)
+    return section("What the camera sees", shown, figures)
+
+
+def _episodes(content: ReportInput) -> str:
+    if not content.episodes:
+        return ""
+    causes: Mapping[Cause, int] = content.metrics.get("failures_by_cause", {})
+    told = ", ".join(f"{CAUSES[cause]}: {count}" for cause, count in causes.items() if count)
+    return section(
+        "Episodes, failures first",
+        paragraph(
+            "V_f is the visible fraction of the target, from 0 to 1"
+            f"{', by the truth and not as the camera measured it' if causes else ''}. The command runs the episode "
+            "again, with its film where this machine can render."
+            f"{f' Failures by cause: {told}.' if told else ''}"
+        ),
+        episode_list(content.episodes),
+    )
 
 
 def _gallery(title: str, pictures: Sequence[ReportPicture], text: str) -> str:
@@ -112,24 +156,32 @@ def _gallery(title: str, pictures: Sequence[ReportPicture], text: str) -> str:
 
 def _evaluation_text(metrics: Mapping[str, Any]) -> str:
     within = metrics["success_rate_within_steps"]
-    parts = [f"{rate:.0%} after {k} step{'' if k == '1' else 's'}" for k, rate in within.items()]
+    parts = [f"{rate:.0%} after {k} move{'' if k == '1' else 's'}" for k, rate in within.items()]
     return (
         "The policy acts without exploration; every episode has its own seed. "
-        f"Share of episodes solved: {', '.join(parts[:-1])} and {parts[-1]}."
+        f"Share of n = {metrics['episodes']} episodes solved: {', '.join(parts[:-1])} and {parts[-1]}."
     )
 
 
 _ROWS = (
     ("success_rate", "Success rate", "{:.1%}"),
-    ("mean_steps", "Mean steps", "{:.2f}"),
-    ("mean_steps_success", "Mean steps of successful episodes", "{:.2f}"),
+    ("true_success_rate", "True success rate: the target truly fully visible", "{:.1%}"),
+    ("false_stop_rate", "False stops: success claimed, not true", "{:.1%}"),
+    ("true_association_success_rate", "True success rate if the truth names each detection", "{:.1%}"),
+    ("mean_steps", "Mean moves", "{:.2f}"),
+    ("mean_steps_success", "Mean moves of successful episodes", "{:.2f}"),
     ("mean_initial_visible_fraction", "Mean V_f at the start", "{:.3f}"),
     ("mean_max_visible_fraction", "Mean largest V_f", "{:.3f}"),
     ("mean_final_visible_fraction", "Mean V_f at the end", "{:.3f}"),
-    ("mean_return", "Mean return (Eq. 4-5)", "{:.2f}"),
+    ("mean_return", "Mean return", "{:.2f}"),
     ("mean_path_length_m", "Mean way of the camera [m]", "{:.2f}"),
-    ("unreachable_step_share", "Steps that asked for an unreachable pose", "{:.1%}"),
-    ("forbidden_zone_step_share", "Steps that ended in the forbidden zone", "{:.1%}"),
+    ("unreachable_step_share", "Share of moves to an unreachable pose", "{:.1%}"),
+    ("forbidden_zone_step_share", "Share of moves that ended in the forbidden zone", "{:.1%}"),
+    ("plant_contact_step_share", "Share of moves with the arm in the plant", "{:.1%}"),
+    ("target_seen_share", "Share of the rows' tomatoes that were seen", "{:.1%}"),
+    ("moves_per_seen_target", "Moves for each tomato seen", "{:.2f}"),
+    ("recall", "Recall of the seeable tomatoes in the list", "{:.1%}"),
+    ("precision", "Precision of the list", "{:.1%}"),
 )
 
 
@@ -137,20 +189,9 @@ def _table(metrics: Mapping[str, Any]) -> str:
     columns = {"policy": metrics}
     if (random := metrics.get("random_actions")) is not None:
         columns["random actions"] = random
-    rows = [
-        (label, *("none" if c[key] is None else form.format(c[key]) for c in columns.values()))
-        for key, label, form in _ROWS
-    ]
+    rows = []
+    for key, label, form in _ROWS:
+        values = [column.get(key) for column in columns.values()]
+        if any(value is not None for value in values):
+            rows.append((label, *("none" if value is None else form.format(value) for value in values)))
     return table(("", *columns), rows)
-
-
-def _facts(content: ReportInput, folder: Path) -> str:
-    rows = [f"<dt>{html.escape(k)}</dt><dd>{html.escape(v)}</dd>" for k, v in content.facts.items()]
-    if content.policy is not None:
-        link = html.escape(_relative(content.policy, folder))
-        rows.append(f'<dt>policy</dt><dd><a href="{link}">{link}</a></dd>')
-    return section("About this run", f"<dl>{''.join(rows)}</dl>")
-
-
-def _relative(path: Path, folder: Path) -> str:
-    return Path(os.path.relpath(path.resolve(), folder.resolve())).as_posix()

@@ -3,7 +3,7 @@
 import contextlib
 import functools
 import os
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -68,6 +68,8 @@ class Film:
     steps: int
     first: Snapshot
     last: Snapshot
+    threshold: float
+    """V_f above which the target counts as fully visible."""
 
 
 def make_film_options() -> dict[str, Any]:
@@ -152,7 +154,34 @@ def photograph(
     camera = camera or Photographer(env)
     (record,) = run_batch(env, policy, [seed], watcher=camera)
     first, last = camera.snapshots
-    return Film(seed=seed, success=record.success, steps=record.steps, first=first, last=last)
+    world: Any = env.unwrapped
+    return Film(
+        seed=seed,
+        success=record.success,
+        steps=record.steps,
+        first=first,
+        last=last,
+        threshold=float(world.task.full_visibility),
+    )
+
+
+def poster_of(films: Sequence[Film]) -> Image:
+    """What a film shows before it plays: the end of the first episode that was solved, else of the first one.
+
+    Args:
+        films: One or more.
+    """
+    film = next((film for film in films if film.success), films[0])
+    return annotate(
+        film.last.outside,
+        film.last.wrist,
+        title=f"episode {film.seed}",
+        step=film.steps,
+        visible_fraction=film.last.visible_fraction,
+        threshold=film.threshold,
+        moving=False,
+        success=film.success,
+    )
 
 
 class Photographer:

@@ -1,6 +1,7 @@
 """Plots of training and evaluation, the counterparts of the thesis's Figures 5-1 to 5-8."""
 
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -16,11 +17,10 @@ from numpy.typing import ArrayLike, NDArray
 from maniskill_tomato.errors import InvalidInputError
 from maniskill_tomato.experiments.episode_record import EpisodeRecord
 from maniskill_tomato.learning.rl.history import TrainingCurves
-from maniskill_tomato.report_design import INK, LEAF, MUTED, PLOT_STYLE, PLUM, SKY, STRAW, TOMATO, save_figure
+from maniskill_tomato.report_design import AXIS, CARD, INK, LEAF, MUTED, SERIES, SKY, TOMATO
+from maniskill_tomato.report_plots import PLOT_STYLE, WIDE, label_ends, line_style, save_figure
 from maniskill_tomato.robot.d435 import T_flange_camera_color_optical, color_intrinsics
 from maniskill_tomato.robot.kinematics import viewpoint_transform
-
-_SEED_COLOURS = (SKY, STRAW, LEAF, PLUM, TOMATO, "#4aa3a2", "#7a5230", "#5b6770")
 
 FRUSTUM_DEPTH = 0.11
 """Length of a drawn camera, in [m]."""
@@ -28,9 +28,34 @@ FRUSTUM_DEPTH = 0.11
 SHOWN_TRAJECTORIES = 3
 
 
+@dataclass(frozen=True, kw_only=True)
+class Outcome:
+    """How episodes of one outcome look, so that colour is not needed to tell them apart."""
+
+    name: str
+    colour: str
+    marker: str
+    hatch: str
+
+
+OUTCOMES = {
+    True: Outcome(name="target fully visible", colour=LEAF, marker="o", hatch=""),
+    False: Outcome(name="not", colour=TOMATO, marker="X", hatch="/////"),
+}
+
+_ABOVE: dict[str, Any] = {
+    "loc": "lower right",
+    "bbox_to_anchor": (1.0, 1.0),
+    "ncols": 3,
+    "borderaxespad": 0.2,
+    "handletextpad": 0.3,
+}
+"""Where a plot of episodes has its key."""
+
+
 def seed_colour(index: int) -> str:
     """One colour for each training seed, reused beyond eight."""
-    return _SEED_COLOURS[index % len(_SEED_COLOURS)]
+    return SERIES[index % len(SERIES)]
 
 
 def moving_average(values: ArrayLike, window: int) -> NDArray[np.float64]:
@@ -84,16 +109,19 @@ def plot_training_curves(
         ("Step visible fraction", lambda c: c.step_visible_fraction, "step", TOMATO),
     )
     with mpl.rc_context(PLOT_STYLE):
-        figure = Figure(figsize=(9.0, 5.6 if len(several) == 1 else 5.8))
+        figure = Figure(figsize=(WIDE[0], 5.6))
         for axes, (title, values_of, unit, colour) in zip(figure.subplots(2, 2).flat, panels, strict=True):
             window = windows[0 if unit == "episode" else 1]
             most = 1
+            ends: dict[str, tuple[float, float]] = {}
             for index, (label, curves) in enumerate(several.items()):
                 values = values_of(curves)
                 most = max(most, len(values))
-                if len(several) > 1:
-                    colour = seed_colour(index)
-                axes.plot(*averaged_curve(values, window), color=colour, linewidth=1.5, label=label)
+                at, average = averaged_curve(values, window)
+                style = {"color": colour, "linewidth": 1.5}
+                axes.plot(at, average, **(line_style(index, len(at)) if len(several) > 1 else style))
+                if len(several) > 1 and len(at):
+                    ends[label] = (float(at[-1]), float(average[-1]))
             for caption, place in marks(unit).items():
                 _mark(axes, place, caption)
             axes.set_title(title)
@@ -101,40 +129,57 @@ def plot_training_curves(
             axes.set_title(note, loc="right", fontsize=8.5, fontweight="normal", color=MUTED)
             axes.set_xlabel(unit)
             axes.xaxis.set_major_locator(MaxNLocator(nbins=6, integer=True))
-        if len(several) > 1:
-            handles, labels = figure.axes[0].get_legend_handles_labels()
-            figure.legend(handles, labels, loc="outside lower center", ncols=len(labels))
+            label_ends(axes, ends)
         save_figure(figure, path)
 
 
 def plot_steps(episodes: Sequence[EpisodeRecord], path: Path) -> None:
     """Steps that each episode needed (Fig. 5-6)."""
     with mpl.rc_context(PLOT_STYLE):
-        figure = Figure(figsize=(9.0, 2.9))
+        figure = Figure(figsize=WIDE)
         axes = figure.subplots()
-        colours = [LEAF if e.success else TOMATO for e in episodes]
-        axes.bar(np.arange(1, len(episodes) + 1), [e.steps for e in episodes], color=colours, width=0.78)
+        for solved, look in OUTCOMES.items():
+            some = [k for k, e in enumerate(episodes) if e.success == solved]
+            axes.bar(
+                [k + 1 for k in some],
+                [episodes[k].steps for k in some],
+                width=0.78,
+                facecolor=look.colour if solved else CARD,
+                edgecolor=look.colour,
+                hatch=look.hatch,
+                linewidth=0.8,
+                label=f"{look.name} ({len(some)})",
+            )
         axes.set_title("Steps per episode")
         axes.set_xlabel("episode")
         axes.xaxis.set_major_locator(MaxNLocator(integer=True))
         axes.set_ylabel("steps")
         axes.yaxis.set_major_locator(MaxNLocator(integer=True))
-        _outcome_legend(axes)
+        axes.legend(**_ABOVE)
         save_figure(figure, path)
 
 
 def plot_visible_fraction(episodes: Sequence[EpisodeRecord], threshold: float, path: Path) -> None:
     """Visible fraction at the start and the largest one reached, for each episode (Fig. 5-7)."""
     with mpl.rc_context(PLOT_STYLE):
-        figure = Figure(figsize=(9.0, 2.9))
+        figure = Figure(figsize=WIDE)
         axes = figure.subplots()
         index = np.arange(1, len(episodes) + 1)
         start = [e.visible_fraction[0] for e in episodes]
         largest = [e.max_visible_fraction for e in episodes]
-        colours = [LEAF if e.success else TOMATO for e in episodes]
-        axes.vlines(index, start, largest, color="#c5cec7", linewidth=1.4, zorder=1)
-        axes.scatter(index, start, s=12, color="#a7b2aa", zorder=2, label="start")
-        axes.scatter(index, largest, s=18, c=colours, zorder=3)
+        axes.vlines(index, start, largest, color=AXIS, linewidth=1.2, zorder=1)
+        axes.scatter(index, start, s=14, marker="_", color=MUTED, zorder=2, label="start")
+        for solved, look in OUTCOMES.items():
+            some = [k for k, e in enumerate(episodes) if e.success == solved]
+            axes.scatter(
+                [k + 1 for k in some],
+                [largest[k] for k in some],
+                s=24,
+                marker=look.marker,
+                color=look.colour,
+                zorder=3,
+                label=f"{look.name} ({len(some)})",
+            )
         axes.axhline(threshold, color=INK, linewidth=1.0, linestyle=(0, (4, 3)))
         axes.annotate(
             f"fully visible, V_f > {threshold:g}",
@@ -151,7 +196,7 @@ def plot_visible_fraction(episodes: Sequence[EpisodeRecord], threshold: float, p
         axes.set_xlabel("episode")
         axes.xaxis.set_major_locator(MaxNLocator(integer=True))
         axes.set_ylabel("V_f")
-        _outcome_legend(axes)
+        axes.legend(**_ABOVE)
         save_figure(figure, path)
 
 
@@ -183,16 +228,7 @@ def plot_trajectories(episodes: Sequence[EpisodeRecord], title: str, path: Path)
                 label = f"episode {index + 1}: {episode.steps} steps, " + (
                     "solved" if episode.success else "not solved"
                 )
-                space.plot(
-                    x,
-                    y,
-                    z,
-                    color=seed_colour(index),
-                    linewidth=1.4,
-                    marker="o",
-                    markersize=2.5,
-                    label=label,
-                )
+                space.plot(x, y, z, **{**line_style(index), "markeredgewidth": 0.0}, label=label)
                 for camera, opacity in zip(cameras, camera_opacities(len(cameras)), strict=True):
                     space.add_collection3d(
                         Poly3DCollection(
@@ -203,7 +239,7 @@ def plot_trajectories(episodes: Sequence[EpisodeRecord], title: str, path: Path)
                             alpha=opacity,
                         )
                     )
-            space.scatter(*targets.T, s=70, color=TOMATO, label="target")
+            space.scatter(*targets.T, s=90, color=TOMATO, marker="P", label="target")
             space.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), zlim=(low[2], high[2]))
             space.set_box_aspect(high - low, zoom=0.9)
             space.view_init(elevation, azimuth)
@@ -256,12 +292,6 @@ def frustum_faces(points: NDArray[np.float64]) -> list[NDArray[np.float64]]:
 def plot_title(figure: Figure, title: str) -> None:
     """What all panels of a figure show, above them."""
     figure.suptitle(title[0].upper() + title[1:], fontsize=11, color=INK, x=0.01, ha="left")
-
-
-def _outcome_legend(axes: Axes) -> None:
-    for colour, name in ((LEAF, "target fully visible"), (TOMATO, "not")):
-        axes.scatter([], [], s=28, marker="s", color=colour, label=name)
-    axes.legend(loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=3, borderaxespad=0.2, handletextpad=0.3)
 
 
 def _mark(axes: Axes, x: float, text: str) -> None:

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
+from tqdm import tqdm
 
 from maniskill_tomato.errors import InvalidInputError
 from maniskill_tomato.experiments.episode_record import EpisodeRecord
@@ -132,14 +133,17 @@ def run_policies(
         return
     logger.info("%d episodes to run", total)
     started, told, done = time.monotonic(), 0.0, 0
-    for block, results in run_jobs(run_block, blocks, processes):
-        for label, episodes in results.items():
-            store.add_episodes(block.condition.name, label, episodes)
-        done += block.episodes
-        if time.monotonic() - told > LINE_SECONDS:
-            told = time.monotonic()
-            left = (told - started) / done * (total - done)
-            logger.info("%d of %d episodes, about %.0f minutes left", done, total, left / 60.0)
+    with tqdm(total=total, unit="episode", disable=None) as bar:
+        for block, results in run_jobs(run_block, blocks, processes):
+            for label, episodes in results.items():
+                store.add_episodes(block.condition.name, label, episodes)
+            bar.update(block.episodes)
+            done += block.episodes
+            # Where nobody watches a bar, a log gets a line now and then.
+            if bar.disable and time.monotonic() - told > LINE_SECONDS:
+                told = time.monotonic()
+                left = (told - started) / done * (total - done)
+                logger.info("%d of %d episodes, about %.0f minutes left", done, total, left / 60.0)
 
 
 def run_block(block: EpisodeBlock) -> dict[str, list[EpisodeRecord]]:

@@ -1,7 +1,6 @@
 """Runs compared: grouped by configuration over seeds, with interquartile means, intervals, curves and a page."""
 
 import json
-import textwrap
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -10,9 +9,7 @@ from typing import Any
 import matplotlib as mpl
 import numpy as np
 import torch
-from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.lines import Line2D
 
 import maniskill_tomato
 from maniskill_tomato.errors import InvalidInputError
@@ -30,23 +27,30 @@ from maniskill_tomato.files import write_atomically, write_json
 from maniskill_tomato.learning.rl.presets import PRESETS, TrainConfig, modernise
 from maniskill_tomato.report_design import (
     MUTED,
-    PLOT_STYLE,
-    SERIES,
     figure,
     markdown_table,
     page,
     paragraph,
-    save_figure,
+    percent,
     section,
+    side_by_side,
     table,
+    tile,
+    tiles,
 )
+from maniskill_tomato.report_plots import (
+    MOST_LINES,
+    PLOT_STYLE,
+    label_ends,
+    line_style,
+    panel_size,
+    save_figure,
+)
+from maniskill_tomato.run_facts import run_facts
 
 CURVE_POINTS = 120
 CURVE_WINDOW = 0.05
 """Share of the axis that a training curve averages over."""
-
-LABEL_WIDTH = 46
-LEGEND_ROWS_PER_INCH = 4.0
 
 HEAD = ("task", "configuration", "seeds", "success", "mean steps", "training steps", "training time")
 
@@ -116,7 +120,7 @@ class Comparison:
 
 
 def compare_runs(config: RunComparisonConfig) -> Comparison:
-    """Compares training runs; writes comparison.json, comparison.md, curves-TASK.png and report.html.
+    """Compares training runs; writes comparison.json, curves-TASK-N.png and report.html.
 
     Raises:
         InvalidInputError: A folder holds no run, or a run cannot be read, compared or evaluated.
@@ -143,14 +147,13 @@ def make_rows(groups: Sequence[Group]) -> list[ComparisonRow]:
 
 
 def write_comparison(groups: Sequence[Group], out: Path) -> Comparison:
-    """Writes comparison.json, comparison.md, curves-TASK.png and report.html into `out`."""
+    """Writes comparison.json, curves-TASK-N.png and report.html into `out`."""
     out.mkdir(parents=True, exist_ok=True)
     rows = make_rows(groups)
     pictures = []
     for env_id in dict.fromkeys(group.env_id for group in groups):
-        path = out / f"curves-{env_id}.png"
-        plot_curves([group for group in groups if group.env_id == env_id], path)
-        pictures.append((env_id, path))
+        of_task = [group for group in groups if group.env_id == env_id]
+        pictures.append((of_task, plot_curves(of_task, out / f"curves-{env_id}.png")))
     note = evaluation_note(groups)
     content = {
         "package_version": maniskill_tomato.__version__,
@@ -173,12 +176,9 @@ def write_comparison(groups: Sequence[Group], out: Path) -> Comparison:
     }
     write_json(out / "comparison.json", content)
     cells = [_cells(row) for row in rows]
-    markdown = markdown_table(HEAD, cells)
-    shown = "".join(f"\n![Training curves of {env_id}]({path.name})\n" for env_id, path in pictures)
-    write_atomically(out / "comparison.md", f"{markdown}\n\n{METHOD} {note}\n{shown}".encode())
     report = out / "report.html"
-    write_atomically(report, _page(cells, groups, pictures, note).encode())
-    return Comparison(table=markdown, report=report)
+    write_atomically(report, _page(cells, rows, groups, pictures, note).encode())
+    return Comparison(table=markdown_table(HEAD, cells), report=report)
 
 
 def evaluation_note(groups: Sequence[Group]) -> str:
@@ -201,36 +201,62 @@ def evaluation_note(groups: Sequence[Group]) -> str:
     return " ".join(parts)
 
 
-def plot_curves(groups: Sequence[Group], path: Path) -> None:
-    """Success and length of training episodes over environment steps and over training time, with 95 % bands."""
-    labels = [textwrap.fill(group.label, LABEL_WIDTH) for group in groups]
-    legend = sum(label.count("\n") + 1 for label in labels) / LEGEND_ROWS_PER_INCH / 2 + 0.3
-    panels = (("Training success", "success", 1.0), ("Steps per training episode", "steps", None))
-    with mpl.rc_context(PLOT_STYLE):
-        canvas = Figure(figsize=(9.0, 5.4 + legend))
-        for row, (title, column, top) in zip(canvas.subplots(2, 2), panels, strict=True):
-            for axes, wall_time in zip(row, (False, True), strict=True):
-                empty = [_draw_curve(axes, group, column, wall_time, i) for i, group in enumerate(groups)]
-                axes.set_title(title)
-                axes.set_xlabel("training time [s]" if wall_time else "environment steps")
-                axes.set_xlim(left=0.0)
-                axes.set_ylim(bottom=0.0, top=top and 1.04 * top)
-                if all(empty):
-                    axes.text(0.5, 0.5, "not logged", transform=axes.transAxes, ha="center", color=MUTED)
-        handles = [Line2D([], [], color=SERIES[i % len(SERIES)]) for i in range(len(groups))]
-        canvas.legend(handles, labels, loc="outside lower center", ncols=2)
-        save_figure(canvas, path)
+PANELS = (
+    ("success", False, "Training success", "environment steps", "share of episodes"),
+    ("success", True, "Training success", "training time [s]", "share of episodes"),
+    ("steps", False, "Steps per training episode", "environment steps", "steps"),
+    ("steps", True, "Steps per training episode", "training time [s]", "steps"),
+)
+"""The plots of a task: column of episodes.csv, whether over time, title, and names of both axes."""
 
 
-def _draw_curve(axes: Axes, group: Group, column: str, wall_time: bool, index: int) -> bool:
-    """One line with its band; whether there was nothing to draw."""
-    curve = training_curve(group, column, wall_time)
-    if curve is None:
-        return True
-    colour = SERIES[index % len(SERIES)]
-    axes.fill_between(curve.at, curve.low, curve.high, color=colour, alpha=0.18, linewidth=0.0)
-    axes.plot(curve.at, curve.mean, color=colour, linewidth=1.6)
-    return False
+def plot_curves(groups: Sequence[Group], path: Path) -> list[Path]:
+    """Success and length of training episodes over environment steps and over training time, with 95 % bands.
+
+    Args:
+        groups: The configurations of a task. At most `MOST_LINES` of them are drawn, those that succeed most.
+        path: The name of the pictures; each gets its number before the ending.
+
+    Returns:
+        The four pictures.
+    """
+    drawn = best_groups(groups)
+    written = []
+    for number, (column, wall_time, title, x_label, y_label) in enumerate(PANELS, start=1):
+        with mpl.rc_context(PLOT_STYLE):
+            canvas = Figure(figsize=panel_size(group.label for group in drawn))
+            axes = canvas.subplots()
+            ends: dict[str, tuple[float, float]] = {}
+            for index, group in enumerate(drawn):
+                curve = training_curve(group, column, wall_time)
+                if curve is None:
+                    continue
+                style = line_style(index, len(curve.at))
+                axes.fill_between(
+                    curve.at, curve.low, curve.high, color=style["color"], alpha=0.15, linewidth=0.0
+                )
+                axes.plot(curve.at, curve.mean, **style)
+                ends[group.label] = (float(curve.at[-1]), float(curve.mean[-1]))
+            axes.set(title=title, xlabel=x_label, ylabel=y_label)
+            axes.set_xlim(left=0.0)
+            axes.set_ylim(bottom=0.0, top=1.04 if column == "success" else None)
+            if not ends:
+                axes.text(0.5, 0.5, "not logged", transform=axes.transAxes, ha="center", color=MUTED)
+            label_ends(axes, ends)
+            written.append(path.with_name(f"{path.stem}-{number}{path.suffix}"))
+            save_figure(canvas, written[-1])
+    return written
+
+
+def best_groups(groups: Sequence[Group]) -> list[Group]:
+    """At most `MOST_LINES` of the configurations, those that succeed most in evaluation, in the given order."""
+
+    def success(group: Group) -> float:
+        scores = group.scores("success_rate")
+        return float(scores.mean()) if len(scores) else -1.0
+
+    kept = sorted(range(len(groups)), key=lambda i: -success(groups[i]))[:MOST_LINES]
+    return [groups[i] for i in sorted(kept)]
 
 
 def _row(task: str, groups: Sequence[Group]) -> ComparisonRow:
@@ -382,7 +408,11 @@ def _short(value: object) -> str:
 
 
 def _page(
-    cells: Sequence[Sequence[str]], groups: Sequence[Group], pictures: Sequence[tuple[str, Path]], note: str
+    cells: Sequence[Sequence[str]],
+    rows: Sequence[ComparisonRow],
+    groups: Sequence[Group],
+    pictures: Sequence[tuple[Sequence[Group], Sequence[Path]]],
+    note: str,
 ) -> str:
     runs = [(group, run) for group in groups for run in group.runs]
     lines = [
@@ -394,26 +424,64 @@ def _page(
             "not evaluated" if run.metrics is None else f"{run.metrics['mean_steps']:.2f}",
             "not known" if run.training_steps is None else f"{run.training_steps:,}",
             "not logged" if run.training_seconds is None else f"{run.training_seconds:.0f} s",
+            "" if run.metrics is None else str(run.metrics["episodes"]),
         )
         for group, run in runs
-    ]
-    curves = [
-        section(
-            env_id,
-            figure(
-                path,
-                f"Training on {env_id}: interquartile mean over the seeds and pointwise 95 % interval. Each point is "
-                "the mean of the episodes that ended in the twentieth of the axis before it, exploration included.",
-            ),
-        )
-        for env_id, path in pictures
     ]
     return page(
         "Comparison of training runs",
         f"{len(runs)} runs of {len(groups)} configurations",
         [
-            section("Results", table(HEAD, cells), paragraph(f"{METHOD} {note}", "caption")),
-            *curves,
-            section("Runs", table((*HEAD[:2], "seed", *HEAD[3:]), lines)),
+            _tiles(rows),
+            section(
+                f"Results, n = {len(runs)} runs",
+                table(HEAD, cells, words=(1,)),
+                paragraph(f"{METHOD} {note}", "caption"),
+            ),
+            *(_curves_section(of_task, paths) for of_task, paths in pictures),
+            section("Runs", table((*HEAD[:2], "seed", *HEAD[3:], "episodes"), lines, words=(1,), tall=True)),
         ],
+        run_facts(),
+    )
+
+
+def _tiles(rows: Sequence[ComparisonRow]) -> str:
+    """The best configuration of each task."""
+    cells = []
+    for task in dict.fromkeys(row.task for row in rows):
+        judged = [(row, row.success_rate) for row in rows if row.task == task and row.success_rate]
+        if judged:
+            best, success = max(judged, key=lambda pair: pair[1].estimate)
+            low, high = success.low, success.high
+            cells.append(
+                tile(
+                    percent(success.estimate, 0),
+                    f"success on {task}, best configuration: {best.label}",
+                    f"interquartile mean over n = {len(best.seeds)} seed{'' if len(best.seeds) == 1 else 's'}",
+                    "" if low is None or high is None else f"95 % interval {percent(low)} to {percent(high)}",
+                )
+            )
+    return tiles(*cells) if cells else ""
+
+
+def _curves_section(groups: Sequence[Group], paths: Sequence[Path]) -> str:
+    drawn = best_groups(groups)
+    seeds = " or ".join(str(count) for count in sorted({len(group.runs) for group in drawn}))
+    left = f" The {len(drawn)} best of {len(groups)} configurations; the table names all." * (
+        len(drawn) < len(groups)
+    )
+    how = f"interquartile mean over n = {seeds} seeds a configuration, pointwise 95 % interval.{left}"
+    return section(
+        groups[0].env_id,
+        side_by_side(
+            *(
+                figure(path, f"{title} [{y_label}] over {x_label}: {how}")
+                for path, (_, _, title, x_label, y_label) in zip(paths, PANELS, strict=True)
+            )
+        ),
+        paragraph(
+            "Each point is the mean of the training episodes that ended in the twentieth of the axis before it, "
+            "exploration included.",
+            "caption",
+        ),
     )

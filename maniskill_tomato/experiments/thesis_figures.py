@@ -27,7 +27,8 @@ from maniskill_tomato.learning.rl.history import load_history
 from maniskill_tomato.plants.organs import SemanticClass
 from maniskill_tomato.plants.spec import PlantPose, PlantSpec
 from maniskill_tomato.rendering import vulkan_probe
-from maniskill_tomato.report_design import INK, MUTED, PLOT_STYLE, TOMATO, save_figure
+from maniskill_tomato.report_design import CARD, INK, MUTED, TOMATO
+from maniskill_tomato.report_plots import PLOT_STYLE, label_ends, line_style, save_figure
 from maniskill_tomato.segmentation.datasets.picture_files import write_picture
 from maniskill_tomato.tasks.plant_batch import grow
 from maniskill_tomato.tasks.thesis.thesis_config import ViewpointTaskConfig, guided_task, sparse_task
@@ -125,25 +126,24 @@ def plot_evaluation(
             (("steps", "steps"), ("largest V_f", "max_visible_fraction"))
         ):
             few, many = grid[row]
+            ends: dict[str, tuple[float, float]] = {}
             for index, (seed, episodes) in enumerate(runs.items()):
                 first = episodes[:THESIS_EPISODES]
+                style = line_style(index, len(episodes))
                 few.scatter(
                     np.arange(1, len(first) + 1) + offsets[index],
                     [getattr(e, attribute) for e in first],
                     s=30,
-                    facecolors=[seed_colour(index) if e.success else "white" for e in first],
+                    marker=style["marker"],
+                    facecolors=[seed_colour(index) if e.success else CARD for e in first],
                     edgecolors=seed_colour(index),
                     linewidths=1.3,
                     zorder=3,
                 )
                 solved = sum(e.success for e in episodes)
-                many.plot(
-                    np.arange(1, len(episodes) + 1),
-                    sorted(getattr(e, attribute) for e in episodes),
-                    color=seed_colour(index),
-                    linewidth=1.5,
-                    label=f"seed {seed}: {solved} of {len(episodes)} solved",
-                )
+                values = sorted(getattr(e, attribute) for e in episodes)
+                many.plot(np.arange(1, len(episodes) + 1), values, **style)
+                ends[f"seed {seed}: {solved} of {len(episodes)} solved"] = (len(episodes), float(values[-1]))
             few.set(xlabel="episode", ylabel=name)
             few.xaxis.set_major_locator(MaxNLocator(integer=True))
             many.set(xlabel="episodes, sorted", ylabel=name)
@@ -153,11 +153,10 @@ def plot_evaluation(
                 else:
                     axes.set_ylim(-0.03, 1.05)
                     axes.axhline(threshold, color=INK, linewidth=1.0, linestyle=(0, (4, 3)))
+            label_ends(many, ends)
         grid[0][0].set_title(f"First {THESIS_EPISODES} episodes (filled: solved)")
         grid[0][1].set_title(f"All {count} episodes")
-        handles, labels = grid[0][1].get_legend_handles_labels()
         plot_title(figure, title)
-        figure.legend(handles, labels, loc="outside lower center", ncols=min(len(labels), 3))
         save_figure(figure, path)
 
 
@@ -208,7 +207,10 @@ def _draw_plant(
     order = np.argsort(towards_viewer * corners[:, :, depth_axis].mean(axis=1))
     axes.add_collection(
         PolyCollection(
-            list(corners[order][:, :, list(shown)]), facecolors=[colours[i] for i in order], edgecolors="none"
+            list(corners[order][:, :, list(shown)]),
+            facecolors=[colours[i] for i in order],
+            edgecolors="none",
+            rasterized=True,
         )
     )
 

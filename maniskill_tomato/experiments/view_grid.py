@@ -14,7 +14,8 @@ from maniskill_tomato.experiments.episode_record import EpisodeRecord
 from maniskill_tomato.experiments.film import Image, make_film_options, wrist_picture
 from maniskill_tomato.experiments.policy_runs import Condition
 from maniskill_tomato.learning.rl.envs import make_env
-from maniskill_tomato.report_design import LEAF, PLOT_STYLE, TOMATO, save_figure
+from maniskill_tomato.report_design import LEAF, TOMATO
+from maniskill_tomato.report_plots import PLOT_STYLE, save_figure
 
 EPISODES = 5
 SHRINK = 2

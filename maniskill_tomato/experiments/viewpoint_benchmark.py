@@ -1,6 +1,7 @@
 """The benchmark: policies on the same held-out episodes, and sweeps over one difficulty at a time."""
 
 import os
+import shlex
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -8,9 +9,15 @@ from typing import Any
 
 import maniskill_tomato
 from maniskill_tomato.errors import InvalidInputError
-from maniskill_tomato.experiments.benchmark_report import BenchmarkFigures, summarise_runs, write_benchmark
+from maniskill_tomato.experiments.benchmark_report import (
+    BenchmarkFigures,
+    BenchmarkInput,
+    summarise_runs,
+    write_benchmark,
+)
 from maniskill_tomato.experiments.certified_episodes import PlantPlace, certified_list, parse_place
 from maniskill_tomato.experiments.configs import BenchmarkConfig
+from maniskill_tomato.experiments.episode_listing import replay_with_eval
 from maniskill_tomato.experiments.policy_runs import Condition, PolicySpec, parse_policies, run_policies
 from maniskill_tomato.experiments.result_store import ResultStore
 from maniskill_tomato.experiments.view_grid import draw_view_grid
@@ -50,13 +57,13 @@ class BenchmarkResult:
     table: str
     """The main table, as Markdown."""
     page: Path
-    """benchmark.md."""
+    """report.html."""
     left_out: str | None
     """Which picture is missing and how to get it; None if none is."""
 
 
 def run_benchmark(config: BenchmarkConfig) -> BenchmarkResult:
-    """Runs what is missing, and writes benchmark.json, benchmark_details.json, benchmark.md and the plots.
+    """Runs what is missing, and writes benchmark.json, benchmark_details.json, the plots and report.html.
 
     Stopped at any time, a second call goes on.
 
@@ -100,17 +107,43 @@ def _run_benchmark(config: BenchmarkConfig) -> BenchmarkResult:
     elif problem is not None:
         left_out = LEFT_OUT.format(hint=problem)
     figures = summarise_runs(runs, (main, *swept), task.max_moves)
-    table, page = write_benchmark(
-        figures,
-        runs[main.name],
-        config.out,
+    sources = {spec.label: spec.source for spec in specs}
+
+    def replay(label: str, seed: int) -> str:
+        again = replay_with_eval(main.env_id, sources[label], seed, main.env_options)
+        return _replay(config, sources[label], seed) if again is None or config.contact_free_oracle else again
+
+    content = BenchmarkInput(
+        runs=runs[main.name],
         threshold=task.full_visibility,
         horizon=task.max_moves,
         privileged=[spec.label for spec in specs if spec.source in PRIVILEGED],
         facts={"first episode": config.seed, "processes": processes, **facts},
         pictures=pictures,
+        left_out=left_out,
+        replay=replay,
     )
+    table, page = write_benchmark(figures, content, config.out)
     return BenchmarkResult(figures=figures, table=table, page=page, left_out=left_out)
+
+
+def _replay(config: BenchmarkConfig, source: str, seed: int) -> str:
+    """The benchmark of one episode, where `eval` has no flag for its plants."""
+    words = [
+        "benchmark",
+        "--policies",
+        source,
+        "--seed",
+        str(seed),
+        "--episodes",
+        "1",
+        "--out",
+        f"runs/again-{seed}",
+    ]
+    flags = [] if config.plants is None else ["--plants", config.plants]
+    if config.contact_free_oracle:
+        flags += ["--episode-list", config.episode_list, "--contact-free-oracle"]
+    return shlex.join(["maniskill-tomato", *words, *flags])
 
 
 def _open_store(config: BenchmarkConfig, specs: Sequence[PolicySpec], **settings: Any) -> ResultStore:

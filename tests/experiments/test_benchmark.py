@@ -9,11 +9,13 @@ from typing import Any, cast
 import numpy as np
 import pytest
 import torch
+from matplotlib.figure import Figure
+from matplotlib.text import Text
 from torch import Tensor
 
 from maniskill_tomato.errors import InvalidInputError, PolicyError, TomatoError
 from maniskill_tomato.experiments import policy_runs
-from maniskill_tomato.experiments.benchmark_report import summarise_runs, write_benchmark
+from maniskill_tomato.experiments.benchmark_report import BenchmarkInput, summarise_runs, write_benchmark
 from maniskill_tomato.experiments.configs import BenchmarkConfig
 from maniskill_tomato.experiments.episode_record import EpisodeRecord, RowSearch
 from maniskill_tomato.experiments.metrics import compare_policies, summarise_policy
@@ -27,6 +29,7 @@ from maniskill_tomato.experiments.viewpoint_benchmark import (
     sweep_conditions,
 )
 from maniskill_tomato.plants.episode_list import load_episodes, write_episodes
+from maniskill_tomato.report_plots import MOST_LINES, clipped_texts
 
 HORIZON = 20
 
@@ -359,9 +362,15 @@ def test_the_results_are_written(tmp_path: Path) -> None:
     swept = Condition(name="leaf_density_1", axis="leaf_density", value=1.0)
     main = main_condition()
     figures = summarise_runs({main.name: runs, swept.name: {"fast": runs["fast"]}}, (main, swept), HORIZON)
-    table, page = write_benchmark(
-        figures, runs, tmp_path, threshold=0.8, horizon=HORIZON, privileged=["fast"], facts={"processes": 2}
+    content = BenchmarkInput(
+        runs=runs,
+        threshold=0.8,
+        horizon=HORIZON,
+        privileged=["fast"],
+        facts={"processes": 2},
+        replay=lambda policy, seed: f"again {policy} {seed}",
     )
+    table, page = write_benchmark(figures, content, tmp_path)
     rows = json.loads((tmp_path / "benchmark.json").read_text())
     assert [row["policy"] for row in rows] == ["fast", "slow"]
     for key in ("success_rate", "mean_moves", "mean_path_m", "decision_ms"):
@@ -371,12 +380,44 @@ def test_the_results_are_written(tmp_path: Path) -> None:
     assert details["tests"][0]["moves_difference"] < 0
     assert details["sweeps"][0]["axis"] == "leaf_density"
     text = page.read_text()
-    assert "| fast * | 100.0 % |" in text and table in text
-    assert "25.0 %" in text
-    assert "## Sweep: leaf density" in text
-    for name in ("progress.png", "thresholds.png", "sweeps.png"):
-        assert f"({name})" in text
+    assert "| fast * | 100.0 % |" in table
+    assert '<th scope="row">fast *</th><td>100.0 %</td>' in text and "<td>25.0 %</td>" in text
+    assert "<h2>Sweep: leaf density</h2>" in text and "n = 40 episodes a point" in text
+    assert "<code>again slow 7</code>" in text and "<dt>processes</dt><dd>2</dd>" in text
+    assert text.count("<svg") == 4
+    for name in ("progress.png", "best_view.png", "thresholds.png", "sweep_leaf_density.png"):
         assert (tmp_path / name).stat().st_size > 5000
+
+
+def test_plots_draw_the_best_policies_alone_and_cut_no_name(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    drawn: list[Figure] = []
+    savefig = Figure.savefig
+    monkeypatch.setattr(Figure, "savefig", lambda self, *a, **k: (drawn.append(self), savefig(self, *a, **k)))
+    names = [f"a policy with a long name, number {k:02d}" for k in range(12)]
+    runs = {
+        name: [episode(i, [0.1] * 3 + [0.9 if i >= k else 0.2], success=i >= k) for i in range(20)]
+        for k, name in enumerate(names)
+    }
+    main = main_condition()
+    swept = [Condition(name=f"pose_{v}", axis="pose", value=v) for v in (0.0, 0.01)]
+    every = {main.name: runs, **{condition.name: runs for condition in swept}}
+    figures = summarise_runs(every, (main, *swept), HORIZON)
+    _, page = write_benchmark(figures, BenchmarkInput(runs=runs, threshold=0.8, horizon=HORIZON), tmp_path)
+    told = {figure: {t.get_text().replace("\n", " ") for t in figure.findobj(Text)} for figure in drawn}
+    assert len(told) == 4
+    for figure, texts in told.items():
+        assert clipped_texts(figure) == []
+        named = [name for name in names if name in texts]
+        sweep = len(figure.axes) > 1
+        assert named == (names if sweep else names[:MOST_LINES])
+        for axes in figure.axes:
+            lines = [line for line in axes.lines if len(line.get_xdata()) > 2]
+            looks = [(str(line._unscaled_dash_pattern), line.get_marker()) for line in lines]
+            assert sweep or (len(looks) == MOST_LINES and len(set(looks)) == MOST_LINES)
+            assert axes.get_legend() is None
+    assert "The 8 best of 12 policies; the table names all." in page.read_text()
 
 
 def test_sweeps_need_a_list_of_the_package(tmp_path: Path) -> None:

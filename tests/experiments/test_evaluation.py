@@ -251,14 +251,13 @@ def report(tmp_path: Path, **changes: Any) -> str:
 
 
 def test_the_report_needs_no_other_file_for_its_pictures(tmp_path: Path) -> None:
+    (tmp_path / "video.mp4").write_bytes(b"film")
     page = report(tmp_path, video=tmp_path / "video.mp4", policy=tmp_path / "run/policy.pt")
-    assert "A &lt;report&gt;" in page and "Steps &amp; more" in page
-    assert all(
-        source.startswith("data:image/png;base64,") for source in re.findall(r'<img[^>]*src="([^"]*)"', page)
-    )
+    assert "A &lt;report&gt;" in page and "Steps &amp; more" in page and "<svg" in page
+    assert set(re.findall(r'src="([^"]{0,15})', page)) == {"data:video/mp4;"}
     assert not re.search(r"(src|href)=.(https?:|//|/)", page)
-    assert 'href="video.mp4"' in page and 'href="run/policy.pt"' in page
-    assert "67%" in page and "95 % interval 21% to 94%" in page
+    assert 'href="video.mp4"' in page and "<dd>run/policy.pt</dd>" in page
+    assert "67%" in page and "95 % interval 21% to 94%" in page and page.count("n = 3 episodes") >= 5
 
 
 def test_the_report_says_what_was_left_out(tmp_path: Path) -> None:
