@@ -205,7 +205,7 @@ def clipped_texts(figure: "Figure") -> list[str]:
     # Numbers of ticks beyond the limits exist, but are not drawn.
     undrawn = set()
     for axes in figure.axes:
-        for axis in axes._axis_map.values():  # type: ignore[attr-defined]
+        for axis in axes._axis_map.values():
             low, high = sorted(axis.get_view_interval())
             for tick in (*axis.get_major_ticks(), *axis.get_minor_ticks()):
                 if not low <= tick.get_loc() <= high:

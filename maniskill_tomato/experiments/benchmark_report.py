@@ -217,19 +217,7 @@ def _page(
         if figures.tests
         else ""
     )
-    listed = [
-        episode_list(
-            list_episodes(
-                found,
-                content.threshold,
-                content.horizon,
-                lambda seed, label=label: content.replay(label, seed),
-            ),
-            label,
-        )
-        for label, found in content.runs.items()
-        if found
-    ]
+    listed = [_listed(label, found, content) for label, found in content.runs.items() if found]
     return page(
         "Benchmark of policies",
         f"{len(rows)} policies on the same {episodes} episodes, at most {content.horizon} moves, success at "
@@ -267,6 +255,13 @@ def _page(
         ],
         facts,
     )
+
+
+def _listed(label: str, episodes: Sequence[EpisodeRecord], content: BenchmarkInput) -> str:
+    def command(seed: int) -> str | None:
+        return content.replay(label, seed)
+
+    return episode_list(list_episodes(episodes, content.threshold, content.horizon, command), label)
 
 
 def _tiles(rows: Sequence[Mapping[str, Any]], privileged: Sequence[str]) -> str:
@@ -390,7 +385,7 @@ def plot_sweep(rows: Sequence[Mapping[str, Any]], path: Path) -> None:
             axes.set_ylim(-0.02, 1.04)
         for axes in panels.flat[len(labels) :]:
             axes.set_visible(False)
-        canvas.supxlabel(textwrap.fill(AXIS_LABELS.get(name, name), 60), fontsize=9)
+        canvas.supxlabel(textwrap.fill(AXIS_LABELS.get(name, str(name)), 60), fontsize=9)
         canvas.supylabel("share of episodes solved", fontsize=9)
         save_figure(canvas, path)
 

@@ -394,7 +394,12 @@ def test_plots_draw_the_best_policies_alone_and_cut_no_name(
 ) -> None:
     drawn: list[Figure] = []
     savefig = Figure.savefig
-    monkeypatch.setattr(Figure, "savefig", lambda self, *a, **k: (drawn.append(self), savefig(self, *a, **k)))
+
+    def keep(self: Figure, *arguments: Any, **options: Any) -> None:
+        drawn.append(self)
+        savefig(self, *arguments, **options)
+
+    monkeypatch.setattr(Figure, "savefig", keep)
     names = [f"a policy with a long name, number {k:02d}" for k in range(12)]
     runs = {
         name: [episode(i, [0.1] * 3 + [0.9 if i >= k else 0.2], success=i >= k) for i in range(20)]
@@ -413,8 +418,8 @@ def test_plots_draw_the_best_policies_alone_and_cut_no_name(
         sweep = len(figure.axes) > 1
         assert named == (names if sweep else names[:MOST_LINES])
         for axes in figure.axes:
-            lines = [line for line in axes.lines if len(line.get_xdata()) > 2]
-            looks = [(str(line._unscaled_dash_pattern), line.get_marker()) for line in lines]
+            lines = [line for line in axes.lines if len(np.asarray(line.get_xdata())) > 2]
+            looks = [(str(vars(line)["_unscaled_dash_pattern"]), line.get_marker()) for line in lines]
             assert sweep or (len(looks) == MOST_LINES and len(set(looks)) == MOST_LINES)
             assert axes.get_legend() is None
     assert "The 8 best of 12 policies; the table names all." in page.read_text()
