@@ -70,8 +70,9 @@ type: $(STAMP) ## Check the types (mypy, pyright)
 	@$(BIN)/pyright
 
 .PHONY: reference
-reference: $(STAMP) ## Write the pages of docs/ that come from the code (commands, profiles)
+reference: $(STAMP) ## Write the pages and drawings of docs/ that come from code
 	@$(BIN)/python tools/write_reference.py
+	@$(BIN)/python tools/draw_diagrams.py
 
 .PHONY: docs
 docs: $(STAMP) ## Build the documentation as a site into build/docs

@@ -139,3 +139,18 @@ def test_every_test_that_a_page_names_exists() -> None:
         if file not in places or f"def test_{name}(" not in places[file].read_text(encoding="utf-8")
     }
     assert len(named) > 40 and missing == set()
+
+
+def test_every_message_that_the_troubleshooting_page_quotes_is_one_of_ours() -> None:
+    page = (ROOT / "docs" / "troubleshooting.md").read_text(encoding="utf-8")
+    code = [path for top in ("maniskill_tomato", "tasks", "deploy") for path in (ROOT / top).rglob("*.py")]
+    text = "\n".join(path.read_text(encoding="utf-8") for path in (*code, *(ROOT / "scripts").glob("*.sh")))
+    text = re.sub(r'"\n\s*f?"', "", text)  # A message may run on over several lines.
+    first_cells = re.findall(r"^\| (`[^|]*?) \|", page, re.MULTILINE)
+    quoted = [quote for cell in first_cells for quote in re.findall(r"`([^`]+)`", cell)]
+    parts = {part.strip() for quote in quoted for part in quote.split("...") if part.strip(" =")}
+    assert len(quoted) > 15
+    assert {part for part in parts if part not in text} == {
+        "a test picture took over 180 s",  # "took over %.0f s"
+        "libGL.so.1: cannot open shared object file",  # The system's own.
+    }

@@ -3,6 +3,7 @@
 import fnmatch
 import importlib.util
 import json
+import re
 import subprocess
 import sys
 import tomllib
@@ -204,6 +205,19 @@ def test_torchvision_operators_load_into_the_installed_torch() -> None:
     boxes = torch.tensor([[0.0, 0.0, 2.0, 2.0], [0.0, 0.0, 2.0, 2.0], [5.0, 5.0, 6.0, 6.0]])
     # The second box equals the first and has the higher score, so it alone survives beside the third.
     assert nms(boxes, torch.tensor([0.3, 0.9, 0.5]), 0.5).tolist() == [1, 2]
+
+
+@needs_checkout
+def test_pictures_of_the_readme_ship_with_the_source_and_the_text_stands_without_them() -> None:
+    # A page of a package index shows no relative picture, and there is no host that an address could name.
+    readme = (ROOT / "README.md").read_text(encoding="utf-8")
+    pictures = re.findall(r"!\[([^\]]*)\]\(([^)]+)\)", readme)
+    assert pictures
+    for told, path in pictures:
+        assert len(told.split()) >= 3, f"{path} needs words for those who do not see it"
+        assert path.startswith("docs/images/") and (ROOT / path).stat().st_size <= 500_000
+    assert "graft docs" in (ROOT / "MANIFEST.in").read_text(encoding="utf-8").splitlines()
+    assert "The pictures lie in `docs/images` of the source." in readme
 
 
 @needs_checkout

@@ -8,6 +8,7 @@ from documentation.api_pages import PUBLIC, write_api_pages
 from documentation.llms import write_llms_files
 from documentation.pages import HOME, NAVIGATION, ROOT, headings, sources, title_and_summary
 from documentation.staging import rewritten, stage
+from draw_diagrams import DIAGRAMS, FOLDER
 
 NAMED = [name for names in NAVIGATION.values() for name in names]
 
@@ -85,3 +86,10 @@ def test_the_list_for_language_models_names_every_page_and_the_long_file_holds_t
     assert re.findall(r"\]\(_sources/([^)]+)\.md\)", listed) == [HOME, *NAMED]
     whole = (tmp_path / "llms-full.txt").read_text(encoding="utf-8")
     assert [name for name in NAMED if (staged / f"{name}.md").read_text(encoding="utf-8") not in whole] == []
+
+
+@pytest.mark.parametrize("name", DIAGRAMS)
+def test_a_diagram_is_what_its_program_draws(name: str) -> None:
+    assert (FOLDER / f"{name}.svg").read_text(encoding="utf-8") == str(DIAGRAMS[name]()), (
+        "run `make reference`"
+    )

@@ -161,7 +161,7 @@ def write_api_pages(folder: Path) -> None:
         "What the docstrings of the public modules say. One page is one room of the package; the",
         "[map of the house](../contributing.md#the-map-of-the-house) says what each is for. Everything is imported",
         "from its module: `from maniskill_tomato.robot.kinematics import ...`. Modules that are not listed are",
-        "internal.",
+        "internal ([compatibility](../compatibility.md#what-stays)).",
         "",
         "| room | modules |",
         "|---|---|",

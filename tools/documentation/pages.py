@@ -10,8 +10,9 @@ HOME: Final = "index"
 """Name of the first page on the site; on a Git host it is the README of `docs/`."""
 
 NAVIGATION: Final[dict[str, tuple[str, ...]]] = {
-    "Begin": ("tutorial", "hardware"),
-    "How to": ("examples", "thesis", "export", "contributing"),
+    "Begin": ("start", "how_it_works"),
+    "Tutorials": ("tutorials/train", "tutorials/judge", "tutorials/your_own", "tutorials/robot"),
+    "How to": ("hardware", "examples", "thesis", "export", "troubleshooting", "contributing"),
     "Reference": (
         "tasks",
         "observation",
@@ -39,7 +40,7 @@ NAVIGATION: Final[dict[str, tuple[str, ...]]] = {
         "results/stopping",
         "results/mutation",
     ),
-    "About": ("security", "licences", "changelog"),
+    "About": ("compatibility", "security", "licences", "changelog"),
 }
 """The pages by their names on the site, as its side bar shows them; `api/` is written from docstrings."""
 

@@ -95,7 +95,7 @@ def profiles_page() -> str:
         *_paragraph(
             "A profile is a TOML file that names the arm, the camera and the limits of a run on them: "
             f"`maniskill-tomato deploy run --profile NAME`, or the path of a file of your own. The package brings "
-            f"{shipped}. `maniskill-tomato deploy profiles NAME` prints one, to begin your own from."
+            f"{shipped}. `maniskill-tomato deploy profiles --show NAME` prints one, to begin your own from."
         ),
         "",
         *_paragraph(
