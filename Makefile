@@ -38,6 +38,10 @@ venv: $(STAMP) ## Create .venv, or bring it up to date (nothing is installed out
 vulkan: ## Install CPU Vulkan for rendering, if missing (system packages: root or sudo)
 	@scripts/install_vulkan.sh
 
+.PHONY: browser
+browser: ## Install Chromium for the tests of the viewer, if missing (system packages: root or sudo)
+	@scripts/install_browser.sh
+
 .PHONY: demo
 demo: $(STAMP) ## Train the guided task, evaluate it, write a report and a video
 	@$(BIN)/maniskill-tomato demo $(ARGS)

@@ -1,12 +1,14 @@
-"""Which tests this machine can run: `render` needs a Vulkan device, `gpu` needs CUDA.
+"""Which tests this machine can run: `render` needs a Vulkan device, `browser` needs Chromium, `gpu` needs CUDA.
 
 Where pictures must work (CI=true or TOMATO_REQUIRE_RENDER=1), a `render` test that cannot run fails;
-elsewhere it is skipped. With CI=true every other skip fails too, of a test as of a whole module, unless
-`ALLOWED_SKIPS` lists it: a package that cannot be imported any more must not take its tests along unseen.
+elsewhere it is skipped. So does a `browser` test with CI=true. Every other skip fails then too, of a test as of a
+whole module, unless `ALLOWED_SKIPS` lists it: a package that cannot be imported any more must not take its tests along
+unseen.
 """
 
 import functools
 import os
+import shutil
 import subprocess
 import sys
 from collections.abc import Generator
@@ -17,6 +19,11 @@ import pytest
 ROOT = Path(__file__).resolve().parent.parent
 PROBE_SECONDS = 300
 """A picture takes a second or two when the machine is idle."""
+
+BROWSERS = ("chromium", "chromium-browser", "google-chrome")
+"""Programs that can be Chromium."""
+
+NO_BROWSER = "no Chromium on PATH; `make browser` installs one"
 
 ALLOWED_SKIPS = {
     "tests/learning/test_learning_wandb.py::test_the_real_package_logs_without_a_network": (
@@ -56,6 +63,19 @@ def rendering_problem() -> str | None:
 def rendering_required() -> bool:
     """Whether a test that cannot render is a failure."""
     return os.environ.get("CI") == "true" or os.environ.get("TOMATO_REQUIRE_RENDER") == "1"
+
+
+def browser_path() -> str | None:
+    """The Chromium of this machine, None if it has none; `scripts/install_browser.sh` looks for the same names."""
+    return next((path for name in BROWSERS if (path := shutil.which(name)) is not None), None)
+
+
+@pytest.fixture
+def chromium() -> str:
+    """The path of a Chromium; for tests with the marker `browser`."""
+    path = browser_path()
+    assert path is not None
+    return path
 
 
 def unlisted_skip(report: pytest.TestReport | pytest.CollectReport) -> str | None:
@@ -134,6 +154,10 @@ def pytest_runtest_setup(item: pytest.Item) -> None:
         pytest.skip(problem)
     if item.get_closest_marker("render") is not None:
         keep_renderer_alive()
+    if item.get_closest_marker("browser") is not None and browser_path() is None:
+        if os.environ.get("CI") == "true":
+            pytest.fail(NO_BROWSER, pytrace=False)
+        pytest.skip(NO_BROWSER)
 
 
 @pytest.hookimpl(wrapper=True)

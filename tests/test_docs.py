@@ -48,6 +48,7 @@ ROOMS = (
     "segmentation",
     "sensing",
     "tasks",
+    "view",
 )
 
 

@@ -49,7 +49,8 @@ ALLOWED: dict[str, frozenset[str]] = {
     "tasks": SENSES | {"rendering", "policies"},
     "learning": SENSES | {"policies", "tasks"},
     "experiments": SENSES | {"rendering", "policies", "tasks", "learning"},
-    "cli": SENSES | {"rendering", "policies", "tasks", "learning", "experiments", "deploy"},
+    "view": SENSES | {"policies", "tasks", "learning", "experiments", "deploy"},
+    "cli": SENSES | {"rendering", "policies", "tasks", "learning", "experiments", "deploy", "view"},
 }
 """The rooms that a module of each room may import, besides its own. CONTRIBUTING.md has the same in words."""
 

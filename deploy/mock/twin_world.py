@@ -154,8 +154,7 @@ class TwinWorld:
 
     def color(self, picture: Picture) -> NDArray[np.uint8]:
         """The picture in flat colours, darker where one looks along a surface. Shape (H, W, 3)."""
-        shade = np.where(picture.labels == 0, 1.0, 0.45 + 0.55 * picture.facing)[..., None]
-        return np.asarray((self._palette[picture.labels] * shade).round(), dtype=np.uint8)
+        return picture.coloured(self._palette)
 
     def truth(self, picture: Picture) -> FrameTruth:
         """What is in the picture, and what the simulated task would say about it."""

@@ -2,15 +2,13 @@
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, get_args
+from typing import Annotated, Any
 
 from maniskill_tomato.cli.arguments import Flat
 from maniskill_tomato.cli.early_checks import check_choice, check_counts, check_env_id, check_policy
-from maniskill_tomato.cli.shared_options import EnvId, PlantOptions
-from maniskill_tomato.errors import InvalidInputError
+from maniskill_tomato.cli.shared_options import EnvId, PlantOptions, camera_options
 from maniskill_tomato.plants.episode_list import EPISODE_LISTS
 from maniskill_tomato.policies.opening import shipped_policy
-from maniskill_tomato.tasks import THESIS_IDS
 
 LISTED_ID = "TomatoViewpoint-v1"
 """The task that has lists of episodes."""
@@ -101,38 +99,7 @@ class Eval:
         options = self.plants.env_options()
         if self.episode_list is not None or (self.env_id == LISTED_ID and not options):
             options["episodes"] = self.episode_list or "held_out"
-        return options | self._camera_options()
-
-    def _camera_options(self) -> dict[str, Any]:
-        """The options of camera perception; none for ground truth.
-
-        Raises:
-            InvalidInputError: One is not allowed.
-        """
-        from maniskill_tomato.sensing.perception_kinds import RENDERED, Naming, Perception
-
-        for flag, value, allowed in (
-            ("--perception", self.perception, get_args(Perception)),
-            ("--target", self.target, get_args(Naming)),
-        ):
-            if value is not None and value not in allowed:
-                raise InvalidInputError.choice(flag, value, allowed)
-        named = {"target": self.target, "map_noise": self.map_noise}
-        options: dict[str, Any] = {name: value for name, value in named.items() if value is not None}
-        if self.perception == "ground_truth":
-            if options:
-                raise InvalidInputError(
-                    "--target and --map-noise are for a robot that sees through a camera; give --perception as well"
-                )
-            return {}
-        if options and self.env_id in THESIS_IDS:
-            raise InvalidInputError(
-                "--target and --map-noise are for TomatoViewpoint-v1; in the thesis's tasks a robot with a camera "
-                "chooses its target itself"
-            )
-        if self.perception in RENDERED:
-            options["render_backend"] = "auto"
-        return {"perception": self.perception, **options}
+        return options | camera_options(self.env_id, self.perception, self.target, self.map_noise)
 
 
 def camera_summary(metrics: dict[str, Any]) -> str:

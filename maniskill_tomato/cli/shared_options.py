@@ -4,13 +4,14 @@ import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, get_args
 
 import tyro
 
 from maniskill_tomato.errors import InvalidInputError, did_you_mean
 from maniskill_tomato.plants.seed_splits import SEED_SPLITS
-from maniskill_tomato.tasks import TASK_IDS
+from maniskill_tomato.sensing.perception_kinds import RENDERED, Naming, Perception
+from maniskill_tomato.tasks import TASK_IDS, THESIS_IDS
 from maniskill_tomato.text_files import parse_json
 
 EnvId = Annotated[
@@ -61,6 +62,38 @@ class PlantOptions:
         if self.plant_pose_noise is not None:
             options["plant_pose_noise"] = self.plant_pose_noise
         return options
+
+
+def camera_options(
+    env_id: str, perception: str, target: str | None, map_noise: float | None
+) -> dict[str, Any]:
+    """The options of camera perception for `gymnasium.make`; none for ground truth.
+
+    Raises:
+        InvalidInputError: One is not allowed.
+    """
+    for flag, value, allowed in (
+        ("--perception", perception, get_args(Perception)),
+        ("--target", target, get_args(Naming)),
+    ):
+        if value is not None and value not in allowed:
+            raise InvalidInputError.choice(flag, value, allowed)
+    named = {"target": target, "map_noise": map_noise}
+    options: dict[str, Any] = {name: value for name, value in named.items() if value is not None}
+    if perception == "ground_truth":
+        if options:
+            raise InvalidInputError(
+                "--target and --map-noise are for a robot that sees through a camera; give --perception as well"
+            )
+        return {}
+    if options and env_id in THESIS_IDS:
+        raise InvalidInputError(
+            "--target and --map-noise are for TomatoViewpoint-v1; in the thesis's tasks a robot with a camera "
+            "chooses its target itself"
+        )
+    if perception in RENDERED:
+        options["render_backend"] = "auto"
+    return {"perception": perception, **options}
 
 
 def merge_options(base: dict[str, Any], changes: dict[str, Any]) -> dict[str, Any]:

@@ -2,6 +2,7 @@
 
 import math
 from abc import abstractmethod
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor
@@ -115,6 +116,18 @@ def _directions(belief: Belief, positions: Tensor) -> Tensor:
     return torch.nn.functional.normalize(positions - belief.camera_position[:, None], dim=-1)
 
 
+@dataclass(frozen=True, eq=False, kw_only=True)
+class JudgedViews:
+    """What a decision was made from: the views to choose from, and what the planner thought of them."""
+
+    positions: Tensor
+    """Of the cameras, in the world frame, in [m]. Shape (B, K, 3)."""
+    worth: Tensor
+    """In the planner's own unit, by the straight way; negative infinity where one may not be chosen. Shape (B, K)."""
+    chosen: Tensor
+    """The views that the cameras move towards, by the ways that the arm really takes. Shape (B,), int64."""
+
+
 class LatticePlanner(Planner):
     """Moves towards the view of the lattice that is worth most, among those worth trying that the arm gets to."""
 
@@ -123,6 +136,8 @@ class LatticePlanner(Planner):
 
     def __init__(self) -> None:
         self.tried = Candidates()
+        self.judged: JudgedViews | None = None
+        """What the last `act` decided from; None before the first."""
         self._ways: WayFollower | None = None
 
     def begin(self, belief: Belief, rows: Tensor) -> None:
@@ -134,7 +149,9 @@ class LatticePlanner(Planner):
         views = self.views(belief)
         allowed = self.tried.choosable(belief, views, self.allowed(belief))
         worth = torch.where(allowed, self.worth(belief, views), -math.inf)
-        return self.tried.move_to_best(belief, views, self._by_ways(belief, views, worth))
+        move = self.tried.move_to_best(belief, views, self._by_ways(belief, views, worth))
+        self.judged = JudgedViews(positions=views, worth=worth, chosen=self.tried.chosen)
+        return move
 
     def _by_ways(self, belief: Belief, views: Tensor, worth: Tensor) -> Tensor:
         """What views are worth by the moves that the arm really needs, as far as that decides which is best.

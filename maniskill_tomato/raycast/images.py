@@ -51,3 +51,15 @@ class Picture:
     """`NOTHING_LABEL`, `ROBOT_LABEL`, or `FIRST_ORGAN_LABEL` plus the index in `Plant.organs`. Shape (H, W)."""
     facing: NDArray[np.float32]
     """Cosine of the angle between ray and surface, 1 where one looks straight at it. Shape (H, W)."""
+
+    def coloured(self, palette: NDArray[np.float64]) -> NDArray[np.uint8]:
+        """The picture in one colour for every label, darker where one looks along a surface.
+
+        Args:
+            palette: sRGB, 0 to 255, by label. Shape (labels, 3).
+
+        Returns:
+            Shape (H, W, 3).
+        """
+        shade = np.where(self.labels == NOTHING_LABEL, 1.0, 0.45 + 0.55 * self.facing)[..., None]
+        return np.asarray((palette[self.labels] * shade).round(), dtype=np.uint8)

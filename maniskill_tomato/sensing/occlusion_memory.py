@@ -119,6 +119,12 @@ class OcclusionMemory:
         return per_edge / CELL_SIZE
 
     @property
+    def known(self) -> Tensor:
+        """Which voxels a ray ended in, or went through far enough. Shape (B, 32, 32, 32), bool."""
+        self.estimate()
+        return ~torch.signbit(self._densities).view(-1, GRID_CELLS, GRID_CELLS, GRID_CELLS)
+
+    @property
     def target_position(self) -> Tensor:
         """The grids' centres, in the world frame, in [m]. Shape (B, 3)."""
         return self._centres

@@ -9,6 +9,7 @@ from torch import Tensor
 
 from maniskill_tomato.errors import InvalidInputError
 from maniskill_tomato.robot.inverse_kinematics import Reach
+from maniskill_tomato.sensing.camera_perception import CameraPerception
 from maniskill_tomato.sensing.perception_kinds import Perception
 from maniskill_tomato.tasks.arm_moves import Plan
 from maniskill_tomato.tasks.senses import (
@@ -71,6 +72,17 @@ class ThesisGame:
         self._starts = Starts(task, world.device)
         self._view: dict[str, Tensor] = {}
         self._views_of_others: list[dict[str, Tensor]] = []
+
+    @property
+    def perception(self) -> CameraPerception:
+        """What a camera has measured.
+
+        Raises:
+            AttributeError: There is none.
+        """
+        if self._camera is None:
+            raise AttributeError("perception")
+        return self._camera.perception
 
     def draw_plant(self, env_index: int, rng: np.random.RandomState, options: Mapping[str, Any]) -> int:
         """The seed of an environment's next plant, the first draw of its episode."""

@@ -1,0 +1,134 @@
+"""What a viewer needs of an episode, step by step: plain arrays that any page or file can draw."""
+
+from dataclasses import dataclass, field
+from enum import IntEnum
+
+import numpy as np
+from numpy.typing import NDArray
+
+from maniskill_tomato.plants.organs import Plant
+
+Float32 = NDArray[np.float32]
+Float64 = NDArray[np.float64]
+UInt8 = NDArray[np.uint8]
+
+
+class Voxel(IntEnum):
+    """What the occlusion memory believes of a voxel."""
+
+    UNKNOWN = 0
+    """No view has told of it."""
+    FREE = 1
+    """A ray through it is more likely to pass than not."""
+    BLOCKED = 2
+    """A ray through it is more likely to end there than not."""
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Foliage:
+    """What the occlusion memory believes."""
+
+    centre: Float64
+    """Of the grid, in the world frame, in [m]. Shape (3,)."""
+    cell_size: float
+    """Edge of a voxel, in [m]."""
+    voxels: UInt8
+    """Values of `Voxel`, along the axes of the world. Shape (X, Y, Z)."""
+
+    def places(self, kind: Voxel) -> Float32:
+        """Centres of the voxels of a kind, in the world frame, in [m]. Shape (n, 3)."""
+        index = np.argwhere(self.voxels == int(kind))
+        half = 0.5 * (np.array(self.voxels.shape) - 1)
+        return np.asarray(self.centre + (index - half) * self.cell_size, dtype=np.float32)
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Candidates:
+    """The views that a policy chooses from."""
+
+    positions: Float32
+    """Of the cameras, in the world frame, in [m]. Shape (K, 3)."""
+    worth: Float32
+    """What the policy thinks of them, in its own unit; negative infinity where one may not be chosen. Shape (K,)."""
+    chosen: int
+    """The one that the camera moves towards."""
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class MappedFruit:
+    """A fruit as a camera's map has it."""
+
+    number: int
+    """Its name in the map."""
+    position: Float64
+    """Centre in the world frame, in [m]. Shape (3,)."""
+    radius: float
+    """In [m]."""
+    spread: float
+    """Standard deviation of its place along the least certain direction, in [m]."""
+    is_ripe: bool
+    """Whether it is more likely ripe than not."""
+    is_target: bool
+    """Whether the robot takes it for its target."""
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Snapshot:
+    """One view of an episode, and what the policy decides on it."""
+
+    joint_positions: Float64
+    """In [rad]. Shape (7,)."""
+    T_w_camera: Float64
+    """Pose of the camera's optical frame. Shape (4, 4)."""
+    target_position: Float64
+    """Where the target is believed to be, in the world frame, in [m]. Shape (3,)."""
+    visible_fraction: float
+    """V_f of the target, as the task goes by it."""
+    picture: UInt8
+    """What the wrist camera sees. Shape (H, W, 3)."""
+    true_visible_fraction: float | None = None
+    """V_f as it is, where a camera measures the other."""
+    target_organ: int | None = None
+    """The true target, as an index in `Plant.organs`."""
+    event: str = ""
+    """What came of the move that led here, in words: a refusal with its reason, a touched plant, the end."""
+    was_refused: bool = False
+    """Whether the arm refused that move."""
+    candidates: Candidates | None = None
+    """What the policy chooses from now."""
+    T_w_camera_next: Float64 | None = None
+    """Where the camera goes next. Shape (4, 4)."""
+    foliage: Foliage | None = None
+    """What the occlusion memory believes."""
+    fruits: tuple[MappedFruit, ...] = ()
+    """What a camera's map holds."""
+
+
+@dataclass(eq=False, kw_only=True)
+class EpisodeRecording:
+    """An episode so far: the first view, and one more for every move."""
+
+    title: str
+    """What it is, in a line."""
+    plant: Plant
+    """The plant or the row."""
+    T_w_plant: Float64
+    """Its pose. Shape (4, 4)."""
+    threshold: float
+    """V_f above which the target counts as fully visible."""
+    fov_y: float
+    """Vertical field of view of the wrist's camera, in [rad]."""
+    snapshots: list[Snapshot] = field(default_factory=list)
+    """In order."""
+    outcome: str = ""
+    """How it ended; empty while it goes on."""
+
+    @property
+    def moves(self) -> int:
+        """Moves so far."""
+        return len(self.snapshots) - 1
+
+    @property
+    def visible_fractions(self) -> Float64:
+        """V_f at every view. Shape (moves + 1,)."""
+        return np.array([snapshot.visible_fraction for snapshot in self.snapshots])

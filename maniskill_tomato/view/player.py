@@ -1,0 +1,110 @@
+"""What the controls of a page do: play, step, go back, another episode; it knows nothing of any page."""
+
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any, Protocol
+
+from maniskill_tomato.view.episode_recording import EpisodeRecording
+from maniskill_tomato.view.play_settings import SHIPPED, PlaySettings
+
+
+class Session(Protocol):
+    """Where a player gets its episode from."""
+
+    settings: PlaySettings
+    """Which."""
+
+    @property
+    def recording(self) -> EpisodeRecording:
+        """The episode so far."""
+        ...
+
+    @property
+    def is_over(self) -> bool:
+        """Whether it has ended."""
+        ...
+
+    def begin(self, seed: int) -> None:
+        """Begins another episode."""
+        ...
+
+    def step(self) -> bool:
+        """Makes a move; whether there was one to make."""
+        ...
+
+
+class Player:
+    """Shows one snapshot of the episode of a session, and goes on from the last one."""
+
+    def __init__(self, open_session: Callable[[PlaySettings], Session], settings: PlaySettings) -> None:
+        """Opens the first episode.
+
+        Args:
+            open_session: Makes a session; it may raise a `TomatoError`.
+            settings: Of the first.
+        """
+        self._open = open_session
+        self._session = open_session(settings)
+        self.settings = settings
+        """Of the episode that is shown."""
+        self.shown = 0
+        """Which snapshot is shown."""
+        self.is_playing = False
+        """Whether moves follow each other by themselves."""
+
+    @property
+    def recording(self) -> EpisodeRecording:
+        """The episode so far."""
+        return self._session.recording
+
+    @property
+    def is_at_end(self) -> bool:
+        """Whether no move is left to show or to make."""
+        return self.shown >= self.recording.moves and self._session.is_over
+
+    def step(self) -> None:
+        """Shows the next snapshot, and makes a move where there is none yet."""
+        if self.shown < self.recording.moves or self._session.step():
+            self.shown += 1
+        if self.is_at_end:
+            self.is_playing = False
+
+    def play(self) -> None:
+        """Lets moves follow each other; from the first view where the end is shown."""
+        if self.is_at_end:
+            self.shown = 0
+        self.is_playing = True
+
+    def pause(self) -> None:
+        """Stops after the present move."""
+        self.is_playing = False
+
+    def show(self, index: int) -> None:
+        """Shows a snapshot that was recorded; the nearest where there is none of this number."""
+        self.is_playing = False
+        self.shown = min(max(index, 0), self.recording.moves)
+
+    def reset(self) -> None:
+        """Begins the same episode again."""
+        self.change(seed=self.settings.seed)
+
+    def change(self, **changes: Any) -> None:
+        """Begins the episode of other settings.
+
+        Args:
+            changes: Fields of `PlaySettings`. With another task the policy is the one that ships for it, unless it is
+                given too.
+
+        Raises:
+            TomatoError: It cannot be opened; the episode that was shown stays.
+        """
+        if changes.get("env_id", self.settings.env_id) != self.settings.env_id:
+            changes.setdefault("policy", SHIPPED)
+        settings = replace(self.settings, **changes)
+        if set(changes) == {"seed"}:
+            self._session.begin(settings.seed)
+            self._session.settings = settings
+        else:
+            self._session = self._open(settings)
+        self.settings = settings
+        self.shown, self.is_playing = 0, False

@@ -1,0 +1,81 @@
+"""The page in a real browser: a click changes the scene, and nothing goes wrong in the console."""
+
+import time
+from collections.abc import Callable, Iterator
+
+import numpy as np
+import pytest
+from playwright.sync_api import ConsoleMessage, Page, sync_playwright
+
+from maniskill_tomato.view.page import PlayPage
+from maniskill_tomato.view.page_export import page_of
+from maniskill_tomato.view.play_session import PlaySession
+from maniskill_tomato.view.play_settings import PlaySettings
+from maniskill_tomato.view.player import Player
+
+pytestmark = pytest.mark.browser
+
+FLAGS = ("--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--ignore-gpu-blocklist")
+"""Without a graphics card Chromium draws WebGL only if it is told to."""
+
+PATIENCE_MS = 120_000
+
+
+@pytest.fixture
+def browser_page(chromium: str) -> Iterator[Page]:
+    with sync_playwright() as playwright:
+        browser = playwright.chromium.launch(executable_path=chromium, args=FLAGS)
+        page = browser.new_page(viewport={"width": 480, "height": 400})
+        page.set_default_timeout(PATIENCE_MS)
+        errors: list[str] = []
+        page.on("pageerror", lambda error: errors.append(str(error)))
+        page.on("console", lambda line: errors.append(line.text) if is_fault(line) else None)
+        yield page
+        browser.close()
+        assert errors == []
+
+
+def is_fault(line: ConsoleMessage) -> bool:
+    """Whether a line of the console tells of a fault; viser replaces the addresses of pictures while they load."""
+    return line.type == "error" and not line.location["url"].startswith("blob:")
+
+
+def wait_for(page: Page, condition: Callable[[], bool]) -> None:
+    end = time.monotonic() + PATIENCE_MS / 1000.0
+    while not condition():
+        assert time.monotonic() < end
+        page.wait_for_timeout(50)
+
+
+def test_a_click_on_step_makes_a_move_and_reset_takes_it_back(browser_page: Page) -> None:
+    player = Player(PlaySession, PlaySettings(env_id="TomatoViewpointGuided-v1", policy="random", seed=2))
+    served = PlayPage(player, port=0)
+    try:
+        browser_page.goto(served.url)
+        browser_page.get_by_text("at move 0").wait_for()
+        wait_for(browser_page, lambda: len(served.server.get_clients()) == 1)
+        (client,) = served.server.get_clients().values()
+        before = client.get_render(120, 160)
+        assert np.std(before) > 5.0
+        browser_page.get_by_role("button", name="Step").click()
+        browser_page.get_by_text("at move 1").wait_for()
+        assert player.recording.moves == player.shown == 1
+        after = client.get_render(120, 160)
+        assert np.mean(np.abs(after.astype(float) - before)) > 0.5
+        browser_page.get_by_role("button", name="Reset").click()
+        browser_page.get_by_text("at move 0").wait_for()
+        assert player.recording.moves == player.shown == 0
+    finally:
+        served.close()
+
+
+def test_an_exported_page_runs_by_itself(browser_page: Page) -> None:
+    session = PlaySession(PlaySettings(env_id="TomatoViewpointGuided-v1", policy="random", seed=2))
+    session.step()
+    requests: list[str] = []
+    browser_page.on("request", lambda request: requests.append(request.url))
+    browser_page.set_content(page_of(session.recording))
+    wait_for(browser_page, lambda: browser_page.locator("canvas").count() > 0)
+    first = browser_page.screenshot()
+    wait_for(browser_page, lambda: browser_page.screenshot() != first)
+    assert [url for url in requests if url.startswith("http")] == []

@@ -1,0 +1,152 @@
+"""Episodes stepped for a viewer: they are those of an evaluation, and snapshots tell what was known and decided."""
+
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+from maniskill_tomato.errors import InvalidInputError
+from maniskill_tomato.experiments.rollout import run_episode
+from maniskill_tomato.policies.opening import open_policy
+from maniskill_tomato.sensing.occlusion_memory import CELL_SIZE
+from maniskill_tomato.tasks.vector_env import make_vector_env
+from maniskill_tomato.view.episode_recording import EpisodeRecording, Voxel
+from maniskill_tomato.view.play_session import PlaySession
+from maniskill_tomato.view.play_settings import PlaySettings
+
+
+def played(settings: PlaySettings) -> EpisodeRecording:
+    session = PlaySession(settings)
+    while session.step():
+        pass
+    assert session.is_over and not session.step()
+    return session.recording
+
+
+@pytest.mark.parametrize(
+    ("env_id", "policy", "options"),
+    [
+        ("TomatoViewpoint-v1", "nbv", {"episodes": "held_out"}),
+        ("TomatoViewpoint-v1", "random_viewpoint", {"episodes": "held_out"}),
+        ("TomatoViewpointSparse-v1", "random", {}),
+    ],
+)
+def test_an_episode_is_that_of_an_evaluation_with_the_same_seed(
+    env_id: str, policy: str, options: dict[str, Any]
+) -> None:
+    recording = played(PlaySettings(env_id=env_id, policy=policy, seed=3))
+    env = make_vector_env(env_id, auto_reset=False, **options)
+    record = run_episode(env, open_policy(policy, env_id=env_id, seed=3), 3)
+    assert recording.moves == record.steps > 0
+    np.testing.assert_allclose(recording.visible_fractions, record.visible_fraction, atol=1e-6)
+    assert record.qpos is not None
+    np.testing.assert_allclose([s.joint_positions for s in recording.snapshots], record.qpos, atol=1e-6)
+    assert recording.outcome.startswith("fully visible") == record.success
+    assert [s.was_refused for s in recording.snapshots[1:]] == record.refused.tolist()
+
+
+@pytest.mark.parametrize(
+    ("env_id", "policy"), [("TomatoViewpoint-v1", "random_step"), ("TomatoViewpointGuided-v1", "random")]
+)
+def test_an_episode_that_begins_again_is_the_same_even_if_its_policy_draws(env_id: str, policy: str) -> None:
+    session = PlaySession(PlaySettings(env_id=env_id, policy=policy, seed=5))
+    ways = []
+    for _ in range(2):
+        session.step()
+        session.step()
+        ways.append([snapshot.joint_positions for snapshot in session.recording.snapshots])
+        session.begin(5)
+    np.testing.assert_array_equal(ways[0], ways[1])
+
+
+def test_a_snapshot_holds_the_views_that_the_policy_chooses_from_and_where_it_goes() -> None:
+    recording = played(PlaySettings(policy="nbv"))
+    for snapshot, after in zip(recording.snapshots, recording.snapshots[1:], strict=False):
+        candidates = snapshot.candidates
+        assert candidates is not None and snapshot.T_w_camera_next is not None
+        assert np.isfinite(candidates.worth[candidates.chosen])
+        camera, goal = snapshot.T_w_camera[:3, 3], candidates.positions[candidates.chosen]
+        assert np.linalg.norm(goal - after.T_w_camera[:3, 3]) < np.linalg.norm(goal - camera)
+        np.testing.assert_allclose(after.T_w_camera, snapshot.T_w_camera_next, atol=1e-4)
+    last = recording.snapshots[-1]
+    assert last.candidates is None and last.T_w_camera_next is None
+
+
+def test_what_the_memory_believes_grows_with_every_view_and_agrees_with_its_predictions() -> None:
+    session = PlaySession(PlaySettings(policy="nbv"))
+    assert session.step()
+    unknown = []
+    for snapshot in session.recording.snapshots:
+        foliage = snapshot.foliage
+        assert foliage is not None and foliage.cell_size == CELL_SIZE
+        unknown.append(len(foliage.places(Voxel.UNKNOWN)))
+        assert sum(len(foliage.places(kind)) for kind in Voxel) == 32**3
+        np.testing.assert_allclose(foliage.centre, snapshot.target_position, atol=1e-6)
+    assert unknown[1] < unknown[0] < 32**3
+
+
+def test_blocked_voxels_are_where_leaves_are() -> None:
+    recording = played(PlaySettings(policy="nbv"))
+    foliage = recording.snapshots[-1].foliage
+    assert foliage is not None
+    vertices = recording.plant.vertices @ recording.T_w_plant[:3, :3].T + recording.T_w_plant[:3, 3]
+    corners = torch.as_tensor(vertices[recording.plant.faces].mean(1), dtype=torch.float32)
+
+    def distance(kind: Voxel) -> float:
+        places = torch.as_tensor(foliage.places(kind)[:500])
+        return float(torch.cdist(places, corners).amin(dim=1).median())
+
+    assert distance(Voxel.BLOCKED) < 0.02 < distance(Voxel.FREE)
+
+
+def test_a_camera_tells_its_map_of_fruits_and_the_truth_stands_beside_what_it_measured() -> None:
+    session = PlaySession(PlaySettings(perception="occlusion_model", policy="nbv", target="any"))
+    session.step()
+    snapshot = session.recording.snapshots[-1]
+    centres = np.array([fruit.centre for fruit in session.recording.plant.fruits])
+    centres = centres @ session.recording.T_w_plant[:3, :3].T + session.recording.T_w_plant[:3, 3]
+    assert snapshot.true_visible_fraction is not None and len(snapshot.fruits) > 3
+    assert sum(fruit.is_target for fruit in snapshot.fruits) <= 1
+    errors = [np.linalg.norm(centres - fruit.position, axis=1).min() for fruit in snapshot.fruits]
+    assert np.median(errors) < 0.01
+
+
+def test_a_refused_move_is_told_with_its_reason() -> None:
+    recording = played(PlaySettings(policy="random_step", seed=1))
+    refused = [s for s in recording.snapshots if s.was_refused]
+    assert refused and all(s.event.startswith("refused: the arm does not reach") for s in refused)
+    assert not recording.snapshots[0].event
+
+
+def test_a_row_counts_the_tomatoes_that_were_seen() -> None:
+    session = PlaySession(PlaySettings(env_id="TomatoViewpointRow-v1", policy="nbv"))
+    while not any("saw its target" in s.event for s in session.recording.snapshots):
+        assert session.step()
+    targets = {snapshot.target_organ for snapshot in session.recording.snapshots}
+    assert len(targets) == 2
+
+
+def test_the_wrist_picture_shows_a_red_target_where_it_is_expected() -> None:
+    recording = played(PlaySettings(policy="nbv"))
+    picture = recording.snapshots[-1].picture.astype(int)
+    height, width = picture.shape[:2]
+    # The camera looks at its target.
+    red, green, _ = picture[height // 2 - 5 : height // 2 + 5, width // 2 - 5 : width // 2 + 5].mean((0, 1))
+    assert red > 1.5 * green
+    corner = picture[:10, :10].mean((0, 1))
+    assert corner[0] < 1.5 * corner[1]
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"env_id": "TomatoViewpoint-v2"}, "env_id must be one of"),
+        ({"perception": "segmenter"}, "perception must be one of"),
+        ({"target": "nearest"}, "target must be one of"),
+        ({"seed": -1}, "seed must be from 0"),
+    ],
+)
+def test_settings_that_cannot_be_played_are_refused(options: dict[str, object], message: str) -> None:
+    with pytest.raises(InvalidInputError, match=message):
+        PlaySettings(**options)  # type: ignore[arg-type]
