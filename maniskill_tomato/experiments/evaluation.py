@@ -322,7 +322,7 @@ def _film(config: EvaluationConfig, found: str | Path) -> FilmedEpisodes:
 
     count = min(config.films, config.episodes)
     logger.info("filming %d episodes", count)
-    env = make_env(config.env_id, **{**make_film_options(), **config.env_options})
+    env = make_env(config.env_id, **make_film_options(config.env_options))
     path = config.out / "video.mp4"
     try:
         seeds = [config.seed + i for i in range(count)]

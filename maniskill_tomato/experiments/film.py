@@ -3,7 +3,7 @@
 import contextlib
 import functools
 import os
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -24,10 +24,11 @@ from maniskill_tomato.experiments.rollout import run_batch
 from maniskill_tomato.policies.protocol import Policy, StatePolicy
 from maniskill_tomato.rendering import vulkan_probe
 from maniskill_tomato.report_design import rgb
+from maniskill_tomato.sensing.perception_kinds import RENDERED
 
 Image = NDArray[np.uint8]
 
-FRAMES_PER_SECOND = 20
+FRAMES_PER_SECOND = 15
 VIEW_SIZE = (640, 480)
 """Width and height of each of the two pictures, in [px]."""
 
@@ -72,14 +73,23 @@ class Film:
     """V_f above which the target counts as fully visible."""
 
 
-def make_film_options() -> dict[str, Any]:
-    """Options for `gymnasium.make` under which an environment can be filmed on this machine."""
+def make_film_options(options: Mapping[str, Any] | None = None) -> dict[str, Any]:
+    """Options for `gymnasium.make` under which an environment can be filmed on this machine.
+
+    It stands in a glasshouse, unless its perception works on colour pictures, which that would change.
+
+    Args:
+        options: Those of the environment, which are kept.
+    """
     width, height = VIEW_SIZE
+    options = options or {}
     return {
         "render_backend": vulkan_probe.render_backend(),
         "render_mode": "rgb_array",
+        "scenery": "plain" if options.get("perception") in RENDERED else "greenhouse",
         "sensor_configs": {"width": width, "height": height},
         "human_render_camera_configs": {"width": width, "height": height},
+        **options,
     }
 
 
@@ -294,9 +304,9 @@ def annotate(
     draw = ImageDraw.Draw(canvas)
     draw.line((width, 0, width, height), fill=PAPER, width=4)
     top = height + 11
-    draw.text((20, top), title, font=_font(19, bold=True), fill=INK)
+    draw.text((20, top), title, font=caption_font(19, bold=True), fill=INK)
     state = "target fully visible" if success else ("moving" if moving else "looking")
-    draw.text((20, top + 24), f"step {step}, {state}", font=_font(15), fill=LEAF if success else MUTED)
+    draw.text((20, top + 24), f"step {step}, {state}", font=caption_font(15), fill=LEAF if success else MUTED)
     _draw_gauge(draw, width + 20, top, width - 40, visible_fraction, threshold)
     return np.asarray(canvas)
 
@@ -305,9 +315,9 @@ def _draw_gauge(
     draw: ImageDraw.ImageDraw, left: int, top: int, width: int, visible_fraction: float, threshold: float
 ) -> None:
     """A bar from 0 to 1 with a mark at the threshold."""
-    draw.text((left, top), "visible fraction of the target", font=_font(15), fill=MUTED)
+    draw.text((left, top), "visible fraction of the target", font=caption_font(15), fill=MUTED)
     value = f"{visible_fraction:.2f}"
-    draw.text((left + width, top - 3), value, font=_font(19, bold=True), fill=INK, anchor="ra")
+    draw.text((left + width, top - 3), value, font=caption_font(19, bold=True), fill=INK, anchor="ra")
     y0, y1 = top + 26, top + 40
     draw.rounded_rectangle((left, y0, left + width, y1), radius=7, fill=TRACK)
     end = left + max(14, int(width * visible_fraction))
@@ -319,7 +329,7 @@ def _draw_gauge(
 
 
 @functools.cache
-def _font(size: int, bold: bool = False) -> ImageFont.FreeTypeFont:
+def caption_font(size: int, bold: bool = False) -> ImageFont.FreeTypeFont:
     """DejaVu Sans, which comes with matplotlib."""
     properties = font_manager.FontProperties(family="DejaVu Sans", weight="bold" if bold else "normal")
     return ImageFont.truetype(font_manager.findfont(properties), size)

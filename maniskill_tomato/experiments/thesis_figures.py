@@ -86,7 +86,7 @@ def take_views(experiment: Experiment, trial: Trial, folder: Path) -> str | None
 
     folder.mkdir(parents=True, exist_ok=True)
     for evaluation in experiment.evaluations:
-        env = make_env(experiment.env_id, **{**make_film_options(), **evaluation.env_options})
+        env = make_env(experiment.env_id, **make_film_options(evaluation.env_options))
         try:
             film = photograph(env, trial.policy(), episode_to_show(trial.records(evaluation)))
         finally:

@@ -38,7 +38,7 @@ def draw_view_grid(
     """
     by_seed = {label: {e.seed: e for e in found} for label, found in runs.items() if found}
     common = sorted(set.intersection(*(set(found) for found in by_seed.values())))[:EPISODES]
-    env = make_env(condition.env_id, **{**make_film_options(), **condition.env_options})
+    env = make_env(condition.env_id, **make_film_options(condition.env_options))
     rows: list[list[tuple[str, float, Image]]] = []
     try:
         for seed in common:

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
 from maniskill_tomato.plants.materials import MATERIALS
-from maniskill_tomato.plants.organs import MeshPart, Plant
+from maniskill_tomato.plants.organs import MeshPart, Plant, joined_faces
 
 if TYPE_CHECKING:
     import sapien
@@ -66,6 +67,24 @@ def make_render_shape(
         uvs=uvs,
         material=materials[name],
     )
+
+
+def merged_parts(parts: Sequence[MeshPart]) -> list[MeshPart]:
+    """One part for each material and number of sides."""
+    merged = []
+    for material, two_sided in sorted({(part.material, part.two_sided) for part in parts}):
+        same = [part for part in parts if (part.material, part.two_sided) == (material, two_sided)]
+        merged.append(
+            MeshPart(
+                vertices=np.concatenate([part.vertices for part in same]),
+                normals=np.concatenate([part.normals for part in same]),
+                uvs=np.concatenate([part.uvs for part in same]),
+                faces=joined_faces(same),
+                material=material,
+                two_sided=two_sided,
+            )
+        )
+    return merged
 
 
 def build_plant_actors(

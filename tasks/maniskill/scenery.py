@@ -13,6 +13,7 @@ from mani_skill.utils.structs.pose import Pose
 from torch import Tensor
 
 from maniskill_tomato.plants.organs import SemanticClass
+from maniskill_tomato.rendering import glasshouse
 from maniskill_tomato.rendering.plant_actors import build_plant_actors
 from maniskill_tomato.tasks.plant_batch import PlantBatch
 
@@ -43,7 +44,7 @@ def _add_box(
 
 
 def light(scene: ManiSkillScene, *, shadows: bool) -> None:
-    """Adds the diffuse light of a glasshouse and a sun."""
+    """Adds the diffuse light of a bare room and a sun."""
     scene.set_ambient_light([0.42, 0.45, 0.46])
     scene.add_directional_light(
         [0.6, 0.45, -1.0], [1.9, 1.85, 1.7], shadow=shadows, shadow_scale=2.0, shadow_map_size=2048
@@ -69,6 +70,32 @@ def writing_only_to(scene: ManiSkillScene, env_idx: Tensor | None) -> Iterator[N
         yield
     finally:
         scene._reset_mask = before
+
+
+class GlasshouseScene:
+    """The glasshouse round one environment's plants."""
+
+    def __init__(self, scene: ManiSkillScene, plant_batch: PlantBatch) -> None:
+        """Builds it; the plants must be in the scene already, so that their segmentation ids stay what they are.
+
+        Args:
+            scene: A scene of one environment that renders.
+            plant_batch: The plants.
+        """
+        self._scene = scene.sub_scenes[0]
+        self._house = glasshouse.Glasshouse(self._scene)
+        self._plant_batch = plant_batch
+        self._feet = glasshouse.stem_feet(plant_batch.plants[0])
+
+    def light(self) -> None:
+        """Lights the scene as on a bright day."""
+        glasshouse.light(self._scene)
+
+    def follow(self) -> None:
+        """Moves it to where the plants stand."""
+        T = self._plant_batch.T_world_plant[0].double().cpu().numpy()
+        feet_w = self._feet @ T[:3, :3].T + T[:3, 3]
+        self._house.place(float(feet_w[:, 0].mean()), feet_w)
 
 
 class PlantScene:

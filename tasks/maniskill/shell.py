@@ -49,6 +49,8 @@ class TomatoEnv(BaseEnv):  # type: ignore[misc]
     **Options** beside ManiSkill's own and those of the task (`tasks.making`):
 
     - `motion`: `"kinematic"` puts the joints at the solution, `"dynamic"` drives them there through physics.
+    - `scenery`: `"plain"` is a bare room, `"greenhouse"` a row in a glasshouse with the robot on a cart, which is
+      slower to render and for one environment; neither changes anything but pictures.
     - `render_backend`: `"auto"` renders on the GPU if there is one, else on the CPU, and not at all where no
       picture is asked for.
     """
@@ -73,6 +75,7 @@ class TomatoEnv(BaseEnv):  # type: ignore[misc]
         control_mode: str | None = None,
         sim_backend: str = "auto",
         render_backend: str = "auto",
+        scenery: shell_options.Scenery = "plain",
         reconfiguration_freq: int | None = None,
         **kwargs: Any,
     ) -> None:
@@ -83,6 +86,7 @@ class TomatoEnv(BaseEnv):  # type: ignore[misc]
         shell_options.check_obs_mode(obs_mode)
         shell_options.check_motion(motion)
         shell_options.check_num_envs(num_envs, sim_backend)
+        shell_options.check_scenery(scenery, num_envs)
         names = option_names(self.env_id)
         options = {name: kwargs.pop(name) for name in list(kwargs) if name in names}
         check_other_tasks(self.env_id, kwargs)
@@ -100,6 +104,7 @@ class TomatoEnv(BaseEnv):  # type: ignore[misc]
             kwargs.setdefault("sensor_configs", {"width": width, "height": height})
         rendering = shell_options.needs_rendering(obs_mode, render_mode) or setup.needs_pictures
         render_backend = shell_options.pick_render_backend(render_backend, rendering)
+        self._in_glasshouse = scenery == "greenhouse" and render_backend != "none"
         # A new plant to look at needs new actors, and so a new scene.
         self._has_actors = not setup.plant.changes or render_backend != "none"
         reconfiguration_freq = shell_options.pick_reconfiguration_freq(
@@ -136,13 +141,16 @@ class TomatoEnv(BaseEnv):  # type: ignore[misc]
     @property
     def _default_human_render_camera_configs(self) -> CameraConfig:
         pose = sapien_utils.look_at(eye=[-0.35, -1.65, 1.45], target=[0.38, 0.0, 0.66])
+        if self._in_glasshouse:
+            pose = sapien_utils.look_at(eye=[-0.85, -1.7, 0.72], target=[0.45, 0.1, 0.32])
         return CameraConfig("render_camera", pose=pose, width=640, height=480, fov=0.82, near=0.01, far=20.0)
 
     def _load_agent(self, options: dict[str, Any], *args: Any, **kwargs: Any) -> None:
         super()._load_agent(options, sapien.Pose())
 
     def _load_scene(self, options: dict[str, Any]) -> None:
-        scenery.build(self.scene)
+        if not self._in_glasshouse:
+            scenery.build(self.scene)
         if not hasattr(self, "world"):
             self.world = self._setup.build(
                 self.num_envs,
@@ -157,12 +165,17 @@ class TomatoEnv(BaseEnv):  # type: ignore[misc]
             world.show_plants({i: world.game.draw_plant(i, rng, options) for i, rng in enumerate(world.rngs)})
         world.swaps_plants = not self._has_actors
         self._plants = scenery.PlantScene(self.scene, world.plant_batch, with_actors=self._has_actors)
+        if self._in_glasshouse:
+            self._glasshouse = scenery.GlasshouseScene(self.scene, world.plant_batch)
         world.first_organ_id = torch.tensor(
             self._plants.first_organ_id, dtype=torch.int32, device=self.device
         )
 
     def _load_lighting(self, options: dict[str, Any]) -> None:
-        scenery.light(self.scene, shadows=self.enable_shadow)
+        if self._in_glasshouse:
+            self._glasshouse.light()
+        else:
+            scenery.light(self.scene, shadows=self.enable_shadow)
 
     @property
     def camera_intrinsics(self) -> CameraIntrinsics:
@@ -186,7 +199,7 @@ class TomatoEnv(BaseEnv):  # type: ignore[misc]
         Returns:
             Shape (num_envs, height, width, 3).
         """
-        self._plants.follow()
+        self._show_plants()
         if not torch.equal(self.agent.robot.get_qpos(), qpos):
             self._put_joints(qpos)
         self.scene.update_render(update_sensors=True, update_human_render_cameras=False)
@@ -216,9 +229,14 @@ class TomatoEnv(BaseEnv):  # type: ignore[misc]
         self.world.begin(env_idx, options)
         self._show_world()
 
+    def _show_plants(self) -> None:
+        self._plants.follow()
+        if self._in_glasshouse:
+            self._glasshouse.follow()
+
     def _show_world(self) -> None:
         """Puts plants and arms where they are in the world."""
-        self._plants.follow()
+        self._show_plants()
         self._put_joints(self.world.state.qpos)
 
     # ------------------------------------------------------------------- step

@@ -12,6 +12,7 @@ from maniskill_tomato.rendering.vulkan_probe import NO_RENDERING_HINT
 from maniskill_tomato.tasks.making import check_choice
 
 Motion = Literal["kinematic", "dynamic"]
+Scenery = Literal["plain", "greenhouse"]
 
 PLAIN_OBS_MODES = ("state", "state_dict", "none", "sensor_data", "pointcloud")
 REWARD_MODES = ("dense", "normalized_dense", "sparse", "none")
@@ -34,6 +35,15 @@ def check_obs_mode(obs_mode: str | None) -> None:
 def check_motion(motion: str) -> None:
     """Accepts the values of `Motion`."""
     check_choice("motion", motion, get_args(Motion))
+
+
+def check_scenery(scenery: str, num_envs: int) -> None:
+    """Accepts the values of `Scenery`; a glasshouse is built round one environment."""
+    check_choice("scenery", scenery, get_args(Scenery))
+    if scenery == "greenhouse" and num_envs > 1:
+        raise InvalidInputError(
+            f"scenery='greenhouse' is for pictures of one environment, got num_envs={num_envs}; use 'plain' there"
+        )
 
 
 def check_num_envs(num_envs: int, sim_backend: str) -> None:

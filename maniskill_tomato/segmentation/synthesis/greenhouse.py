@@ -1,6 +1,5 @@
 """A rendered scene: a row of plants with its surroundings, and light, depth and thing of every pixel of a view."""
 
-import tempfile
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
@@ -13,9 +12,10 @@ from numpy.random import Generator
 from numpy.typing import NDArray
 
 from maniskill_tomato.plants.generator import generate_plant
-from maniskill_tomato.plants.organs import MeshPart, Plant, SemanticClass, joined_faces
+from maniskill_tomato.plants.organs import MeshPart, Plant, SemanticClass
 from maniskill_tomato.plants.row import ROW_SPACING, Row, generate_row
-from maniskill_tomato.rendering.plant_actors import make_render_shape
+from maniskill_tomato.rendering.plant_actors import make_render_shape, merged_parts
+from maniskill_tomato.rendering.surfaces import dome
 from maniskill_tomato.rendering.vulkan_probe import render_backend
 from maniskill_tomato.robot.d435 import CAMERA_FAR, CAMERA_NEAR, R_CAMERA_OPTICAL, CameraIntrinsics
 from maniskill_tomato.segmentation.datasets.annotations import BEHIND
@@ -39,9 +39,8 @@ CATEGORY: dict[SemanticClass, str] = {
 DISTANT_PLANTS = 6
 """Plants that the rows behind are made of; they are grown once per process."""
 
-SKY_RESOLUTION = 16
-"""Side of the environment map's faces, in [px]: a gradient needs no more, and filtering a large one takes minutes on
-a CPU."""
+SKY, GROUND = (0.78, 0.81, 0.83), (0.33, 0.33, 0.31)
+"""Linear colours of the light from above and below at a strength of 1."""
 
 _SUN_CENTRE = [0.0, 0.0, 0.8]
 
@@ -219,7 +218,7 @@ class GreenhouseScene:
                 place = [appearance.row_distance * k, ROW_SPACING * j + float(rng.normal(0, 0.05)), 0.0]
                 pose = sapien.Pose(place, [np.cos(angle / 2), 0, 0, np.sin(angle / 2)])
                 green = [p for o in plant.organs if o.semantic_class <= SemanticClass.LEAF for p in o.parts]
-                self._add_parts(_merged(green), pose)
+                self._add_parts(merged_parts(green), pose)
                 T = pose.to_transformation_matrix()
                 for organ in plant.organs:
                     if organ.semantic_class <= SemanticClass.LEAF:
@@ -243,36 +242,6 @@ class GreenhouseScene:
         self._scene.set_environment_map(_sky(round(appearance.sky, 1)))
 
 
-@lru_cache(maxsize=16)
 def _sky(strength: float) -> sapien.render.RenderCubemap:
-    from sapien.asset import create_dome_envmap
-
-    # SAPIEN writes colours as 8-bit numbers, in which anything above 1 would wrap round to near 0.
-    sky = np.minimum(np.array([0.78, 0.81, 0.83]) * strength, 1.0)
-    ground = np.minimum(np.array([0.33, 0.33, 0.31]) * strength, 1.0)
-    with tempfile.TemporaryDirectory() as folder:  # Its default file is one for all processes.
-        return create_dome_envmap(
-            filename=f"{folder}/sky.ktx",
-            sky_color=sky.tolist(),
-            ground_color=ground.tolist(),
-            blend=0.4,
-            resolution=SKY_RESOLUTION,
-        )
-
-
-def _merged(parts: Sequence[MeshPart]) -> list[MeshPart]:
-    """One part for each material and number of sides."""
-    merged = []
-    for material, two_sided in sorted({(part.material, part.two_sided) for part in parts}):
-        same = [part for part in parts if (part.material, part.two_sided) == (material, two_sided)]
-        merged.append(
-            MeshPart(
-                vertices=np.concatenate([part.vertices for part in same]),
-                normals=np.concatenate([part.normals for part in same]),
-                uvs=np.concatenate([part.uvs for part in same]),
-                faces=joined_faces(same),
-                material=material,
-                two_sided=two_sided,
-            )
-        )
-    return merged
+    sky, ground = (tuple(min(c * strength, 1.0) for c in colour) for colour in (SKY, GROUND))
+    return dome(sky, ground, 0.4)

@@ -6,47 +6,15 @@ import numpy as np
 import sapien
 import sapien.render
 from numpy.random import Generator
-from numpy.typing import NDArray
 
 from maniskill_tomato.assets import asset_path
-from maniskill_tomato.segmentation.synthesis import paint
+from maniskill_tomato.rendering import surfaces
+from maniskill_tomato.rendering.surfaces import tiled_box
 from maniskill_tomato.segmentation.synthesis.appearance import SceneAppearance
 
 AddBody = Callable[[list[sapien.render.RenderShape], sapien.Pose], sapien.Entity]
 HALF_LENGTH = 4.0
 """Half of the row's length that is built, in [m]."""
-
-
-def _box(
-    half: list[float], material: sapien.render.RenderMaterial, tile: float = 0.6
-) -> sapien.render.RenderShape:
-    # A box's own texture would stretch over its faces; this one repeats every `tile` metres.
-    corners: list[NDArray[np.float64]] = []
-    normals: list[NDArray[np.float64]] = []
-    uvs: list[list[float]] = []
-    faces: list[list[int]] = []
-    size = np.array(half)
-    for axis in range(3):
-        i, j = (axis + 1) % 3, (axis + 2) % 3
-        for sign in (-1.0, 1.0):
-            first = len(corners)
-            for a, b in ((-1, -1), (1, -1), (1, 1), (-1, 1)):
-                corner = np.zeros(3)
-                corner[axis], corner[i], corner[j] = sign * size[axis], a * size[i], b * size[j]
-                corners.append(corner)
-                normals.append(sign * np.eye(3)[axis])
-                along, across = (i, j) if size[i] >= size[j] else (j, i)
-                # Print on the side that faces the aisle (-x) is the right way round.
-                uvs.append([-corner[along] / tile, 0.5 - corner[across] / tile])
-            order = [[0, 1, 2], [0, 2, 3]] if sign > 0 else [[0, 2, 1], [0, 3, 2]]
-            faces += [[first + k for k in face] for face in order]
-    return sapien.render.RenderShapeTriangleMesh(
-        vertices=np.array(corners, np.float32),
-        triangles=np.array(faces, np.uint32),
-        normals=np.array(normals, np.float32),
-        uvs=np.array(uvs, np.float32),
-        material=material,
-    )
 
 
 def add_surroundings(add: AddBody, appearance: SceneAppearance, rng: Generator) -> None:
@@ -59,16 +27,19 @@ def add_surroundings(add: AddBody, appearance: SceneAppearance, rng: Generator) 
     """
     rows = [0.0] + [appearance.row_distance * k for k in (1, 2)] + [-appearance.row_distance]
     gutter, slab = (
-        paint.dirty(appearance.paint, rng, dirt=float(rng.uniform(0, 0.6))),
-        paint.printed(appearance.paint, rng),
+        surfaces.dirty(appearance.paint, rng, dirt=float(rng.uniform(0, 0.6))),
+        surfaces.printed(appearance.paint, rng),
     )
-    wool, pipe = paint.dirty((0.42, 0.36, 0.26), rng, dirt=0.6), paint.plain((0.8, 0.8, 0.78), roughness=0.4)
+    wool, pipe = (
+        surfaces.dirty((0.42, 0.36, 0.26), rng, dirt=0.6),
+        surfaces.plain((0.8, 0.8, 0.78), roughness=0.4),
+    )
     for x in rows:
         low = float(rng.uniform(-0.01, 0.01))
-        add([_box([0.14, HALF_LENGTH, 0.03], gutter)], sapien.Pose([x, 0, low - 0.21]))
-        add([_box([0.11, HALF_LENGTH, 0.04], slab)], sapien.Pose([x, 0, low - 0.14]))
+        add([tiled_box([0.14, HALF_LENGTH, 0.03], gutter)], sapien.Pose([x, 0, low - 0.21]))
+        add([tiled_box([0.11, HALF_LENGTH, 0.04], slab)], sapien.Pose([x, 0, low - 0.14]))
         for k in np.arange(-7, 8):
-            add([_box([0.05, 0.05, 0.05], wool)], sapien.Pose([x, 0.5 * k, low - 0.05]))
+            add([tiled_box([0.05, 0.05, 0.05], wool)], sapien.Pose([x, 0.5 * k, low - 0.05]))
         for side in (-0.25, 0.25):
             rail = sapien.render.RenderShapeCylinder(0.026, HALF_LENGTH, pipe)
             turned = sapien.Pose(
@@ -78,8 +49,8 @@ def add_surroundings(add: AddBody, appearance: SceneAppearance, rng: Generator) 
         if rng.random() < 0.5:
             wide = sapien.render.RenderShapeCylinder(0.05, HALF_LENGTH, gutter)
             add([wide], sapien.Pose([x + 0.25, 0, appearance.floor + 0.25], [0.7071, 0, 0, 0.7071]))
-    ground = paint.dirty(appearance.floor_colour, rng, dirt=float(rng.uniform(0.1, 0.9)))
-    add([_box([5.0, 5.0, 0.01], ground)], sapien.Pose([0, 0, appearance.floor]))
+    ground = surfaces.dirty(appearance.floor_colour, rng, dirt=float(rng.uniform(0.1, 0.9)))
+    add([tiled_box([5.0, 5.0, 0.01], ground)], sapien.Pose([0, 0, appearance.floor]))
     _add_strings(add, appearance, rng)
     _add_walls(add, appearance, rng)
 
@@ -87,7 +58,7 @@ def add_surroundings(add: AddBody, appearance: SceneAppearance, rng: Generator) 
 def _add_strings(add: AddBody, appearance: SceneAppearance, rng: Generator) -> None:
     colours = ((0.95, 0.95, 0.92), (0.75, 0.72, 0.6), (0.12, 0.12, 0.12))
     for _ in range(appearance.strings):
-        material = paint.plain(colours[int(rng.integers(3))])
+        material = surfaces.plain(colours[int(rng.integers(3))])
         radius = float(rng.uniform(0.0008, 0.003))
         x, y = float(rng.normal(0.02, 0.12)), float(rng.uniform(-0.9, 0.9))
         lean = rng.normal(0, 0.08, 2)
@@ -112,18 +83,22 @@ def _x_axis_to(
 
 def _add_walls(add: AddBody, appearance: SceneAppearance, rng: Generator) -> None:
     far = 5.0 if appearance.backdrop != "bright" else 2.2
-    wall = paint.far_greenery(appearance.wall, rng) if appearance.greenery else paint.glowing(appearance.wall)
-    dark = paint.plain((0.35, 0.36, 0.36))
+    wall = (
+        surfaces.far_greenery(appearance.wall, rng)
+        if appearance.greenery
+        else surfaces.glowing(appearance.wall)
+    )
+    dark = surfaces.plain((0.35, 0.36, 0.36))
     for sign in (1.0, -1.0):
-        add([_box([0.01, 6.0, 4.0], wall, 4.0)], sapien.Pose([sign * far, 0, 3.0]))
-        add([_box([6.0, 0.01, 4.0], wall, 4.0)], sapien.Pose([0, sign * 5.0, 3.0]))
+        add([tiled_box([0.01, 6.0, 4.0], wall, 4.0)], sapien.Pose([sign * far, 0, 3.0]))
+        add([tiled_box([6.0, 0.01, 4.0], wall, 4.0)], sapien.Pose([0, sign * 5.0, 3.0]))
         for y in np.arange(-4, 4.1, float(rng.uniform(0.8, 2.0))):
-            add([_box([0.02, 0.03, 4.0], dark)], sapien.Pose([sign * (far - 0.05), float(y), 3.0]))
-    roof = paint.glowing((1.2 * appearance.wall[0], 1.2 * appearance.wall[1], 1.25 * appearance.wall[2]))
-    add([_box([6.0, 6.0, 0.01], roof)], sapien.Pose([0, 0, 4.0]))
-    beam = paint.plain((0.7, 0.72, 0.72))
+            add([tiled_box([0.02, 0.03, 4.0], dark)], sapien.Pose([sign * (far - 0.05), float(y), 3.0]))
+    roof = surfaces.glowing((1.2 * appearance.wall[0], 1.2 * appearance.wall[1], 1.25 * appearance.wall[2]))
+    add([tiled_box([6.0, 6.0, 0.01], roof)], sapien.Pose([0, 0, 4.0]))
+    beam = surfaces.plain((0.7, 0.72, 0.72))
     for x in np.arange(-4, 4.1, 1.0):
-        add([_box([0.03, 6.0, 0.04], beam)], sapien.Pose([float(x), 0, 3.5]))
+        add([tiled_box([0.03, 6.0, 0.04], beam)], sapien.Pose([float(x), 0, 3.5]))
 
 
 def add_arm(scene: sapien.Scene, rng: Generator) -> list[sapien.Entity]:
