@@ -6,6 +6,7 @@ from functools import cache
 from pathlib import Path
 
 import pytest
+from documentation.pages import HOME, NAVIGATION, sources
 
 ROOT = Path(__file__).resolve().parent.parent
 PAGES = [
@@ -155,3 +156,10 @@ def test_every_message_that_the_troubleshooting_page_quotes_is_one_of_ours() -> 
         "a test picture took over 180 s",  # "took over %.0f s"
         "libGL.so.1: cannot open shared object file",  # The system's own.
     }
+
+
+def test_every_page_stands_once_in_the_side_bar_of_the_site() -> None:
+    named = sorted(name for names in NAVIGATION.values() for name in names)
+    assert named == sorted({*sources(), "api/index"} - {HOME}), (
+        "see NAVIGATION of tools/documentation/pages.py"
+    )
