@@ -92,7 +92,7 @@ def exists(dotted: str) -> bool:
 
 
 @cache
-def sources() -> tuple[str, ...]:
+def python_files() -> tuple[str, ...]:
     """All Python files outside hidden folders such as the environment's."""
     tops = [top for top in ROOT.iterdir() if not top.name.startswith(".")]
     nested = (path for top in tops if top.is_dir() for path in top.rglob("*.py"))
@@ -120,7 +120,7 @@ def test_names_of_modules_in_the_text_exist(page: Path) -> None:
         if not (ROOT / name).exists() and not (ROOT / "maniskill_tomato" / name).exists()
     }
     modules = re.findall(r"`([\w/]+\.py)`", text)
-    gone |= {name for name in modules if not any(path.endswith(f"/{name}") for path in sources())}
+    gone |= {name for name in modules if not any(path.endswith(f"/{name}") for path in python_files())}
     folders = re.findall(r"`([a-z_]+/[a-z_/]+/)`", text)
     gone |= {
         name for name in folders if not any((ROOT / top / name).is_dir() for top in ("", "maniskill_tomato"))
