@@ -80,7 +80,7 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
         (tmp_path / "runs" / run).mkdir(parents=True)
         shutil.copy(asset_path(asset), tmp_path / "runs" / run / "policy.pt")
     shutil.copy(profile_path("mock"), tmp_path / "lab.toml")
-    y_up = trimesh.transformations.rotation_matrix(-np.pi / 2, [1.0, 0.0, 0.0])
+    y_up = np.array([[1.0, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0], [0, 0, 0, 1]])
     (tmp_path / "foreign" / "validation").mkdir(parents=True)
     for place in (tmp_path, tmp_path / "foreign" / "validation"):
         write_vine(place / "vine.glb", 1.0, "tomato", y_up)
