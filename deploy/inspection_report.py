@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from maniskill_tomato.deploy.interface import Float64
-from maniskill_tomato.deploy.policy_run import MARK, write_text
+from maniskill_tomato.deploy.policy_run import MARK, wrap_text, write_text
 from maniskill_tomato.report_design import (
     GRID,
     INK,
@@ -19,6 +19,7 @@ from maniskill_tomato.report_design import (
     SKY,
     TOMATO,
     figure,
+    many_small,
     number,
     page,
     paragraph,
@@ -83,11 +84,14 @@ def overview(
     front = _front_view(fruits, cameras)
     rows = math.ceil(len(pictures) / COLUMNS)
     width = max(FRONT_SIZE[0], COLUMNS * (SIDE + 8) + 8)
-    sheet = np.full((BAR + FRONT_SIZE[1] + 8 + rows * (SIDE + BAR + 8), width, 3), 255, dtype=np.uint8)
-    write_text(sheet, title, (10, 24), 0.55)
-    sheet[BAR : BAR + front.shape[0], : front.shape[1]] = front
+    head = wrap_text(title, width - 20, 0.55)
+    bar = 18 + 22 * len(head)
+    sheet = np.full((bar + FRONT_SIZE[1] + 8 + rows * (SIDE + BAR + 8), width, 3), 255, dtype=np.uint8)
+    for k, line in enumerate(head):
+        write_text(sheet, line, (10, 24 + 22 * k), 0.55)
+    sheet[bar : bar + front.shape[0], : front.shape[1]] = front
     for k, picture in enumerate(pictures):
-        top = BAR + FRONT_SIZE[1] + 8 + (k // COLUMNS) * (SIDE + BAR + 8)
+        top = bar + FRONT_SIZE[1] + 8 + (k // COLUMNS) * (SIDE + BAR + 8)
         left = 8 + (k % COLUMNS) * (SIDE + 8)
         sheet[top : top + picture.shape[0], left : left + picture.shape[1]] = picture
     return sheet
@@ -121,7 +125,11 @@ def write_page(
     has_truth = any("true_visible_fraction" in fruit for fruit in fruits)
     rows = [_row(fruit, has_truth) for fruit in fruits]
     shown = [
-        figure(path.parent / fruit["picture"], f"Fruit {fruit['number']}, {fruit['ripeness']}")
+        figure(
+            path.parent / fruit["picture"],
+            f"Fruit {fruit['number']}, {fruit['ripeness']}: V_f {fruit['visible_fraction']:.2f} (0 to 1), "
+            f"{fruit['views']} views",
+        )
         for fruit in fruits
         if fruit["picture"] is not None
     ]
@@ -136,11 +144,16 @@ def write_page(
                 "The row",
                 paragraph(outcome),
                 figure(
-                    overview_file, "The row seen from the robot; ring: fully seen, line: the camera's way"
+                    overview_file,
+                    f"The row seen from the robot, in metres, n = {len(fruits)} fruits; thick ring: fully seen, "
+                    "line: the camera's way",
                 ),
             ),
-            section("Fruits", table([*head, *(["True V_f", "Off [mm]"] if has_truth else [])], rows)),
-            section("Pictures", f'<div class="pairs">{"".join(shown)}</div>') if shown else "",
+            section(
+                f"Fruits, n = {len(fruits)}",
+                table([*head, *(["True V_f", "Off [mm]"] if has_truth else [])], rows),
+            ),
+            section(f"Pictures, n = {len(shown)} fruits", many_small(*shown)) if shown else "",
         ],
         {**{key.replace("_", " "): str(facts[key]) for key in keys}, **run_facts()},
     ).encode()

@@ -1,4 +1,4 @@
-"""One run from a profile to its report: `result.json`, `report.png` with every look, and `run.mcap`."""
+"""One run from a profile to its report: `result.json`, `report.html` and `report.png` with every look, `run.mcap`."""
 
 import json
 import logging
@@ -23,6 +23,7 @@ from maniskill_tomato.deploy.interface import Float64
 from maniskill_tomato.deploy.loop import Loop
 from maniskill_tomato.deploy.profile import Profile
 from maniskill_tomato.deploy.recording import McapRecorder
+from maniskill_tomato.deploy.run_page import Look, run_page
 from maniskill_tomato.deploy.run_records import Mode, Proposal, Recorder, RunResult, Step
 from maniskill_tomato.deploy.workcell import Workcell, make_workcell
 from maniskill_tomato.errors import TomatoError
@@ -37,8 +38,8 @@ from maniskill_tomato.warp_runtime import load_kernels
 
 TILE: Final = (320, 240)
 """Largest size of one look, in [px]."""
-BAR: Final = 34
-"""Height of the caption below it, in [px]."""
+LINE: Final = 15
+"""Height of a line of the caption below it, in [px]."""
 COLUMNS: Final = 5
 MARK = (0, 230, 255)
 """Outline of the target; RGB."""
@@ -76,7 +77,7 @@ def run(
     clock: Clock | None = None,
     keyboard: bool = False,
 ) -> RunResult:
-    """Connects, runs, disconnects, and writes `result.json`, `report.png` and `run.mcap`.
+    """Connects, runs, disconnects, and writes `result.json`, `report.html`, `report.png` and `run.mcap`.
 
     Args:
         config: What to run.
@@ -291,30 +292,44 @@ class ContactSheet(StepFacts):
 
     def __init__(self) -> None:
         super().__init__()
-        self.tiles: list[NDArray[np.uint8]] = []
+        self.looks: list[Look] = []
 
     def step(self, step: Step) -> None:
         super().step(step)
-        self.tiles.append(_tile(step))
+        self.looks.append(_look(step))
 
     def picture(self, title: str) -> NDArray[np.uint8]:
-        """All looks side by side under a title. Shape (H, W, 3)."""
-        if not self.tiles:
+        """All looks side by side under a title; no text is cut. Shape (H, W, 3)."""
+        if not self.looks:
             return np.full((60, 400, 3), 255, dtype=np.uint8)
-        height = max(tile.shape[0] for tile in self.tiles)
-        width = max(tile.shape[1] for tile in self.tiles)
-        columns = min(COLUMNS, len(self.tiles))
-        rows = math.ceil(len(self.tiles) / columns)
-        sheet = np.full((BAR + rows * (height + 8), columns * (width + 8) + 8, 3), 255, dtype=np.uint8)
-        write_text(sheet, title, (10, 22), 0.55)
-        for k, tile in enumerate(self.tiles):
-            top, left = BAR + (k // columns) * (height + 8), 8 + (k % columns) * (width + 8)
-            sheet[top : top + tile.shape[0], left : left + tile.shape[1]] = tile
+        columns = min(COLUMNS, len(self.looks))
+        width = max(look.picture.shape[1] for look in self.looks)
+        sheet_width = columns * (width + 8) + 8
+        captions = [
+            [(look.title, 0.42), *((line, 0.36) for line in wrap_text(look.outcome, width - 8, 0.36))]
+            for look in self.looks
+        ]
+        height = max(
+            look.picture.shape[0] + LINE * len(lines) + 6
+            for look, lines in zip(self.looks, captions, strict=True)
+        )
+        head = wrap_text(title, sheet_width - 20, 0.55)
+        top = 12 + 22 * len(head)
+        rows = math.ceil(len(self.looks) / columns)
+        sheet = np.full((top + rows * (height + 8), sheet_width, 3), 255, dtype=np.uint8)
+        for k, line in enumerate(head):
+            write_text(sheet, line, (10, 22 * (k + 1)), 0.55)
+        for k, (look, lines) in enumerate(zip(self.looks, captions, strict=True)):
+            y, x = top + (k // columns) * (height + 8), 8 + (k % columns) * (width + 8)
+            h, w = look.picture.shape[:2]
+            sheet[y : y + h, x : x + w] = look.picture
+            for row, (line, size) in enumerate(lines, start=1):
+                write_text(sheet, line, (x + 4, y + h + LINE * row), size)
         return sheet
 
 
 def write_report(out: Path, result: RunResult, facts: dict[str, Any], sheet: ContactSheet) -> None:
-    """Writes `result.json` and `report.png`.
+    """Writes `result.json`, `report.png` and `report.html`.
 
     Raises:
         RecordingError: The disk does not take them.
@@ -324,7 +339,9 @@ def write_report(out: Path, result: RunResult, facts: dict[str, Any], sheet: Con
         f"{facts.get('profile')}, seed {facts.get('seed')}, {facts.get('policy_name')}: {result.reason}, "
         f"V_f {result.visible_fraction:.2f} after {result.moves} moves"
     )
+    # The result first: what matters most when the disk is nearly full.
     write_files(out, {"result.json": as_json(content), "report.png": as_png(sheet.picture(title))})
+    write_files(out, {"report.html": run_page(result, facts, sheet.looks, sheet.steps)})
 
 
 def result_facts(result: RunResult) -> dict[str, Any]:
@@ -364,7 +381,7 @@ def write_files(out: Path, files: Mapping[str, bytes]) -> None:
         raise RecordingError(f"cannot write the report into {out}: {error.__cause__ or error}") from error
 
 
-def _tile(step: Step) -> NDArray[np.uint8]:
+def _look(step: Step) -> Look:
     color = step.frame.color.copy()
     scale = min(TILE[0] / color.shape[1], TILE[1] / color.shape[0])
     size = (round(color.shape[1] * scale), round(color.shape[0] * scale))
@@ -378,12 +395,39 @@ def _tile(step: Step) -> NDArray[np.uint8]:
         u = round((i.fx * centre[0] / centre[2] + i.cx) * scale)
         v = round((i.fy * centre[1] / centre[2] + i.cy) * scale)
         cv2.drawMarker(small, (u, v), MARK, cv2.MARKER_CROSS, 9, 1)
-    tile = np.full((small.shape[0] + BAR, small.shape[1], 3), 255, dtype=np.uint8)
-    tile[: small.shape[0]] = small
-    write_text(tile, f"{step.number}: V_f {step.view.visible_fraction:.2f}", (4, small.shape[0] + 14), 0.42)
-    what = step.outcome if not step.detail else f"{step.outcome}: {step.detail}"
-    write_text(tile, what[:48], (4, small.shape[0] + 29), 0.36)
-    return tile
+    return Look(
+        picture=small,
+        title=f"{step.number}: V_f {step.view.visible_fraction:.2f}",
+        outcome=step.outcome if not step.detail else f"{step.outcome}: {step.detail}",
+    )
+
+
+def wrap_text(text: str, width: int, size: float) -> list[str]:
+    """A text in lines that `write_text` fits into a width; a word that is wider is broken.
+
+    Args:
+        text: One line.
+        width: In [px].
+        size: As for `write_text`.
+    """
+
+    def fits(line: str) -> bool:
+        return int(cv2.getTextSize(line, cv2.FONT_HERSHEY_SIMPLEX, size, 1)[0][0]) <= width
+
+    lines = [""]
+    for word in text.split():
+        joined = f"{lines[-1]} {word}".strip()
+        if fits(joined):
+            lines[-1] = joined
+            continue
+        if lines[-1]:
+            lines.append("")
+        while not fits(word):
+            part = next(n for n in range(len(word) - 1, 0, -1) if n == 1 or fits(word[:n]))
+            lines[-1], word = word[:part], word[part:]
+            lines.append("")
+        lines[-1] = word
+    return lines
 
 
 def write_text(image: NDArray[np.uint8], text: str, at: tuple[int, int], size: float) -> None:

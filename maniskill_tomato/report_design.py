@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Final
 
 import maniskill_tomato
+from maniskill_tomato.files import write_atomically
 
 INK, MUTED, GRID, PAPER = "#1f2a24", "#6b7770", "#e3e7e2", "#fafaf7"
 CARD, AXIS = "#ffffff", "#b9c2bb"
@@ -81,7 +82,7 @@ code { font: 13px/1.5 ui-monospace, SFMono-Regular, Menlo, Consolas, monospace; 
   background: var(--card); border: 1px solid var(--line); border-radius: 10px; padding: 16px 18px;
   display: flex; flex-direction: column;
 }
-.tile b { font-size: 32px; line-height: 1.1; font-variant-numeric: tabular-nums; }
+.tile b { font-size: 28px; line-height: 1.1; font-variant-numeric: tabular-nums; }
 .tile:first-child b { color: var(--leaf); }
 .tile span { margin: 6px 0 8px; font-weight: 600; line-height: 1.35; }
 .tile small { color: var(--muted); }
@@ -103,7 +104,9 @@ figcaption, .caption { color: var(--muted); font-size: 14px; margin: 10px 2px 0;
 table { width: 100%; border-collapse: collapse; font-variant-numeric: tabular-nums; }
 th, td { padding: 9px 14px; border-bottom: 1px solid var(--line); text-align: right; white-space: nowrap; }
 tbody th { text-align: left; font-weight: 500; white-space: normal; min-width: 7em; }
-thead th { color: var(--muted); font-weight: 600; font-size: 14px; vertical-align: bottom; white-space: normal; }
+thead th {
+  color: var(--muted); font-weight: 600; font-size: 14px; min-width: 4.6em; vertical-align: bottom; white-space: normal;
+}
 thead th:first-child, .words { text-align: left; }
 .tall thead th { position: sticky; top: 0; background: var(--card); }
 td.words { white-space: normal; min-width: 15em; }
@@ -209,8 +212,22 @@ def figure(path: Path, caption: str) -> str:
     """
     text = html.escape(caption)
     plot = path.with_suffix(".svg")
-    shown = _plot(plot, text) if plot.is_file() else f'<img alt="{text}" src="{_picture_data(path)}">'
-    return f"<figure>{shown}<figcaption>{text}</figcaption></figure>"
+    if plot.is_file():
+        return f"<figure>{_plot(plot, text)}<figcaption>{text}</figcaption></figure>"
+    return photo(path.read_bytes(), caption)
+
+
+def photo(content: bytes, caption: str) -> str:
+    """A picture that is no file, with its caption below.
+
+    Args:
+        content: Of a PNG or JPEG file.
+        caption: As text.
+    """
+    text = html.escape(caption)
+    return (
+        f'<figure><img alt="{text}" src="{_picture_data(content)}"><figcaption>{text}</figcaption></figure>'
+    )
 
 
 def film(path: Path, poster: Path | None, caption: str, folder: Path) -> str:
@@ -231,7 +248,7 @@ def film(path: Path, poster: Path | None, caption: str, folder: Path) -> str:
         source = link
         limit = LARGEST_FILM / 1e6
         where = f"It has {size / 1e6:.1f} MB; above {limit:.0f} MB it is not in this page but beside it: "
-    shown = "" if poster is None else f' poster="{_picture_data(poster)}"'
+    shown = "" if poster is None else f' poster="{_picture_data(poster.read_bytes())}"'
     return (
         f'<figure><video controls preload="metadata"{shown} src="{source}"></video>'
         f'<figcaption>{html.escape(caption)} {html.escape(where)}<a href="{link}">{link}</a>.</figcaption></figure>'
@@ -262,7 +279,7 @@ def table(
     kinds = {**dict.fromkeys(words, "words"), **dict.fromkeys(commands, "command")}
 
     def cell(column: int, text: str) -> str:
-        kind = f' class="{kinds[column]}"' if column in kinds else ""
+        kind = f' class="{kinds[column]}"' if column in kinds and text else ""
         escaped = html.escape(text)
         return f"<td{kind}>{f'<code>{escaped}</code>' if column in commands and text else escaped}</td>"
 
@@ -312,6 +329,17 @@ def markdown_table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
     return "\n".join("| " + " | ".join(cell.replace("|", "\\|") for cell in line) + " |" for line in lines)
 
 
+def report(out: Path, title: str, subtitle: str, sections: Sequence[str], facts: Mapping[str, str]) -> Path:
+    """Writes `report.html` into a folder; arguments as for `page`.
+
+    Raises:
+        NotWrittenError: The file cannot be written.
+    """
+    path = out / "report.html"
+    write_atomically(path, page(title, subtitle, sections, facts).encode())
+    return path
+
+
 def percent(value: float, decimals: int = 1) -> str:
     """A share as text, `97.5 %`."""
     return f"{100.0 * value:.{decimals}f} %"
@@ -349,14 +377,14 @@ def _plot(path: Path, alt: str) -> str:
     return f'<div class="scroll">{text}</div>'
 
 
-def _picture_data(path: Path) -> str:
+def _picture_data(content: bytes) -> str:
     """A picture's file as the source of an image; large PNG files are packed as JPEG."""
-    content = path.read_bytes()
-    kind = "jpeg" if path.suffix.lower() in (".jpg", ".jpeg") else "png"
+    kind = "png" if content.startswith(b"\x89PNG") else "jpeg"
     if kind == "png" and len(content) > LARGEST_PICTURE:
         import cv2
+        import numpy as np
 
-        picture = cv2.imread(str(path))
+        picture = cv2.imdecode(np.frombuffer(content, np.uint8), cv2.IMREAD_COLOR)
         if picture is not None:
             ok, packed = cv2.imencode(".jpg", picture, (cv2.IMWRITE_JPEG_QUALITY, 88))
             if ok and len(packed) < len(content):

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 from maniskill_tomato.files import write_atomically
-from maniskill_tomato.report_design import AXIS, CARD, GRID, INK, MUTED, SERIES
+from maniskill_tomato.report_design import AXIS, CARD, GRID, INK, MUTED, SERIES, SKY
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -42,7 +42,7 @@ PLOT_STYLE: Final[Any] = {
 }
 """For `matplotlib.rc_context`."""
 
-PANEL: Final = (4.4, 3.3)
+PANEL: Final = (4.25, 3.2)
 """Width and height of a plot that a phone shows as a whole, in [in]."""
 
 WIDE: Final = (9.0, 3.1)
@@ -142,6 +142,55 @@ def label_ends(
 def panel_size(names: Iterable[str]) -> tuple[float, float]:
     """`PANEL`, or as high as the names at the ends of its lines need, in [in]."""
     return PANEL[0], max(PANEL[1], sum(_label_height(_wrapped(name)) for name in names) / 72.0 + 1.0)
+
+
+def plot_intervals(
+    values: Mapping[str, tuple[float, float, float] | float],
+    title: str,
+    label: str,
+    path: Path,
+    limits: tuple[float | None, float | None] = (None, None),
+) -> None:
+    """Values side by side, a line each: a point with its number, and its interval where there is one.
+
+    Args:
+        values: The value, or the value with both ends of its interval, by name.
+        title: Above them.
+        label: Of the axis, with its unit.
+        path: The picture to write.
+        limits: Of the axis; None fits the values.
+    """
+    import matplotlib as mpl
+    from matplotlib.figure import Figure
+
+    names = {name: textwrap.fill(name, 24, break_long_words=True) for name in values}
+    heights = [max(_label_height(text), 22.0) for text in names.values()]
+    middles = [sum(heights[:k]) + height / 2 for k, height in enumerate(heights)]
+    with mpl.rc_context(PLOT_STYLE):
+        figure = Figure(figsize=(PANEL[0], sum(heights) / 72.0 + 1.0))
+        axes = figure.subplots()
+        for value, y in zip(values.values(), middles, strict=True):
+            middle, low, high = value if isinstance(value, tuple) else (value, value, value)
+            axes.plot([low, high], [y, y], color=SKY, linewidth=2.4, alpha=0.6, solid_capstyle="round")
+            axes.plot([middle], [y], marker="o", color=SKY, markersize=6.0)
+            axes.annotate(
+                f"{middle:.3g}",
+                (high, y),
+                xytext=(6, 0),
+                textcoords="offset points",
+                va="center",
+                fontsize=8.5,
+            )
+        axes.set_yticks(middles, list(names.values()))
+        axes.tick_params(axis="y", labelcolor=INK, length=0)
+        axes.set_ylim(sum(heights), 0.0)
+        axes.set_xlim(*limits)
+        low, high = axes.get_xlim()
+        axes.set_xlim(low, high + 0.16 * (high - low))
+        axes.grid(False, axis="y")
+        axes.set_title(title, loc="left")
+        axes.set_xlabel(label)
+        save_figure(figure, path)
 
 
 def _wrapped(name: str) -> str:

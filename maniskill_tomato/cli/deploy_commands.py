@@ -70,7 +70,7 @@ class DeployRun(_Moving):
     """
 
     out: Path = Path("runs/deploy")
-    """Folder of result.json, report.png and run.mcap."""
+    """Folder of result.json, report.html, report.png and run.mcap."""
 
     def run(self) -> None:
         """Runs, and says how it ended."""
@@ -86,7 +86,7 @@ class DeployRun(_Moving):
         )
         if not result.report_error:
             print(f"result  {self.out / 'result.json'}")
-            print(f"report  {self.out / 'report.png'}")
+            print(f"report  {self.out / 'report.html'}")
         _tell_fault(result, self.out)
         _end(result)
 

@@ -69,7 +69,7 @@ class Dataset:
         print(f"images {len(images.images)}, visible fruits {fruits}")
         print(f"COCO   {self.out / 'annotations.json'} and {self.out / 'annotations_amodal.json'}")
         print(f"VOC    {self.out / 'Annotations'}")
-        print(f"page   {page}")
+        print(f"report {page}")
 
 
 @dataclass(frozen=True, kw_only=True)

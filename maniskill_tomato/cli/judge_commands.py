@@ -31,7 +31,7 @@ class JudgeOcclusion:
     data: Path
     """A folder of `maniskill-tomato dataset`."""
     out: Path = Path("runs/occlusion")
-    """Folder of occlusion.md and occlusion.json, or of steps.png."""
+    """Folder of report.html and occlusion.json, or of steps.png."""
     models: tuple[OcclusionModelName, ...] = ("thesis", "improved", "sphere", "amodal")
     """Which models."""
     segmenter: str | None = None
@@ -82,6 +82,7 @@ class JudgeOcclusion:
                 on_image=bar.update,
             )
         print(text)
+        print(f"report {self.out / 'report.html'}")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -100,7 +101,7 @@ class JudgeSegmenter:
     """Rendered fruits narrower than this share of the image's longer side are set aside; by default 12 px of 640; 0:
     the tiniest alone."""
     out: Path = Path("runs/segmenter-evaluation")
-    """Folder of metrics.json, precision_recall.png, overlaps.png and pictures.jpg."""
+    """Folder of metrics.json, report.html, precision_recall.png, overlaps.png and pictures.jpg."""
 
     def run(self) -> None:
         """Evaluates and prints the figures."""
@@ -112,6 +113,7 @@ class JudgeSegmenter:
         from maniskill_tomato.segmentation.datasets.annotations import SMALLEST_SHARE
         from maniskill_tomato.segmentation.datasets.reading import read_place
         from maniskill_tomato.segmentation.metrics.detector_evaluation import coco_table, evaluate_segmenter
+        from maniskill_tomato.segmentation.metrics.evaluation_page import write_evaluation_page
         from maniskill_tomato.segmentation.segmenter import open_for_files
 
         segmenter = open_for_files(self.segmenter, 0.02, self.thorough)
@@ -126,6 +128,8 @@ class JudgeSegmenter:
             if not name.startswith("coco_"):
                 print(f"{name:24} {value:.4g}")
         print(coco_table(metrics))
+        about = {"segmenter": self.segmenter, "data": self.data, "thorough": str(self.thorough)}
+        print(f"report {write_evaluation_page(metrics, self.out, about)}")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -142,7 +146,7 @@ class JudgePlants:
     triangles: int | None = None
     """The most that a plant may keep; by default what mesh.toml says."""
     out: Path = Path("runs/plants")
-    """Folder of plants.md and plants.json."""
+    """Folder of report.html and plants.json."""
 
     def run(self) -> None:
         """Reads the plants and prints the table."""
@@ -160,6 +164,7 @@ class JudgePlants:
         with tqdm(total=count, unit="plant", disable=None) as bar:
             text = judge_meshes(source, self.split, self.triangles, self.out, bar.update)
         print(text)
+        print(f"report {self.out / 'report.html'}")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -176,7 +181,9 @@ class JudgePerception(PerceptionComparisonConfig):
 
         from maniskill_tomato.experiments.perception_comparison import compare_perceptions
 
-        print(compare_perceptions(self))
+        done = compare_perceptions(self)
+        print(done.table)
+        print(f"report  {done.report}")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -199,3 +206,4 @@ class JudgeTwin(TwinConfig):
 
         measure = inspect_twin if self.inspect else compare_twin
         print(json.dumps(measure(self, say), indent=1))
+        say(f"report  {self.out / 'report.html'}")

@@ -65,7 +65,9 @@ class BenchmarkRows(RowBenchmarkConfig):
 
         from maniskill_tomato.experiments.row_benchmark import run_row_benchmark
 
-        print(run_row_benchmark(self))
+        done = run_row_benchmark(self)
+        print(done.text)
+        print(f"report  {done.report}")
 
 
 @dataclass(frozen=True, kw_only=True)

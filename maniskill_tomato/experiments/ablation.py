@@ -3,6 +3,7 @@
 import dataclasses
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -10,13 +11,16 @@ import numpy as np
 import maniskill_tomato
 from maniskill_tomato.errors import InvalidInputError
 from maniskill_tomato.experiments.configs import AblationConfig
-from maniskill_tomato.experiments.statistics import Interval, interquartile_interval, interval_text
+from maniskill_tomato.experiments.statistics import Interval, ends, interquartile_interval, interval_text
 from maniskill_tomato.experiments.training_study import SOLVED, WINDOW, Trial, run_trials
 from maniskill_tomato.experiments.variants import Evaluation, Variant, choose_variants
-from maniskill_tomato.files import write_atomically, write_json
+from maniskill_tomato.files import write_json
 from maniskill_tomato.folder_lock import only_writer
 from maniskill_tomato.learning.rl.presets import get_preset
-from maniskill_tomato.report_design import markdown_table
+from maniskill_tomato.report_design import figure, markdown_table, paragraph, report, section, side_by_side
+from maniskill_tomato.report_design import table as html_table
+from maniskill_tomato.report_plots import plot_intervals
+from maniskill_tomato.run_facts import run_facts
 from maniskill_tomato.tasks import THESIS_IDS
 
 JUDGED = Evaluation(name="evaluation", title="the plant and the pose of the training")
@@ -80,15 +84,15 @@ def ablation_rows(variants: Sequence[Variant], results: Sequence[Result]) -> lis
     return rows
 
 
-def run_ablation(config: AblationConfig, report: Callable[[str], None] = lambda line: None) -> str:
-    """Runs what is missing, and writes ablation.json and ablation.md after every run.
+def run_ablation(config: AblationConfig, tell: Callable[[str], None] = lambda line: None) -> str:
+    """Runs what is missing, and writes ablation.json and report.html after every run.
 
     Args:
         config: What to compare.
-        report: Told one line after each run.
+        tell: Told one line after each run.
 
     Returns:
-        The content of ablation.md.
+        The table as Markdown.
 
     Raises:
         InvalidInputError: An option cannot be used, or a folder holds a run of other settings.
@@ -96,10 +100,10 @@ def run_ablation(config: AblationConfig, report: Callable[[str], None] = lambda 
         CheckpointError: Another process measures in the folder.
     """
     with only_writer(config.out, "measures"):
-        return _run_ablation(config, report)
+        return _run_ablation(config, tell)
 
 
-def _run_ablation(config: AblationConfig, report: Callable[[str], None]) -> str:
+def _run_ablation(config: AblationConfig, tell: Callable[[str], None]) -> str:
     variants = choose_variants(config.variants)
     trials = plan_trials(config, variants)
     results: list[Result] = []
@@ -107,7 +111,7 @@ def _run_ablation(config: AblationConfig, report: Callable[[str], None]) -> str:
     for number, (trial, found) in enumerate(run_trials(trials, config.jobs), start=1):
         results.append(_result(trial, found))
         text = write_ablation(config, variants, results)
-        report(
+        tell(
             f"{number} of {len(trials)}: {trial.env_id} {trial.variant.name}, seed {trial.seed}: "
             f"success {results[-1]['success_rate']:.0%}, {results[-1]['training_cpu_seconds']:.0f} s of CPU"
         )
@@ -145,7 +149,7 @@ def plan_trials(config: AblationConfig, variants: Sequence[Variant]) -> list[Tri
 
 
 def write_ablation(config: AblationConfig, variants: Sequence[Variant], results: Sequence[Result]) -> str:
-    """Writes ablation.json and ablation.md; returns the latter's content."""
+    """Writes ablation.json and report.html; returns the table as Markdown."""
     rows = ablation_rows(variants, results)
     ordered = sorted(results, key=lambda r: (r["env_id"], r["variant"], r["seed"]))
     episodes = sorted({int(r["episodes"]) for r in results})
@@ -160,9 +164,36 @@ def write_ablation(config: AblationConfig, variants: Sequence[Variant], results:
     write_json(config.out / "ablation.json", content)
     table = markdown_table(HEAD, [_cells(row) for row in rows])
     listed = " and ".join(map(str, episodes))
-    text = f"{table}\n\nPreset `{config.preset}`, {listed} evaluation episodes for each run. {METHOD}\n"
-    write_atomically(config.out / "ablation.md", text.encode())
-    return text
+    plots = [_plot(task, rows, config.out) for task in dict.fromkeys(row.task for row in rows)]
+    told = f"Preset {config.preset}, {listed} evaluation episodes for each run. {METHOD}"
+    report(
+        config.out,
+        "What each option of the learner is worth",
+        f"{len(results)} trainings of {len({row.variant for row in rows})} variants of {config.preset}",
+        [
+            section(
+                f"Variants, n = {len(results)} trainings",
+                html_table(HEAD, [_cells(row) for row in rows], words=(1,)),
+                paragraph(told, "caption"),
+            ),
+            section("Success", side_by_side(*plots)),
+        ],
+        run_facts(),
+    )
+    return f"{table}\n\nPreset `{config.preset}`, {listed} evaluation episodes for each run. {METHOD}\n"
+
+
+def _plot(task: str, rows: Sequence[AblationRow], out: Path) -> str:
+    """The success of the variants on a task, as HTML."""
+    own = [row for row in rows if row.task == task]
+    path = out / f"success-{task.replace(' ', '-')}.png"
+    plot_intervals({row.title: ends(row.success_rate) for row in own}, task, "share of episodes solved", path)
+    seeds = " or ".join(str(n) for n in sorted({row.runs for row in own}))
+    return figure(
+        path,
+        f"Share of episodes solved on {task} (0 to 1): interquartile mean and 95 % interval, n = {seeds} trainings a "
+        "line.",
+    )
 
 
 def _result(trial: Trial, found: Mapping[str, Any]) -> dict[str, Any]:

@@ -462,7 +462,7 @@ def _tests_table(tests: Sequence[Mapping[str, Any]]) -> str:
                 _p(test["moves_p"]),
             )
         )
-    return table(head, rows, tall=len(rows) > 14)
+    return table(head, rows, words=(1,), tall=len(rows) > 14)
 
 
 def _sweep_table(rows: Sequence[Mapping[str, Any]]) -> str:

@@ -223,7 +223,7 @@ class AblationConfig:
     jobs: int = 1
     """Runs at a time."""
     out: Path = Path("runs/ablation")
-    """Folder of the runs and of ablation.json and ablation.md."""
+    """Folder of the runs and of ablation.json and report.html."""
 
     def __post_init__(self) -> None:
         check_positive(episodes=self.episodes, jobs=self.jobs)
@@ -247,7 +247,7 @@ class ReproductionConfig:
     """Names of variants; by default the exact settings alone, or all of them with --ablate. A+B makes two changes, and
     td3-without-A+B puts two parts of the preset td3 back to the exact settings."""
     ablate: bool = False
-    """Judge each variant at the training pose only, draw nothing, and write the table ablation.md."""
+    """Judge each variant at the training pose only, draw nothing, and write their table as report.html."""
     episodes: int = 100
     """Evaluation episodes; the first six are the thesis's."""
     untrained: int = 200

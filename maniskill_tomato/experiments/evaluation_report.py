@@ -94,8 +94,8 @@ def _summary(metrics: Mapping[str, Any]) -> str:
         ("mean_steps", "{:.1f} moves", "an episode, mean", f"{unit}; failures count with all their moves"),
         (
             "mean_max_visible_fraction",
-            "{:.2f} of 1",
-            "largest visible fraction V_f, mean",
+            "V_f {:.2f}",
+            "largest visible fraction (0 to 1), mean",
             f"{unit}; {metrics['mean_initial_visible_fraction']:.2f} at the start",
         ),
         (

@@ -16,9 +16,10 @@ from maniskill_tomato.plants.mesh_plant import plant_from_mesh
 from maniskill_tomato.plants.mesh_set import MeshSource
 from maniskill_tomato.plants.organs import Plant, SemanticClass
 from maniskill_tomato.raycast.scene import RayScene
-from maniskill_tomato.report_design import markdown_table
+from maniskill_tomato.report_design import markdown_table, paragraph, report, section, table
 from maniskill_tomato.robot.d435 import color_intrinsics
 from maniskill_tomato.robot.look_at import look_at_pose
+from maniskill_tomato.run_facts import run_facts
 from maniskill_tomato.tasks.row.row_config import GeneralTaskConfig
 
 AZIMUTHS_DEG: Final = (-60.0, -45.0, -30.0, 0.0, 30.0, 45.0, 60.0)
@@ -72,7 +73,7 @@ def judge_meshes(
         source: File or folder, with its rules.
         split: Whose plants, or `all`.
         triangles: The budget; None takes that of the rules.
-        out: Folder of plants.md and plants.json.
+        out: Folder of report.html and plants.json.
         on_plant: Called with 1 after each plant.
 
     Returns:
@@ -91,10 +92,23 @@ def judge_meshes(
         rows.append(_row(whole, fewer, found.split_of(seed)))
         if on_plant is not None:
             on_plant(1)
-    text = _markdown(rows, rules.triangles)
-    write_atomically(out / "plants.md", text.encode())
+    head, cells, told = _table(rows, rules.triangles)
     write_atomically(out / "plants.json", json.dumps([asdict(row) for row in rows], indent=1).encode())
-    return text
+    report(
+        out,
+        "Plants from mesh files",
+        f"{len(rows)} plants, split {split}",
+        [
+            section(
+                f"Plants, n = {len(rows)}",
+                table(head, cells),
+                paragraph(told or "All triangles are kept: there is no budget to judge.", "caption"),
+            )
+        ],
+        run_facts(),
+    )
+    text = markdown_table(head, cells) + "\n"
+    return f"{told}\n\n{text}" if told else text
 
 
 def fixed_views(centre: NDArray[np.floating[Any]]) -> torch.Tensor:
@@ -144,11 +158,12 @@ def _row(whole: Plant, fewer: Plant, split: str) -> MeshRow:
     )
 
 
-def _markdown(rows: list[MeshRow], budget: int | None) -> str:
+def _table(rows: list[MeshRow], budget: int | None) -> tuple[list[str], list[list[str]], str]:
+    """Head and lines of the table, and what its figures are; no words where no budget is judged."""
     head = ["plant", "split", "leaves", "fruits (ripe)", "triangles"]
     cells = [[r.plant, r.split, str(r.leaves), f"{r.fruits} ({r.ripe})", f"{r.triangles:,}"] for r in rows]
     if budget is None:
-        return markdown_table(head, cells) + "\n"
+        return head, cells, ""
     head += ["kept", "change of V_f: mean", "largest", f"views across {FULL}"]
     views = sum(row.views for row in rows)
     for row, line in zip(rows, cells, strict=True):
@@ -163,8 +178,9 @@ def _markdown(rows: list[MeshRow], budget: int | None) -> str:
         + [f"{sum(r.crossed for r in rows)} of {views}"]
     )
     count = len(AZIMUTHS_DEG) * len(ELEVATIONS_DEG)
-    return (
+    told = (
         f"At most {budget:,} triangles a plant. V_f of ripe fruits from {count} views each, {DISTANCE} m away: "
         f"azimuths of {AZIMUTHS_DEG[0]:.0f} to {AZIMUTHS_DEG[-1]:.0f} degrees from the robot's side, elevations of "
-        f"{ELEVATIONS_DEG[0]:.0f} to {ELEVATIONS_DEG[-1]:.0f}.\n\n{markdown_table(head, cells)}\n"
+        f"{ELEVATIONS_DEG[0]:.0f} to {ELEVATIONS_DEG[-1]:.0f}."
     )
+    return head, cells, told

@@ -1,14 +1,28 @@
 """The occlusion models on a folder of rendered images: tables of their errors, or every step on one image."""
 
 import json
-from collections.abc import Callable, Sequence
+import math
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
 
 from maniskill_tomato.errors import InvalidInputError
 from maniskill_tomato.experiments.occlusion_figure import draw_steps
-from maniskill_tomato.experiments.occlusion_scores import annotated_fruits, judge, make_view, markdown
+from maniskill_tomato.experiments.occlusion_scores import (
+    SCORE_HEAD,
+    Judged,
+    annotated_fruits,
+    band_table,
+    judge,
+    make_view,
+    markdown,
+    score,
+    score_cells,
+)
 from maniskill_tomato.files import write_atomically
+from maniskill_tomato.report_design import figure, paragraph, report, section, table
+from maniskill_tomato.report_plots import plot_intervals
+from maniskill_tomato.run_facts import run_facts
 from maniskill_tomato.segmentation.datasets.annotations import AnnotatedImage
 from maniskill_tomato.segmentation.datasets.reading import read_annotated
 from maniskill_tomato.segmentation.segmenter import make_segmenter
@@ -28,7 +42,7 @@ def report_occlusion(
     segmenter: str | None = None,
     on_image: Callable[[int], object] | None = None,
 ) -> str:
-    """Judges models and writes occlusion.md, and occlusion.json with every single judgement.
+    """Judges models and writes report.html, and occlusion.json with every single judgement.
 
     Args:
         images: With depth, cameras and V_f.
@@ -61,14 +75,48 @@ def report_occlusion(
         if segmenter is None
         else f"masks of {segmenter}; failures are tomatoes that it missed, too"
     )
-    text = (
+    told = (
         f"{len(images)} images, {', '.join(categories)}, at least {min_visible} px visible, {min_total} px in all, "
         f"{masks}."
-        f"\n\n{markdown(judged, milliseconds)}"
     )
-    write_atomically(out / "occlusion.md", text.encode())
     write_atomically(out / "occlusion.json", json.dumps([asdict(j) for j in judged]).encode())
-    return text
+    _write_report(out, judged, milliseconds, told)
+    return f"{told}\n\n{markdown(judged, milliseconds)}"
+
+
+def _write_report(out: Path, judged: list[Judged], milliseconds: Mapping[str, float], told: str) -> None:
+    """Writes report.html with a plot of the models' errors."""
+    errors = {name: score([j for j in judged if j.model == name]).mae for name in milliseconds}
+    known = {name: error for name, error in errors.items() if math.isfinite(error)}
+    count = len(judged) // max(len(milliseconds), 1)
+    of = f"n = {count} tomatoes a model"
+    shown = []
+    if known:
+        plot_intervals(
+            known, "Error in V_f", "mean absolute error of V_f (0 to 1)", out / "errors.png", (0.0, None)
+        )
+        shown.append(
+            figure(out / "errors.png", f"Mean absolute error of V_f (0 to 1), less is better; {of}.")
+        )
+    report(
+        out,
+        "Occlusion models",
+        told,
+        [
+            section(
+                f"Errors in V_f, {of}",
+                table(SCORE_HEAD, score_cells(judged, milliseconds)),
+                *shown,
+                paragraph(
+                    "MAE: mean absolute error of V_f (0 to 1); a failure counts as a guess of 0. Bias and RMSE are "
+                    "without failures. CPU time in ms for an image, without the segmenter's.",
+                    "caption",
+                ),
+            ),
+            section("By how hidden the tomato is", table(*band_table(judged, milliseconds))),
+        ],
+        run_facts(),
+    )
 
 
 def draw_occlusion(data: Path, file_name: str, out: Path, *, models: Sequence[str], min_visible: int) -> Path:

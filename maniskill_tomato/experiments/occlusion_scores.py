@@ -182,17 +182,25 @@ def by_band(judged: list[Judged]) -> list[tuple[tuple[float, float], Score]]:
     return [(band, score([j for j in judged if band[0] <= j.truth < band[1]])) for band in BANDS]
 
 
-def markdown(judged: list[Judged], milliseconds: Mapping[str, float]) -> str:
-    """The judgements as two tables."""
-    head = ("model", "tomatoes", "MAE", "bias", "RMSE", "failures", "CPU ms an image")
-    of_model = {name: [j for j in judged if j.model == name] for name in milliseconds}
-    rows = []
-    for name, own in of_model.items():
+SCORE_HEAD = ("model", "tomatoes", "MAE", "bias", "RMSE", "failures", "CPU ms an image")
+
+
+def score_cells(judged: list[Judged], milliseconds: Mapping[str, float]) -> list[tuple[str, ...]]:
+    """The lines of a table with `SCORE_HEAD`."""
+    rows: list[tuple[str, ...]] = []
+    for name, own in _by_model(judged, milliseconds).items():
         s = score(own)
         errors = f"{s.mae:.3f}", f"{s.bias:+.3f}", f"{s.rmse:.3f}"
         rows.append((name, str(s.count), *errors, str(s.failures), f"{milliseconds[name]:.0f}"))
-    bands = [by_band(own) for own in of_model.values()]
-    by_truth = [
+    return rows
+
+
+def band_table(
+    judged: list[Judged], milliseconds: Mapping[str, float]
+) -> tuple[tuple[str, ...], list[tuple[str, ...]]]:
+    """Head and lines of a table of errors by the true V_f."""
+    bands = [by_band(own) for own in _by_model(judged, milliseconds).values()]
+    rows = [
         (
             f"{low:g} to {min(high, 1):g}",
             *(f"{band[k][1].mae:.3f} ({band[k][1].bias:+.3f})" for band in bands),
@@ -200,5 +208,14 @@ def markdown(judged: list[Judged], milliseconds: Mapping[str, float]) -> str:
         )
         for k, (low, high) in enumerate(BANDS)
     ]
-    truth_head = ("true V_f", *(f"{name}: MAE (bias)" for name in milliseconds), "tomatoes")
-    return f"{markdown_table(head, rows)}\n\n{markdown_table(truth_head, by_truth)}\n"
+    return ("true V_f", *(f"{name}: MAE (bias)" for name in milliseconds), "tomatoes"), rows
+
+
+def markdown(judged: list[Judged], milliseconds: Mapping[str, float]) -> str:
+    """The judgements as two tables."""
+    by_model = markdown_table(SCORE_HEAD, score_cells(judged, milliseconds))
+    return f"{by_model}\n\n{markdown_table(*band_table(judged, milliseconds))}\n"
+
+
+def _by_model(judged: list[Judged], milliseconds: Mapping[str, float]) -> dict[str, list[Judged]]:
+    return {name: [j for j in judged if j.model == name] for name in milliseconds}

@@ -140,6 +140,8 @@ def plot_steps(episodes: Sequence[EpisodeRecord], path: Path) -> None:
         axes = figure.subplots()
         for solved, look in OUTCOMES.items():
             some = [k for k, e in enumerate(episodes) if e.success == solved]
+            if not some:
+                continue
             axes.bar(
                 [k + 1 for k in some],
                 [episodes[k].steps for k in some],
@@ -171,6 +173,8 @@ def plot_visible_fraction(episodes: Sequence[EpisodeRecord], threshold: float, p
         axes.scatter(index, start, s=14, marker="_", color=MUTED, zorder=2, label="start")
         for solved, look in OUTCOMES.items():
             some = [k for k, e in enumerate(episodes) if e.success == solved]
+            if not some:
+                continue
             axes.scatter(
                 [k + 1 for k in some],
                 [largest[k] for k in some],
@@ -241,6 +245,9 @@ def plot_trajectories(episodes: Sequence[EpisodeRecord], title: str, path: Path)
                     )
             space.scatter(*targets.T, s=90, color=TOMATO, marker="P", label="target")
             space.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), zlim=(low[2], high[2]))
+            for axis in (space.xaxis, space.yaxis, space.zaxis):
+                axis.set_pane_color(CARD)
+                axis.line.set_color(AXIS)
             space.set_box_aspect(high - low, zoom=0.9)
             space.view_init(elevation, azimuth)
             space.set(xlabel="x [m]", ylabel="y [m]", zlabel="z [m]")

@@ -9,19 +9,23 @@ from typing import Any
 import numpy as np
 import torch
 from torch import Tensor
+from tqdm import tqdm
 
+from maniskill_tomato import report_design as design
 from maniskill_tomato.experiments import thesis_figures
 from maniskill_tomato.experiments.configs import ReproductionConfig
 from maniskill_tomato.experiments.statistics import mean_interval
 from maniskill_tomato.experiments.training_study import SATURATED, Trial, run_trials
 from maniskill_tomato.experiments.variants import Experiment, Variant, experiments, find_variant, variants_of
-from maniskill_tomato.files import write_atomically, write_json
+from maniskill_tomato.files import write_json
 from maniskill_tomato.folder_lock import only_writer
 from maniskill_tomato.learning.rl.agent import make_actor, make_normalizer
 from maniskill_tomato.learning.rl.envs import make_env
 from maniskill_tomato.learning.rl.presets import TrainConfig
-from maniskill_tomato.report_design import markdown_table
+from maniskill_tomato.report_design import figure, markdown_table, section, table
+from maniskill_tomato.report_plots import plot_intervals
 from maniskill_tomato.robot.inverse_kinematics import Reach
+from maniskill_tomato.run_facts import run_facts
 
 logger = logging.getLogger(__name__)
 
@@ -60,23 +64,91 @@ def _run_reproduction(
     names = config.variant or (tuple(variants_of(experiment)) if config.ablate else ("exact",))
     chosen = [find_variant(experiment, name) for name in names]
     rows = []
+    shares: dict[str, tuple[float, float, float] | float] = {}
     for number, variant in enumerate(chosen, start=1):
         logger.info("%s, variant %d of %d: %s", experiment.name, number, len(chosen), variant.title)
         trials = plan_trials(config, experiment, variant)
-        results = {trial.seed: result for trial, result in run_trials(trials, config.jobs)}
+        results = {}
+        # One training at a time draws bars of its own.
+        silent = True if not config.progress or config.jobs == 1 else None
+        with tqdm(total=len(trials), unit="training", desc=variant.name, disable=silent) as bar:
+            for trial, result in run_trials(trials, config.jobs):
+                results[trial.seed] = result
+                bar.update()
         summaries = [results[seed] for seed in config.seeds]
         folder = trials[0].folder.parent
         untrained = untrained_first_steps(experiment.env_id, trials[0].config, config.untrained)
         write_json(folder / "untrained.json", untrained)
         write_json(folder / "summary.json", summaries)
         rows.append(_cells(variant.title, summaries, untrained))
+        shares[variant.title] = _share(summaries)
         report(markdown_table(HEAD, rows[-1:]))
         if not config.ablate:
-            _draw(config, experiment, trials, report)
+            pictures = _draw(config, experiment, trials, report)
+            page = _write_report(
+                config, folder, variant.title, rows[-1:], {variant.title: _share(summaries)}, pictures
+            )
+            report(f"report  {page}")
     if config.ablate:
-        path = config.out / experiment.name / "ablation.md"
-        write_atomically(path, (markdown_table(HEAD, rows) + "\n").encode())
-        report(f"table   {path}")
+        page = _write_report(config, config.out / experiment.name, "variants", rows, shares, ())
+        report(f"report  {page}")
+
+
+def _share(summaries: Sequence[dict[str, Any]]) -> tuple[float, float, float] | float:
+    """Mean over the seeds of the success at the training pose, with its interval if there are several."""
+    first = next(iter(summaries[0]["evaluations"]))
+    rates = [s["evaluations"][first]["success_rate"] for s in summaries]
+    return (float(np.mean(rates)), *mean_interval(rates)) if len(rates) > 1 else rates[0]
+
+
+def _write_report(
+    config: ReproductionConfig,
+    folder: Path,
+    what: str,
+    rows: Sequence[Sequence[str]],
+    shares: dict[str, tuple[float, float, float] | float],
+    pictures: Sequence[Path],
+) -> Path:
+    """Writes report.html; the plot of the success stands beside it."""
+    plot = folder / "success.png"
+    plot_intervals(shares, "Success at the training pose", "share of episodes solved", plot)
+    of = f"n = {len(config.seeds)} training seeds, {config.episodes} episodes each"
+    return design.report(
+        folder,
+        f"The thesis's experiment, {config.experiment}",
+        f"{what}; {of}",
+        [
+            section(
+                f"Results, {of}",
+                table(HEAD, rows),
+                figure(
+                    plot,
+                    "Share of episodes solved at the training pose (0 to 1): mean over the seeds, 95 % interval; "
+                    f"{of}.",
+                ),
+            ),
+            section("Figures", *(figure(path, f"{_caption(path)}; {of}.") for path in pictures))
+            if pictures
+            else "",
+        ],
+        run_facts(),
+    )
+
+
+def _caption(path: Path) -> str:
+    """What a figure of the thesis's counterparts shows, with units."""
+    kind, _, evaluation = path.stem.partition("_")
+    where = evaluation.replace("-", " ")
+    return {
+        "training": "Training: loss and reward of episodes, reward and V_f (0 to 1) of steps, moving averages "
+        "(thesis Fig. 5-1 to 5-4)",
+        "plants": "Where the plant stands in each evaluation, in metres, from the front and from above (thesis "
+        "Fig. 5-5)",
+        "evaluation": f"Evaluation at {where}: steps and largest V_f (0 to 1) of the first episodes and of all, sorted "
+        "(thesis Fig. 5-6, 5-7)",
+        "trajectories": f"Ways of the camera at {where}, in metres (thesis Fig. 5-8)",
+        "views": f"First view, last view and the scene at the end, at {where} (thesis Fig. 5-9)",
+    }[kind]
 
 
 def plan_trials(config: ReproductionConfig, experiment: Experiment, variant: Variant) -> list[Trial]:
@@ -101,15 +173,19 @@ def plan_trials(config: ReproductionConfig, experiment: Experiment, variant: Var
 
 def _draw(
     config: ReproductionConfig, experiment: Experiment, trials: Sequence[Trial], report: Callable[[str], None]
-) -> None:
+) -> list[Path]:
+    """Draws the figures, and returns their files."""
     folder: Path = trials[0].folder.parent
-    thesis_figures.draw_all(experiment, trials, folder / "figures")
+    drawn = thesis_figures.draw_all(experiment, trials, folder / "figures")
     if config.views:
         left_out = thesis_figures.take_views(experiment, trials[0], folder / "figures")
-        if left_out is not None:
+        if left_out is None:
+            drawn += [folder / "figures" / f"views_{one.name}.png" for one in experiment.evaluations]
+        else:
             report(left_out)
     report(f"summary {folder / 'summary.json'}")
     report(f"figures {folder / 'figures'}")
+    return drawn
 
 
 def untrained_first_steps(env_id: str, config: TrainConfig, actors: int) -> dict[str, float]:

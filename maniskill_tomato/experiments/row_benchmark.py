@@ -1,28 +1,45 @@
 """Rows searched by policies: which tomatoes were seen, which can be seen at all, and what it cost."""
 
+import shlex
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from itertools import combinations
+from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
 import torch
+from tqdm import tqdm
 
 import maniskill_tomato
 from maniskill_tomato.errors import InvalidInputError
 from maniskill_tomato.experiments.camera_metrics import summarise_inspections
 from maniskill_tomato.experiments.configs import RowBenchmarkConfig
+from maniskill_tomato.experiments.episode_listing import episode_list, list_episodes
 from maniskill_tomato.experiments.episode_record import EpisodeRecord, RowSearch
 from maniskill_tomato.experiments.policy_runs import Condition, parse_policies, run_policies
 from maniskill_tomato.experiments.result_store import ResultStore
 from maniskill_tomato.experiments.statistics import mean_interval, sign_flip_p
-from maniskill_tomato.files import write_atomically, write_json
+from maniskill_tomato.files import write_json
 from maniskill_tomato.folder_lock import only_writer
 from maniskill_tomato.learning.rl.envs import make_env
 from maniskill_tomato.policies.oracle import FARTHEST, SHOULDER, shell_points
-from maniskill_tomato.report_design import markdown_table
+from maniskill_tomato.report_design import (
+    figure,
+    markdown_table,
+    paragraph,
+    percent,
+    report,
+    section,
+    table,
+    tile,
+    tiles,
+)
+from maniskill_tomato.report_plots import plot_intervals
 from maniskill_tomato.robot.iiwa14 import READY_QPOS
 from maniskill_tomato.robot.inverse_kinematics import Reach
 from maniskill_tomato.robot.look_at_move import MIN_DISTANCE, LookAtMover
+from maniskill_tomato.run_facts import run_facts
 from maniskill_tomato.sensing.perception_kinds import RENDERED, Perception
 from maniskill_tomato.sensing.view_lattice import ViewLattice
 from maniskill_tomato.tasks.row.row_config import GeneralTaskConfig
@@ -60,11 +77,18 @@ HEAD = (
 )
 
 
-def run_row_benchmark(config: RowBenchmarkConfig) -> str:
-    """Searches the rows that are not in the folder yet; writes rows-SPLIT-TRANSITS.json and .md.
+@dataclass(frozen=True, kw_only=True)
+class RowBenchmark:
+    """What a benchmark of rows found and wrote."""
 
-    Returns:
-        The table and the comparison of every two policies, as Markdown.
+    text: str
+    """The table and the comparison of every two policies, as Markdown."""
+    report: Path
+    """report.html, which needs no other file."""
+
+
+def run_row_benchmark(config: RowBenchmarkConfig) -> RowBenchmark:
+    """Searches the rows that are not in the folder yet; writes rows-SPLIT-TRANSITS.json and report.html.
 
     Raises:
         InvalidInputError: An option cannot be used, or the folder holds another benchmark.
@@ -74,7 +98,7 @@ def run_row_benchmark(config: RowBenchmarkConfig) -> str:
         return _run_benchmark(config)
 
 
-def _run_benchmark(config: RowBenchmarkConfig) -> str:
+def _run_benchmark(config: RowBenchmarkConfig) -> RowBenchmark:
     specs = parse_policies(config.policies)
     name = f"{config.split}-{config.transits}"
     options: dict[str, Any] = {"plant": {"seed": config.split, "pool": None}, "transits": config.transits}
@@ -86,8 +110,10 @@ def _run_benchmark(config: RowBenchmarkConfig) -> str:
     store = ResultStore(config.out, settings, {f"policy {spec.label}": spec.fingerprint for spec in specs})
     seeds = range(config.seed, config.seed + config.rows)
     jobs = [(condition, seed) for seed in store.missing(SEEABLE, config.split, seeds)]
-    for (_, seed), fruits in run_jobs(_seeable_in_row, jobs, config.jobs):
-        store.add(SEEABLE, config.split, {seed: {"fruits": fruits}})
+    with tqdm(total=len(jobs), unit="row", desc="what can be seen", disable=None if jobs else True) as bar:
+        for (_, seed), fruits in run_jobs(_seeable_in_row, jobs, config.jobs):
+            store.add(SEEABLE, config.split, {seed: {"fruits": fruits}})
+            bar.update()
     run_policies(store, [(condition, specs, seeds)], config.jobs)
     results = {spec.label: store.episodes(name, spec.label, seeds) for spec in specs}
     known = store.read(SEEABLE, config.split)
@@ -101,9 +127,92 @@ def _run_benchmark(config: RowBenchmarkConfig) -> str:
     parts = [rows_table(results, seeable), "\n".join(compare_rows(results, seeable)) + "\n"]
     if config.perception != "ground_truth":
         parts.insert(1, inspection_table(results, seeable))
-    text = "\n".join(parts)
-    write_atomically(path.with_suffix(".md"), text.encode())
-    return text
+    sources = {spec.label: spec.source for spec in specs}
+    return RowBenchmark(text="\n".join(parts), report=_write_report(config, results, seeable, sources))
+
+
+def _write_report(
+    config: RowBenchmarkConfig,
+    results: Mapping[str, Sequence[EpisodeRecord]],
+    seeable: Mapping[int, set[int]],
+    sources: Mapping[str, str],
+) -> Path:
+    """Writes report.html with the plot of its first table."""
+    shares = {
+        name: (_both_share(episodes, seeable), *mean_interval([_seen_share(e, seeable) for e in episodes]))
+        for name, episodes in results.items()
+    }
+    plot = config.out / "seen.png"
+    plot_intervals(shares, "Seen of the seeable tomatoes", "share of tomatoes", plot)
+    threshold = GeneralTaskConfig().full_visibility
+    count = f"n = {config.rows} rows"
+
+    def listed(name: str, episodes: Sequence[EpisodeRecord]) -> str:
+        def replay(seed: int) -> str:
+            words = ["--policies", sources[name], "--rows", "1", "--seed", str(seed), "--split", config.split]
+            words += ["--transits", config.transits, "--perception", config.perception]
+            return shlex.join(["maniskill-tomato", "benchmark-rows", *words, "--out", f"runs/again-{seed}"])
+
+        return episode_list(list_episodes(episodes, threshold, None, replay), name)
+
+    best = max(shares, key=lambda name: shares[name][0])
+    share, low, high = shares[best]
+    rows = [searched(e) for e in results[best]]
+    seen = sum(len(r.seen) for r in rows)
+    inspections = (
+        section(
+            f"Inspection lists, {count} a policy",
+            table(INSPECTION_HEAD, _inspection_cells(results, seeable)),
+        )
+        if config.perception != "ground_truth"
+        else ""
+    )
+    return report(
+        config.out,
+        "Rows searched by policies",
+        f"{_row_counts(results, seeable)}; split {config.split}, perception {config.perception}",
+        [
+            tiles(
+                tile(
+                    percent(share),
+                    f"of the seeable tomatoes seen by {best}, the best",
+                    count,
+                    f"95 % interval over the rows {percent(low)} to {percent(high)}",
+                ),
+                tile(
+                    f"{sum(r.moves for r in rows) / max(seen, 1):.2f} moves",
+                    "for each tomato seen",
+                    f"n = {seen} tomatoes",
+                ),
+                tile(
+                    f"{sum(r.path_m for r in rows) / len(rows):.1f} m",
+                    "way of the camera for a row, mean",
+                    count,
+                ),
+            ),
+            section(
+                f"Policies, {count} each",
+                table(HEAD, _rows_cells(results, seeable)),
+                figure(
+                    plot,
+                    f"Share of the seeable tomatoes that each policy saw (0 to 1), with 95 % intervals over {count}.",
+                ),
+            ),
+            inspections,
+            section("Paired differences", *(paragraph(line) for line in compare_rows(results, seeable)))
+            if len(results) > 1
+            else "",
+            section(
+                "Rows, failures first",
+                paragraph(
+                    "A row is solved when every tomato in reach was seen. V_f (0 to 1) is that of the tomato that was "
+                    "the target. The command searches the row again."
+                ),
+                *(listed(name, episodes) for name, episodes in results.items()),
+            ),
+        ],
+        run_facts(),
+    )
 
 
 def camera_options(perception: Perception) -> dict[str, Any]:
@@ -197,22 +306,42 @@ def rows_table(results: Mapping[str, Sequence[EpisodeRecord]], seeable: Mapping[
         results: Of each policy, on the same rows.
         seeable: The tomatoes that can be seen, by the row's seed.
     """
+    return f"{_row_counts(results, seeable)}.\n\n{markdown_table(HEAD, _rows_cells(results, seeable))}\n"
+
+
+def _row_counts(results: Mapping[str, Sequence[EpisodeRecord]], seeable: Mapping[int, set[int]]) -> str:
     first = next(iter(results.values()))
-    wanted = sum(len(searched(e).targets) for e in first)
-    possible = sum(len(seeable[e.seed]) for e in first)
-    lines = []
+    wanted, possible = _tomatoes(first, seeable)
+    return f"{len(first)} rows, {wanted} tomatoes in reach, {possible} of them seeable"
+
+
+def _tomatoes(episodes: Sequence[EpisodeRecord], seeable: Mapping[int, set[int]]) -> tuple[int, int]:
+    """Tomatoes in reach, and those of them that can be seen."""
+    return sum(len(searched(e).targets) for e in episodes), sum(len(seeable[e.seed]) for e in episodes)
+
+
+def _both_share(episodes: Sequence[EpisodeRecord], seeable: Mapping[int, set[int]]) -> float:
+    """Share of all rows' seeable tomatoes that were seen."""
+    both = sum(len(seeable[e.seed] & set(searched(e).seen)) for e in episodes)
+    return both / max(_tomatoes(episodes, seeable)[1], 1)
+
+
+def _rows_cells(
+    results: Mapping[str, Sequence[EpisodeRecord]], seeable: Mapping[int, set[int]]
+) -> list[tuple[str, ...]]:
+    wanted, _ = _tomatoes(next(iter(results.values())), seeable)
+    lines: list[tuple[str, ...]] = []
     for name, episodes in results.items():
         rows = [searched(e) for e in episodes]
         count, asked = len(rows), sum(e.steps for e in episodes)
         seen = sum(len(r.seen) for r in rows)
-        both = sum(len(seeable[e.seed] & set(searched(e).seen)) for e in episodes)
         low, high = mean_interval([_seen_share(e, seeable) for e in episodes])
         touched = sum(int(e.contact.sum()) for e in episodes if e.contact is not None)
         lines.append(
             (
                 name,
-                f"{both / possible:.1%} (rows: {low:.1%} to {high:.1%})",
-                f"{seen / wanted:.1%}",
+                f"{_both_share(episodes, seeable):.1%} (rows: {low:.1%} to {high:.1%})",
+                f"{seen / max(wanted, 1):.1%}",
                 f"{sum(r.moves for r in rows) / max(seen, 1):.2f}",
                 f"{sum(e.success for e in episodes) / count:.0%}",
                 f"{sum(r.moves for r in rows) / count:.1f}",
@@ -223,8 +352,7 @@ def rows_table(results: Mapping[str, Sequence[EpisodeRecord]], seeable: Mapping[
                 f"{touched / asked:.0%}",
             )
         )
-    head = f"{len(first)} rows, {wanted} tomatoes in reach, {possible} of them seeable."
-    return f"{head}\n\n{markdown_table(HEAD, lines)}\n"
+    return lines
 
 
 INSPECTION_HEAD = (
@@ -240,7 +368,13 @@ INSPECTION_HEAD = (
 
 def inspection_table(results: Mapping[str, Sequence[EpisodeRecord]], seeable: Mapping[int, set[int]]) -> str:
     """What the policies' inspection lists are worth, as Markdown; see `summarise_inspections`."""
-    lines = []
+    return markdown_table(INSPECTION_HEAD, _inspection_cells(results, seeable)) + "\n"
+
+
+def _inspection_cells(
+    results: Mapping[str, Sequence[EpisodeRecord]], seeable: Mapping[int, set[int]]
+) -> list[tuple[str, ...]]:
+    lines: list[tuple[str, ...]] = []
     for name, episodes in results.items():
         figures = summarise_inspections(episodes, seeable, GeneralTaskConfig().full_visibility)
         shares = [figures[key] for key in ("recall", "precision", "full_precision")]
@@ -253,7 +387,7 @@ def inspection_table(results: Mapping[str, Sequence[EpisodeRecord]], seeable: Ma
                 f"{figures['mean_moves']:.1f}",
             )
         )
-    return markdown_table(INSPECTION_HEAD, lines) + "\n"
+    return lines
 
 
 def compare_rows(

@@ -137,6 +137,13 @@ def interquartile_band(runs: Float64, resamples: int = 1000) -> tuple[Float64, F
     return low, high
 
 
+def ends(interval: Interval) -> tuple[float, float, float] | float:
+    """An interquartile mean with the ends of its interval, or alone where none follows."""
+    if interval.low is None or interval.high is None:
+        return interval.estimate
+    return interval.estimate, interval.low, interval.high
+
+
 def interval_text(interval: Interval | None, factor: float, form: str, unit: str) -> str:
     """An interquartile mean with its interval, as `97.5 [95.0, 99.0] %`.
 

@@ -1,9 +1,10 @@
 """The twin of `deploy` and the simulated task on the same episodes with the same policy."""
 
 import json
+import shlex
 import time
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import gymnasium as gym
@@ -17,6 +18,7 @@ from maniskill_tomato.deploy.policy_run import RunConfig, run
 from maniskill_tomato.deploy.profile import Profile, load_profile
 from maniskill_tomato.errors import TomatoError
 from maniskill_tomato.experiments.configs import TwinConfig
+from maniskill_tomato.experiments.episode_listing import ListedEpisode, episode_list
 from maniskill_tomato.experiments.result_store import ResultStore
 from maniskill_tomato.experiments.rollout import run_episode
 from maniskill_tomato.experiments.statistics import mcnemar_p, wilson_interval
@@ -25,14 +27,17 @@ from maniskill_tomato.folder_lock import only_writer
 from maniskill_tomato.learning.rl.envs import make_env
 from maniskill_tomato.plants.mesh_set import ALL
 from maniskill_tomato.policies.opening import open_policy
+from maniskill_tomato.report_design import figure, percent, report, section, table, tile, tiles
+from maniskill_tomato.report_plots import plot_intervals
+from maniskill_tomato.run_facts import run_facts
 
 
-def compare_twin(config: TwinConfig, report: Callable[[str], None] = lambda line: None) -> dict[str, Any]:
-    """Runs the episodes that are not in the folder yet; writes summary.json and a folder for each run.
+def compare_twin(config: TwinConfig, tell: Callable[[str], None] = lambda line: None) -> dict[str, Any]:
+    """Runs the episodes that are not in the folder yet; writes summary.json, report.html and a folder for each run.
 
     Args:
         config: What to compare.
-        report: Told one line after each episode.
+        tell: Told one line after each episode.
 
     Returns:
         The content of summary.json.
@@ -41,10 +46,10 @@ def compare_twin(config: TwinConfig, report: Callable[[str], None] = lambda line
         CheckpointError: Another process measures in the folder.
     """
     with only_writer(config.out, "measures"):
-        return _compare(config, report)
+        return _compare(config, tell)
 
 
-def _compare(config: TwinConfig, report: Callable[[str], None]) -> dict[str, Any]:
+def _compare(config: TwinConfig, tell: Callable[[str], None]) -> dict[str, Any]:
     profile = load_profile(config.profile)
     store, episodes = twin_store(config, profile)
     numbers = range(config.seed, config.seed + config.episodes)
@@ -64,7 +69,7 @@ def _compare(config: TwinConfig, report: Callable[[str], None]) -> dict[str, Any
                 }
                 result = {"episode": number, "twin": twin, "simulation": simulation}
                 store.add(episodes, "twin", {number: result})
-                report(
+                tell(
                     f"{number:3d}  twin {twin['reason']:12} {twin.get('moves', 0):2d} moves   "
                     f"simulation {'success' if record.success else 'failure'} {record.steps:2d} moves"
                 )
@@ -73,7 +78,101 @@ def _compare(config: TwinConfig, report: Callable[[str], None]) -> dict[str, Any
     found = store.read(episodes, "twin")
     summary = summarise_twin([found[number] for number in numbers])
     write_json(config.out / "summary.json", summary)
+    _write_report(config, profile, [found[number] for number in numbers], summary)
     return summary
+
+
+def _write_report(
+    config: TwinConfig, profile: Profile, episodes: Sequence[dict[str, Any]], summary: dict[str, Any]
+) -> None:
+    """Writes report.html with a plot of both rates."""
+    count = len(episodes)
+    of = f"n = {count} episodes"
+    rates = {
+        name: (summary[f"{name}_success"] / count, *summary[f"{name}_interval_95"])
+        for name in ("twin", "simulation")
+    }
+    plot = config.out / "success.png"
+    plot_intervals(rates, "Success on the same episodes", "share of episodes", plot)
+    low, high = summary["twin_interval_95"]
+    report(
+        config.out,
+        "The twin beside the simulated task",
+        f"{count} episodes from {config.seed}, profile {profile.name}",
+        [
+            tiles(
+                tile(
+                    percent(rates["twin"][0]),
+                    "solved by the twin",
+                    of,
+                    f"95 % interval {percent(low)} to {percent(high)}",
+                    f"{summary['twin_success_and_truly_visible']} of {summary['twin_success']} truly visible",
+                ),
+                tile(percent(rates["simulation"][0]), "solved in the simulated task", of),
+                tile(
+                    f"p {summary['mcnemar_p']:.2g}",
+                    "that both are alike (McNemar)",
+                    f"{of}; only the twin: {summary['only_twin']}, only the task: {summary['only_simulation']}",
+                ),
+            ),
+            section(
+                "Success",
+                figure(plot, f"Share of episodes solved (0 to 1), with 95 % intervals (Wilson); {of} each."),
+            ),
+            section("Episodes, failures first", episode_list([_listed(config, one) for one in episodes])),
+            figures_section(summary, of),
+        ],
+        run_facts(),
+    )
+
+
+def _listed(config: TwinConfig, episode: dict[str, Any]) -> ListedEpisode:
+    """An episode of the twin as a line; a success in which the fruit was not truly visible is a failure."""
+    twin = episode["twin"]
+    seen = twin.get("visible_fractions") or (None,)
+    truly = bool(twin.get("truly_visible"))
+    false = "success that was not truly visible" if twin["success"] else f"{twin['reason']}: {twin['detail']}"
+    return ListedEpisode(
+        seed=episode["episode"],
+        success=truly,
+        reason="" if truly else false,
+        moves=twin.get("moves", 0),
+        start=seen[0],
+        best=twin.get("best_visible_fraction"),
+        command=replay_on_twin(config, episode["episode"], "run"),
+    )
+
+
+def replay_on_twin(config: TwinConfig, seed: int, command: str) -> str:
+    """The `deploy run` or `deploy inspect` of one episode."""
+    policy = [] if config.policy is None else ["--policy", config.policy]
+    words = [
+        "deploy",
+        command,
+        "--profile",
+        config.profile,
+        "--seed",
+        str(seed),
+        "--out",
+        f"runs/again-{seed}",
+    ]
+    return shlex.join(["maniskill-tomato", *words, *policy])
+
+
+def figures_section(summary: Mapping[str, Any], of: str) -> str:
+    """All figures of a summary as a table; `of` says of how many."""
+
+    def told(value: object) -> str:
+        if isinstance(value, float):
+            return f"{value:.4g}"
+        if isinstance(value, dict):
+            return ", ".join(f"{name.replace('_', ' ')}: {told(one)}" for name, one in value.items())
+        if isinstance(value, (list, tuple)):
+            return ", ".join(told(one) for one in value)
+        return "none" if value is None else str(value)
+
+    rows = [(name.replace("_", " "), told(value)) for name, value in summary.items()]
+    return section(f"All figures, {of}", table(("figure", "value"), rows, words=(1,)))
 
 
 def twin_store(config: TwinConfig, profile: Profile) -> tuple[ResultStore, str]:

@@ -14,11 +14,20 @@ from maniskill_tomato.deploy.profile import Profile, load_profile
 from maniskill_tomato.errors import TomatoError
 from maniskill_tomato.experiments.camera_metrics import list_figures
 from maniskill_tomato.experiments.configs import TwinConfig
+from maniskill_tomato.experiments.episode_listing import ListedEpisode, episode_list
 from maniskill_tomato.experiments.row_benchmark import SeeableTomatoes
 from maniskill_tomato.experiments.statistics import mean_interval
-from maniskill_tomato.experiments.twin_comparison import mean_of, simulated_task, twin_store
+from maniskill_tomato.experiments.twin_comparison import (
+    figures_section,
+    mean_of,
+    replay_on_twin,
+    simulated_task,
+    twin_store,
+)
 from maniskill_tomato.files import write_json
 from maniskill_tomato.folder_lock import only_writer
+from maniskill_tomato.report_design import paragraph, percent, report, section, tile, tiles
+from maniskill_tomato.run_facts import run_facts
 from maniskill_tomato.sensing.inspection_judge import JudgedFruit, score_lists, truly_seen
 from maniskill_tomato.sensing.view_lattice import ViewLattice
 
@@ -26,12 +35,12 @@ ROWS: Final = "rows"
 """Name under which the store keeps the rows."""
 
 
-def inspect_twin(config: TwinConfig, report: Callable[[str], None] = lambda line: None) -> dict[str, Any]:
-    """Inspects the rows that are not in the folder yet; writes rows.json and a folder for each row.
+def inspect_twin(config: TwinConfig, tell: Callable[[str], None] = lambda line: None) -> dict[str, Any]:
+    """Inspects the rows that are not in the folder yet; writes rows.json, report.html and a folder for each row.
 
     Args:
         config: Which rows.
-        report: Told one line after each row.
+        tell: Told one line after each row.
 
     Returns:
         The content of rows.json.
@@ -41,10 +50,10 @@ def inspect_twin(config: TwinConfig, report: Callable[[str], None] = lambda line
         ProfileError: The profile is not of a twin.
     """
     with only_writer(config.out, "measures"):
-        return _inspect(config, report)
+        return _inspect(config, tell)
 
 
-def _inspect(config: TwinConfig, report: Callable[[str], None]) -> dict[str, Any]:
+def _inspect(config: TwinConfig, tell: Callable[[str], None]) -> dict[str, Any]:
     profile = load_profile(config.profile)
     store, episodes = twin_store(config, profile)
     numbers = range(config.seed, config.seed + config.episodes)
@@ -60,7 +69,7 @@ def _inspect(config: TwinConfig, report: Callable[[str], None]) -> dict[str, Any
                 }
                 store.add(episodes, ROWS, {number: row})
                 alone = summarise_rows([row], profile.loop.threshold)
-                report(
+                tell(
                     f"{number:3d}  {row['reason']:12} {row['moves']:3d} moves   {alone['seen']} of {alone['seeable']} "
                     f"seeable ripe fruits, precision {alone['precision']}"
                 )
@@ -69,7 +78,63 @@ def _inspect(config: TwinConfig, report: Callable[[str], None]) -> dict[str, Any
     found = store.read(episodes, ROWS)
     summary = summarise_rows([found[number] for number in numbers], profile.loop.threshold)
     write_json(config.out / "rows.json", summary)
+    _write_report(config, profile, [found[number] for number in numbers], summary)
     return summary
+
+
+def _write_report(
+    config: TwinConfig, profile: Profile, rows: Sequence[dict[str, Any]], summary: dict[str, Any]
+) -> None:
+    """Writes report.html."""
+    of = f"n = {len(rows)} rows"
+
+    def share(name: str, label: str, count: str) -> str:
+        value, interval = summary[name], summary[f"{name}_interval_95"]
+        ends = "" if interval is None else f"95 % interval {percent(interval[0])} to {percent(interval[1])}"
+        return tile("none" if value is None else percent(value), label, count, ends)
+
+    listed = [_listed(config, row, profile.loop.threshold) for row in rows]
+    report(
+        config.out,
+        "Rows inspected by the twin",
+        f"{len(rows)} rows from {config.seed}, profile {profile.name}",
+        [
+            tiles(
+                share(
+                    "recall",
+                    "of the seeable ripe fruits seen",
+                    f"n = {summary['seeable']} fruits in {len(rows)} rows",
+                ),
+                share(
+                    "precision", "of the fruits listed as ripe are", f"n = {summary['listed_as_ripe']} fruits"
+                ),
+                tile(f"{summary['mean_moves']:.1f} moves", "a row, mean", of),
+            ),
+            section(
+                "Rows, failures first",
+                paragraph("A row is solved when every seeable ripe fruit was truly seen fully."),
+                episode_list(listed),
+            ),
+            figures_section(summary, of),
+        ],
+        run_facts(),
+    )
+
+
+def _listed(config: TwinConfig, row: dict[str, Any], threshold: float) -> ListedEpisode:
+    alone = summarise_rows([row], threshold)
+    done = alone["seen"] == alone["seeable"]
+    return ListedEpisode(
+        seed=row["episode"],
+        success=done,
+        reason=""
+        if done
+        else f"{alone['seen']} of {alone['seeable']} seeable fruits seen; {row['reason']}: {row['detail']}",
+        moves=row["moves"],
+        start=None,
+        best=None,
+        command=replay_on_twin(config, row["episode"], "inspect"),
+    )
 
 
 def _fruits_to_see(env: gym.Env[Any, Any], number: int) -> dict[str, list[int]]:

@@ -3,6 +3,7 @@
 import json
 import os
 import pty
+import re
 import signal
 import subprocess
 import sys
@@ -59,6 +60,14 @@ def test_the_twin_runs_and_inspects_without_sapien_and_maniskill(tmp_path: Path)
     assert content["success"] is True and content["reason"] == "success"
     assert content["visible_fraction"] > 0.8 and content["moves"] >= 1 and content["seconds"] > 0.0
     assert (tmp_path / "run" / "report.png").stat().st_size > 10_000
+    page = (tmp_path / "run" / "report.html").read_text()
+    looks = len(content["steps"])
+    assert (
+        page.count("<img") == looks
+        and f"n = {looks} looks" in page
+        and not re.search(r'src="(?!data:)', page)
+    )
+    assert re.search(r"<code>maniskill-tomato deploy run .*?</code>", page)
     assert (tmp_path / "run" / "run.mcap").stat().st_size > 10_000
     listed = json.loads((tmp_path / "row" / "inspection.json").read_text())
     assert (listed["reason"], listed["moves"], listed["row_moves"]) == ("budget", 2, 2)

@@ -74,7 +74,8 @@ def test_the_change_of_v_f_is_that_of_rays_cast_one_by_one(tmp_path: Path) -> No
     assert leafy["largest_change"] == pytest.approx(changes.max(), abs=1e-6)
     assert leafy["crossed"] == int(((values[0] > 0.8) != (values[1] > 0.8)).sum())
     assert "At most 500 triangles a plant" in text and f"{leafy['kept']}" in text
-    assert (tmp_path / "out" / "plants.md").read_text() == text
+    page = (tmp_path / "out" / "report.html").read_text()
+    assert "At most 500 triangles a plant" in page and f"<td>{leafy['kept']}</td>" in page
 
 
 def test_without_a_budget_plants_are_counted_alone(tmp_path: Path) -> None:

@@ -3,6 +3,7 @@
 import dataclasses
 import json
 import math
+import re
 from pathlib import Path
 from typing import Any
 
@@ -240,7 +241,8 @@ def test_figures_are_drawn_for_one_seed_and_for_several(tmp_path: Path) -> None:
     plot_evaluation({s: episodes for s in range(9)}, 0.85, "nine", tmp_path / "nine.png")
     plot_trajectories(episodes, "ways", tmp_path / "ways.png")
     plot_plant_positions(GUIDED, tmp_path / "plants.png")
-    for path in tmp_path.iterdir():
+    for path in tmp_path.glob("*.png"):
+        assert path.with_suffix(".svg").is_file()
         assert np.asarray(imageio.imread(path)).std() > 5.0, path.name
     with pytest.raises(InvalidInputError):
         plot_trajectories([], "none", tmp_path / "none.png")
@@ -300,9 +302,15 @@ def test_a_reproduction_runs_from_end_to_end_and_its_runs_can_be_compared(tmp_pa
     lines: list[str] = []
     run_reproduction(reproduction(tmp_path, experiment="sparse", seeds=(0, 1)), lines.append)
     folder = tmp_path / "sparse" / "exact"
-    assert lines[-2:] == [f"summary {folder / 'summary.json'}", f"figures {folder / 'figures'}"]
+    assert lines[-3:] == [
+        f"summary {folder / 'summary.json'}",
+        f"figures {folder / 'figures'}",
+        f"report  {folder / 'report.html'}",
+    ]
+    page = (folder / "report.html").read_text()
+    assert page.count("<svg") == 7 and page.count("n = 2 training seeds") >= 8
     assert "exactly Table 5-1 / 5-2" in lines[0]
-    figures = {path.name for path in (folder / "figures").iterdir()}
+    figures = {path.name for path in (folder / "figures").glob("*.png")}
     assert figures == {
         "training.png",
         "plants.png",
@@ -323,9 +331,9 @@ def test_a_reproduction_runs_from_end_to_end_and_its_runs_can_be_compared(tmp_pa
 def test_an_ablation_writes_a_table_and_names_unknown_variants(tmp_path: Path) -> None:
     variants = ("exact", "tau-0.01+gamma-0.9")
     run_reproduction(reproduction(tmp_path, ablate=True, variant=variants))
-    table = (tmp_path / "guided" / "ablation.md").read_text().splitlines()
-    assert len(table) == 4
-    assert table[3].startswith("| tau 0.01, not 0.001; gamma 0.9, not 0.99 | ")
-    assert not list(tmp_path.rglob("*.png"))
+    page = (tmp_path / "guided" / "report.html").read_text()
+    rows = re.findall(r'<th scope="row">(.*?)</th>', page)
+    assert len(rows) == 2 and rows[1] == "tau 0.01, not 0.001; gamma 0.9, not 0.99"
+    assert [path.name for path in tmp_path.rglob("*.png")] == ["success.png"]
     with pytest.raises(InvalidInputError, match="variant of guided must be one of 'exact'"):
         run_reproduction(reproduction(tmp_path, variant=("nonsense",)))

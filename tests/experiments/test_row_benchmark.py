@@ -113,11 +113,13 @@ def test_an_episode_of_another_task_is_no_row() -> None:
 @pytest.mark.slow
 def test_a_row_benchmark_goes_on_where_it_was(tmp_path: Path) -> None:
     config = RowBenchmarkConfig(policies="stay", rows=1, out=tmp_path)
-    text = run_row_benchmark(config)
-    assert "| stay | " in text and (tmp_path / "rows-held_out-both.md").read_text() == text
+    done = run_row_benchmark(config)
+    page = done.report.read_text()
+    assert "| stay | " in done.text and '<th scope="row">stay</th>' in page and page.count("n = 1 rows") >= 4
+    assert "benchmark-rows --policies stay --rows 1 --seed 1000 --split held_out" in page
     stored = {path: path.read_bytes() for path in tmp_path.rglob("*.jsonl")}
     assert len(stored) == 2
-    assert run_row_benchmark(config) == text
+    assert run_row_benchmark(config).text == done.text
     assert {path: path.read_bytes() for path in tmp_path.rglob("*.jsonl")} == stored
     (row,) = json.loads((tmp_path / "rows-held_out-both.json").read_text())["rows"]["stay"].values()
     assert row["seed"] == 1000 and row["seen"] == seen_by_an_arm_that_stays(1000)

@@ -93,6 +93,8 @@ def test_an_episode_runs_on_both_and_is_not_run_again(tmp_path: Path) -> None:
     content = compare_twin(config, lines.append)
     assert content["episodes"] == 1 and content["reasons"] == {"success": 1}
     assert lines[0].startswith("  6  twin success")
+    page = (tmp_path / "report.html").read_text()
+    assert "maniskill-tomato deploy run --profile mock --seed 6" in page and page.count("n = 1 episodes") >= 5
     assert json.loads((tmp_path / "summary.json").read_text())["looks"] == content["looks"]
     stored = {path: path.read_bytes() for path in tmp_path.rglob("*.jsonl")}
     assert len(stored) == 1

@@ -94,6 +94,9 @@ def test_a_row_is_inspected_once_and_judged_by_what_stands_there(tmp_path: Path)
     assert found["seen"] <= found["seeable"] <= told["true_ripe_in_reach"]
     assert found["recall"] == pytest.approx(found["seen"] / found["seeable"]) and found["recall"] < 1.0
     assert found["reasons"] == {told["reason"]: 1} and told["is_fault"]
+    page = (tmp_path / "out" / "report.html").read_text()
+    assert f"{found['seen']} of {found['seeable']} seeable fruits seen; {told['reason']}" in page
+    assert "maniskill-tomato deploy inspect" in page and "--seed 1 --out runs/again-1" in page
     assert len(lines) == 1 and f"{found['seen']} of {found['seeable']}" in lines[0]
     assert json.loads((tmp_path / "out" / "rows.json").read_text())["recall"] == found["recall"]
     assert inspect_twin(config, lines.append)["recall"] == found["recall"] and len(lines) == 1

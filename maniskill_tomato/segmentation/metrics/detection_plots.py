@@ -5,6 +5,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+import matplotlib as mpl
 import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
@@ -12,10 +13,12 @@ from numpy.typing import NDArray
 
 from maniskill_tomato.errors import InvalidInputError
 from maniskill_tomato.files import write_atomically
+from maniskill_tomato.report_design import SERIES
+from maniskill_tomato.report_plots import PANEL, PLOT_STYLE, line_style, save_figure
 from maniskill_tomato.segmentation.metrics.detection_metrics import COCO_OVERLAPS, PrecisionRecall
 
-COLOURS = ("#d9822b", "#2f6fb7", "#2f6b42", "#b8392a")
-"""Of the runs in a figure; the first two are those of Fig. 4-9 to 4-19."""
+COLOURS = SERIES[:4]
+"""Of the runs in a figure."""
 
 
 def plot_precision_recall(curves: Mapping[str, PrecisionRecall], path: Path) -> None:
@@ -24,18 +27,21 @@ def plot_precision_recall(curves: Mapping[str, PrecisionRecall], path: Path) -> 
     Raises:
         CheckpointError: The file cannot be written.
     """
-    figure = Figure(figsize=(5.2, 4.2), layout="constrained")
-    axes = figure.add_subplot()
-    for (name, curve), colour in zip(curves.items(), COLOURS, strict=False):
-        recall = np.concatenate([[0.0], curve.recall])
-        precision = np.concatenate([curve.precision[:1], curve.precision])
-        envelope = np.maximum.accumulate(precision[::-1])[::-1]
-        axes.plot(recall, precision, color=colour, alpha=0.35, linewidth=1)
-        axes.plot(recall, envelope, color=colour, label=f"{name}, AP50 {curve.average_precision:.4f}")
-    axes.set(xlabel="recall", ylabel="precision", xlim=(0, 1), ylim=(0, 1.02))
-    axes.grid(alpha=0.3)
-    axes.legend(loc="lower left")
-    _write(figure, path)
+    with mpl.rc_context(PLOT_STYLE):
+        figure = Figure(figsize=PANEL)
+        axes = figure.add_subplot()
+        for index, (name, curve) in enumerate(curves.items()):
+            recall = np.concatenate([[0.0], curve.recall])
+            precision = np.concatenate([curve.precision[:1], curve.precision])
+            envelope = np.maximum.accumulate(precision[::-1])[::-1]
+            style = line_style(index, max(len(recall), 9))
+            axes.plot(recall, precision, color=style["color"], alpha=0.35, linewidth=1)
+            axes.plot(recall, envelope, **style, label=f"{name}, AP50 {curve.average_precision:.4f}")
+        axes.set(
+            title="Precision and recall", xlabel="recall", ylabel="precision", xlim=(0, 1), ylim=(0, 1.02)
+        )
+        axes.legend(loc="lower left")
+        save_figure(figure, path)
 
 
 def plot_overlaps(precision: Mapping[str, Mapping[str, NDArray[np.float64]]], path: Path) -> None:
@@ -48,16 +54,21 @@ def plot_overlaps(precision: Mapping[str, Mapping[str, NDArray[np.float64]]], pa
     Raises:
         CheckpointError: The file cannot be written.
     """
-    figure = Figure(figsize=(4.2 * len(precision), 3.6), layout="constrained")
-    panels = figure.subplots(1, len(precision), squeeze=False)[0]
-    for axes, (overlap, sizes) in zip(panels, precision.items(), strict=True):
-        for (size, values), colour in zip(sizes.items(), COLOURS, strict=False):
-            label = f"{size}, AP50-95 {values.mean():.3f}"
-            axes.plot(COCO_OVERLAPS, values, "o-", color=colour, markersize=3, label=label)
-        axes.set(xlabel=f"least overlap of the {overlap}", ylabel="AP", ylim=(0, 1.02))
-        axes.grid(alpha=0.3)
-        axes.legend(loc="lower left", fontsize=8)
-    _write(figure, path)
+    with mpl.rc_context(PLOT_STYLE):
+        figure = Figure(figsize=(PANEL[0] * len(precision), PANEL[1] + 0.2))
+        panels = figure.subplots(1, len(precision), squeeze=False)[0]
+        for axes, (overlap, sizes) in zip(panels, precision.items(), strict=True):
+            for index, (size, values) in enumerate(sizes.items()):
+                label = f"{size}, AP50-95 {values.mean():.3f}"
+                axes.plot(COCO_OVERLAPS, values, **line_style(index), label=label)
+            axes.set(
+                title=f"AP of {overlap}es".replace("maskes", "masks"),
+                xlabel=f"least overlap of the {overlap}",
+                ylabel="AP",
+                ylim=(0, 1.02),
+            )
+            axes.legend(loc="lower left")
+        save_figure(figure, path)
 
 
 def plot_losses(

@@ -110,16 +110,23 @@ def evaluate_segmenter(
     return metrics
 
 
-def coco_table(metrics: Mapping[str, float]) -> str:
-    """COCO's metrics among those of `evaluate_segmenter` as a table: a line each for boxes, masks, and those of
-    the row in front."""
+def coco_cells(metrics: Mapping[str, float]) -> tuple[list[str], list[list[str]]]:
+    """COCO's metrics of `evaluate_segmenter` as head and lines of a table: boxes, masks, the front row."""
     columns = {"AP50": "AP50", "AP50-95": "AP", "AP75": "AP75", "AR": "AR100"}
     columns |= {f"{kind} {size}": f"{kind}_{size}" for size in COCO_SIZES for kind in ("AP", "AR")}
-    lines = [f"{'COCO':10}" + "".join(f"{name:>11}" for name in columns)]
+    rows = []
     for overlap in ("box", "mask", "front_box", "front_mask"):
         values = [metrics.get(f"coco_{overlap}_{key}") for key in columns.values()]
         if None not in values:
             # COCO gives -1 where there is no fruit of a size.
             shown = ["-" if value is None or value < 0 else f"{value:.3f}" for value in values]
-            lines.append(f"{overlap.replace('_', ' '):10}" + "".join(f"{text:>11}" for text in shown))
-    return "\n".join(lines)
+            rows.append([overlap.replace("_", " "), *shown])
+    return ["COCO", *columns], rows
+
+
+def coco_table(metrics: Mapping[str, float]) -> str:
+    """The table of `coco_cells` for the terminal."""
+    head, rows = coco_cells(metrics)
+    return "\n".join(
+        f"{first:10}" + "".join(f"{text:>11}" for text in rest) for first, *rest in (head, *rows)
+    )

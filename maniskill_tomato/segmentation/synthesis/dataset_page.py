@@ -1,15 +1,32 @@
 """A page about a data set: how many fruits, how hidden, how large, and sample images."""
 
 from collections import Counter
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Final
 
 import cv2
-import matplotlib.pyplot as plt
+import matplotlib as mpl
 import numpy as np
+from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from maniskill_tomato.files import write_atomically
+from maniskill_tomato.report_design import (
+    LEAF,
+    figure,
+    many_small,
+    paragraph,
+    percent,
+    photo,
+    report,
+    section,
+    side_by_side,
+    table,
+    tile,
+    tiles,
+)
+from maniskill_tomato.report_plots import PANEL, PLOT_STYLE, save_figure
+from maniskill_tomato.run_facts import run_facts
 from maniskill_tomato.segmentation.datasets.annotations import AnnotatedImage, AnnotatedImages, Instance
 from maniskill_tomato.segmentation.datasets.picture_files import write_picture
 from maniskill_tomato.segmentation.drawing import contact_sheet
@@ -23,25 +40,125 @@ COLOURS: Final[dict[str, tuple[int, int, int]]] = {
 """Outlines by category, RGB; other fruits are red."""
 
 
+SAMPLES, SAMPLE_WIDTH = 15, 320
+"""Images on the page, and the width of each in [px]."""
+
 SHEET_IMAGES, SHEET_COLUMNS, SHEET_TILE = 24, 6, 320
 """Images on the contact sheet, images in a row, and width of each in [px]."""
 
 
 def write_statistics(images: AnnotatedImages, folder: Path) -> Path:
-    """Writes `statistics.md`, `statistics.png` and `contact_sheet.jpg` into a data set's folder.
+    """Writes `report.html`, its plots and `contact_sheet.jpg` into a data set's folder.
 
     Returns:
         The page.
     """
-    _write_plot(images, folder / "statistics.png")
     shown = [outlined(image) for image in _spread(images.images, SHEET_IMAGES)]
     # As high as the images need, up to a little more than a square.
     height = round(SHEET_TILE * min(max(i.shape[0] / i.shape[1] for i in shown), 1.25))
     sheet = contact_sheet(shown, SHEET_COLUMNS, (SHEET_TILE, height))
     write_picture(folder / "contact_sheet.jpg", sheet, 88)
-    page = folder / "statistics.md"
-    write_atomically(page, _page(images).encode())
-    return page
+    fruits = [i for image in images.images for i in image.instances if i.fruit]
+    seen = [i for i in fruits if i.box_xywh[2] > 0]
+    counts = Counter(i.category for image in images.images for i in image.instances if i.box_xywh[2] > 0)
+    return report(
+        folder,
+        "Data set",
+        f"{len(images.images)} images, {len(seen)} visible fruits",
+        [
+            _tiles(images, fruits, seen),
+            section(
+                "Sample pictures",
+                many_small(*(_sample(image) for image in _spread(images.images, SAMPLES))),
+                paragraph(
+                    f"Visible fruits in colour (red ripe, yellow turning, green unripe), whole fruits thin and white; "
+                    f"{min(SAMPLES, len(images.images))} of n = {len(images.images)} images. contact_sheet.jpg beside "
+                    f"this page has {len(shown)}.",
+                    "caption",
+                ),
+            ),
+            section("Composition", side_by_side(*_plots(images, fruits, seen, folder))),
+            section(
+                f"Categories, n = {sum(counts.values())} visible instances",
+                table(
+                    ("category", "visible instances", "share"),
+                    [(name, str(c), percent(c / sum(counts.values()))) for name, c in sorted(counts.items())],
+                ),
+            ),
+            _bands(fruits),
+            paragraph(f"Left out of the photos: {images.skipped_text()}.") if images.skipped else "",
+        ],
+        run_facts(),
+    )
+
+
+def _tiles(images: AnnotatedImages, fruits: Sequence[Instance], seen: Sequence[Instance]) -> str:
+    count = len(images.images)
+    low, middle, high = np.percentile([_side(i.box_xywh) for i in seen] or [0.0], [10, 50, 90])
+    return tiles(
+        tile(str(count), "images"),
+        tile(f"{len(seen) / max(count, 1):.1f} fruits", "visible in an image, mean", f"n = {count} images"),
+        tile(
+            f"{middle:.0f} px",
+            "size of a visible fruit's box, median",
+            f"n = {len(seen)} fruits; root of the box's area",
+            f"10th and 90th percentile {low:.0f} and {high:.0f} px",
+        ),
+        tile(
+            f"{len(fruits) - len(seen)} fruits",
+            "of the front row wholly hidden",
+            f"n = {len(fruits)} fruits; in the amodal file only",
+        ),
+    )
+
+
+def _sample(image: AnnotatedImage) -> str:
+    """An image with its outlines as a small figure."""
+    picture = outlined(image)
+    size = (SAMPLE_WIDTH, round(SAMPLE_WIDTH * picture.shape[0] / picture.shape[1]))
+    small = cv2.resize(picture, size, interpolation=cv2.INTER_AREA)
+    _, packed = cv2.imencode(".jpg", small[..., ::-1], (cv2.IMWRITE_JPEG_QUALITY, 85))
+    return photo(packed.tobytes(), f"{len(image.fruits)} visible fruits")
+
+
+def _plots(
+    images: AnnotatedImages, fruits: Sequence[Instance], seen: Sequence[Instance], folder: Path
+) -> list[str]:
+    """Histograms, each a figure of the page."""
+    fractions = [i.visible_fraction for i in fruits if i.visible_fraction is not None]
+    sides = [_side(i.box_xywh) for i in seen]
+    per_image = [len(image.fruits) for image in images.images]
+    wanted: list[tuple[str, list[Any], Any, str, str]] = [
+        ("visible_fraction", fractions, np.linspace(0, 1, 21), "visible fraction V_f", "fruits"),
+        ("size", sides, np.geomspace(4, 400, 24), "size of visible boxes [px]", "fruits"),
+        ("per_image", per_image, np.arange(max(per_image, default=1) + 2) - 0.5, "visible fruits", "images"),
+    ]
+    shown = []
+    for name, values, bins, label, unit in wanted:
+        if not values:
+            continue
+        path = folder / f"histogram_{name}.png"
+        with mpl.rc_context(PLOT_STYLE):
+            canvas = Figure(figsize=PANEL)
+            axes = canvas.subplots()
+            axes.hist(values, bins=bins, color=LEAF)
+            axes.set(xlabel=label, ylabel=unit, title=label[0].upper() + label[1:])
+            if name == "size":
+                axes.set_xscale("log")
+            save_figure(canvas, path)
+        shown.append(figure(path, f"{label[0].upper()}{label[1:]}; n = {len(values)} {unit}."))
+    return shown
+
+
+def _bands(fruits: Sequence[Instance]) -> str:
+    known = np.array([i.visible_fraction for i in fruits if i.visible_fraction is not None])
+    if not len(known):
+        return ""
+    bands = [(0.0, 0.01), (0.01, 0.3), (0.3, 0.7), (0.7, 0.95), (0.95, 1.001)]
+    rows = [
+        (f"{a:g} to {min(b, 1):g}", percent(float(np.mean((known >= a) & (known < b))))) for a, b in bands
+    ]
+    return section(f"How hidden, n = {len(known)} fruits", table(("V_f", "share of fruits"), rows))
 
 
 def outlined(image: AnnotatedImage) -> NDArray[np.uint8]:
@@ -72,64 +189,5 @@ def _spread(images: tuple[AnnotatedImage, ...], count: int) -> list[AnnotatedIma
     return [images[k] for k in np.unique(np.linspace(0, len(images) - 1, count).astype(int))]
 
 
-def _fruits(images: AnnotatedImages) -> list[Instance]:
-    return [i for image in images.images for i in image.instances if i.fruit]
-
-
 def _side(box: tuple[float, float, float, float]) -> float:
     return float(np.sqrt(box[2] * box[3]))
-
-
-def _write_plot(images: AnnotatedImages, path: Path) -> None:
-    fruits = _fruits(images)
-    fractions = [i.visible_fraction for i in fruits if i.visible_fraction is not None]
-    sides = [_side(i.box_xywh) for i in fruits if i.box_xywh[2] > 0]
-    per_image = [len(image.fruits) for image in images.images]
-    figure, axes = plt.subplots(1, 4, figsize=(16, 3.4), constrained_layout=True)
-    plots: list[tuple[list[Any], Any, str]] = [
-        (fractions, np.linspace(0, 1, 21), "visible fraction $V_f$ of fruits"),
-        (sides, np.geomspace(4, 400, 24), "size of visible boxes [px]"),
-        (per_image, np.arange(0, max(per_image, default=1) + 2) - 0.5, "visible fruits in an image"),
-    ]
-    for axis, (values, bins, label) in zip(axes, plots, strict=False):
-        axis.hist(values, bins=bins, color="#3a7d44")
-        axis.set_xlabel(label)
-    axes[1].set_xscale("log")
-    counts = Counter(i.category for image in images.images for i in image.instances if i.box_xywh[2] > 0)
-    axes[3].barh(list(counts), list(counts.values()), color="#3a7d44")
-    axes[3].set_xlabel("visible instances")
-    from io import BytesIO
-
-    buffer = BytesIO()
-    figure.savefig(buffer, dpi=90)
-    plt.close(figure)
-    write_atomically(path, buffer.getvalue())
-
-
-def _page(images: AnnotatedImages) -> str:
-    fruits = _fruits(images)
-    seen = [i for i in fruits if i.box_xywh[2] > 0]
-    known = np.array([i.visible_fraction for i in fruits if i.visible_fraction is not None])
-    sides = np.array([_side(i.box_xywh) for i in seen]) if seen else np.zeros(1)
-    counts = Counter(i.category for image in images.images for i in image.instances if i.box_xywh[2] > 0)
-    lines = ["# Data set", "", f"{len(images.images)} images, {len(seen)} visible fruits."]
-    if len(fruits) > len(seen):
-        lines[-1] += (
-            f" {len(fruits) - len(seen)} more fruits of the front row are wholly hidden (amodal file only)."
-        )
-    lines += ["", "![Images with the outlines of visible and, thin, whole fruits](contact_sheet.jpg)", ""]
-    lines += ["![Histograms](statistics.png)", "", "| category | visible instances |", "|---|---|"]
-    lines += [f"| {name} | {count} |" for name, count in sorted(counts.items())]
-    low, middle, high = np.percentile(sides, [10, 50, 90])
-    lines += ["", f"Size of a visible fruit's box (root of its area): median {middle:.0f} px, "]
-    lines[-1] += f"10th and 90th percentile {low:.0f} and {high:.0f} px."
-    if len(known):
-        bands = [(0.0, 0.01), (0.01, 0.3), (0.3, 0.7), (0.7, 0.95), (0.95, 1.001)]
-        lines += ["", "| V_f | share of fruits |", "|---|---|"]
-        lines += [
-            f"| {a:g} to {min(b, 1):g} | {100 * np.mean((known >= a) & (known < b)):.1f} % |"
-            for a, b in bands
-        ]
-    if images.skipped:
-        lines += ["", f"Left out of the photos: {images.skipped_text()}."]
-    return "\n".join(lines) + "\n"
