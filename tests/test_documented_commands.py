@@ -40,3 +40,19 @@ def test_commands_and_scripts_named_in_sentences_exist(page: Path) -> None:
         assert name in COMMANDS or name in FAMILIES, name
     for path in re.findall(r"\b((?:scripts|tools|examples)/\w+\.(?:py|sh))\b", text):
         assert (ROOT / path).is_file(), path
+
+
+@pytest.mark.skipif(not (ROOT / "pyproject.toml").is_file(), reason="the tests run outside a checkout")
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
+def test_options_of_commands_named_in_sentences_exist(page: Path) -> None:
+    helps = (ROOT / "docs" / "commands.md").read_text(encoding="utf-8")
+    sections = dict(re.findall(r"^## ([\w -]+)\n(.*?)(?=^## |\Z)", helps, re.MULTILINE | re.DOTALL))
+    names = "|".join(sorted(COMMANDS, key=len, reverse=True))
+    text = re.sub(r"^```.*?^```", "", page.read_text(encoding="utf-8"), flags=re.MULTILINE | re.DOTALL)
+    wrong = [
+        f"{name} {flag}"
+        for name, rest in re.findall(rf"`(?:maniskill-tomato )?({names})((?: [^`]*)?)`", text)
+        for flag in re.findall(r"--[a-z][\w.-]*", rest)
+        if not re.search(rf"{re.escape(flag)}(?![\w-])", sections[name])
+    ]
+    assert wrong == []
