@@ -34,8 +34,11 @@ class Eval:
     """Folder of the results."""
     baseline: bool = True
     """Also run random actions, to compare."""
+    beside: str = ""
+    """Other policies to run on the same episodes, with commas between them: planners such as nbv or lattice_oracle, or
+    files. The report has a column for each."""
     video: bool = True
-    """Film the first episodes where this machine can render."""
+    """Film some episodes where this machine can render."""
     allow_other_task: bool = False
     """Accept a policy that was trained on another task."""
     plants: Annotated[PlantOptions, Flat] = PlantOptions()
@@ -59,6 +62,9 @@ class Eval:
         check_counts(episodes=self.episodes, num_envs=self.num_envs)
         env_id = None if self.allow_other_task else self.env_id
         check_policy("--policy", self.policy or shipped_policy(self.env_id), env_id)
+        beside = tuple(dict.fromkeys(name.strip() for name in self.beside.split(",") if name.strip()))
+        for name in beside:
+            check_policy("--beside", name, env_id)
         if self.episode_list is not None and not Path(self.episode_list).is_file():
             check_choice("--episode-list", self.episode_list, (*EPISODE_LISTS, "FILE.json"))
 
@@ -75,6 +81,7 @@ class Eval:
             allow_other_task=self.allow_other_task,
             env_options=self.options_of_task(),
             baseline=self.baseline,
+            beside=beside,
             video=self.video,
             title="Where to look: evaluation",
         )
@@ -85,6 +92,8 @@ class Eval:
             print(camera_summary(result.metrics))
         if "recall" in result.metrics:
             print(inspection_summary(result.metrics))
+        for line in beside_summary(result.metrics):
+            print(line)
         if result.left_out:
             print(result.left_out)
         print(f"metrics {self.out / 'metrics.json'}")
@@ -100,6 +109,17 @@ class Eval:
         if self.episode_list is not None or (self.env_id == LISTED_ID and not options):
             options["episodes"] = self.episode_list or "held_out"
         return options | camera_options(self.env_id, self.perception, self.target, self.map_noise)
+
+
+def beside_summary(metrics: dict[str, Any]) -> list[str]:
+    """One line for each other policy that ran on the same episodes."""
+    others = {**metrics.get("beside", {})}
+    if "random_actions" in metrics:
+        others = {"random actions": metrics["random_actions"], **others}
+    return [
+        f"        {name}: success {other['success_rate']:.0%}, {other['mean_steps']:.1f} steps"
+        for name, other in others.items()
+    ]
 
 
 def camera_summary(metrics: dict[str, Any]) -> str:

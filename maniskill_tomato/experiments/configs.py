@@ -46,10 +46,12 @@ class EvaluationConfig:
     """Options for `gymnasium.make` beside the defaults, for instance another plant."""
     baseline: bool = True
     """Also run uniformly random actions from the same seeds."""
+    beside: tuple[str, ...] = ()
+    """Other policies, by name or file, to run from the same seeds."""
     video: bool = True
-    """Film the first episodes where the machine can render."""
+    """Film episodes where the machine can render."""
     films: int = 3
-    """How many episodes to film."""
+    """How many: solved ones first, and of these the ones nearest to `evaluation_report.FILM_MOVES` moves."""
     title: str = "Evaluation"
     training_run: Path | None = None
     """A run whose training curves the report shows; by default the one beside the policy, if there is one."""

@@ -17,7 +17,12 @@ from maniskill_tomato.experiments import plots
 from maniskill_tomato.experiments.configs import EvaluationConfig
 from maniskill_tomato.experiments.episode_listing import list_episodes, replay_with_eval
 from maniskill_tomato.experiments.episode_record import EpisodeRecord
-from maniskill_tomato.experiments.evaluation_report import ReportInput, ReportPicture, write_report
+from maniskill_tomato.experiments.evaluation_report import (
+    FILM_MOVES,
+    ReportInput,
+    ReportPicture,
+    write_report,
+)
 from maniskill_tomato.experiments.metrics import make_metrics
 from maniskill_tomato.experiments.rollout import open_widest, run_episodes
 from maniskill_tomato.experiments.row_benchmark import ENV_ID as ROW_ID
@@ -87,6 +92,9 @@ def evaluate(config: EvaluationConfig) -> EvaluationResult:
     path = found if isinstance(found, Path) else None
     episodes, baseline, limits, policy = _run(config, found)
     threshold = limits.threshold
+    beside = {
+        name: _run_policy(config, find_policy(name, _required_task(config)))[0] for name in config.beside
+    }
     true_association = _with_true_association(config, found)
     seeable = _seeable(config, episodes)
     description = {
@@ -101,6 +109,7 @@ def evaluate(config: EvaluationConfig) -> EvaluationResult:
         policy=description,
         wall_seconds=time.perf_counter() - start,
         baseline=baseline,
+        beside=beside,
         true_association=true_association,
         seeable=seeable,
     )
@@ -110,7 +119,7 @@ def evaluate(config: EvaluationConfig) -> EvaluationResult:
     left_out = None
     if config.video:
         if (problem := vulkan_probe.rendering_problem()) is None:
-            shown = _film(config, found)
+            shown = _film(config, found, _worth_watching(episodes, config.films))
         else:
             left_out = LEFT_OUT.format(hint=problem)
     facts = {key.replace("_", " "): str(value) for key, value in description.items() if key != "path"}
@@ -316,16 +325,20 @@ def _plot_training(config: EvaluationConfig, policy: Path | None) -> list[Report
     ]
 
 
-def _film(config: EvaluationConfig, found: str | Path) -> FilmedEpisodes:
-    """Films the first episodes, with the first and last view of the first one."""
+def _worth_watching(episodes: Sequence[EpisodeRecord], count: int) -> list[int]:
+    """Seeds of the episodes to film: solved ones first, and of these the ones nearest to `FILM_MOVES` moves."""
+    order = sorted(episodes, key=lambda e: (not e.success, abs(e.steps - FILM_MOVES), e.seed))
+    return [episode.seed for episode in order[:count]]
+
+
+def _film(config: EvaluationConfig, found: str | Path, seeds: list[int]) -> FilmedEpisodes:
+    """Films some episodes, with the first and last view of the first of them."""
     from maniskill_tomato.experiments.film import film_episodes, make_film_options, poster_of
 
-    count = min(config.films, config.episodes)
-    logger.info("filming %d episodes", count)
+    logger.info("filming %d episodes", len(seeds))
     env = make_env(config.env_id, **make_film_options(config.env_options))
     path = config.out / "video.mp4"
     try:
-        seeds = [config.seed + i for i in range(count)]
         films = film_episodes(env, _open(config, found, env), seeds, path)
     finally:
         env.close()
@@ -351,4 +364,4 @@ def _film(config: EvaluationConfig, found: str | Path) -> FilmedEpisodes:
         pictures.append(ReportPicture(path=picture, caption=caption))
     poster = config.out / "poster.jpg"
     write_picture(poster, poster_of(films), 88)
-    return FilmedEpisodes(video=path, poster=poster, count=count, views=pictures)
+    return FilmedEpisodes(video=path, poster=poster, count=len(seeds), views=pictures)

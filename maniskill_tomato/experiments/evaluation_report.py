@@ -22,6 +22,9 @@ from maniskill_tomato.report_design import (
     tiles,
 )
 
+FILM_MOVES = 4
+"""Moves of the episodes that are filmed, if there are such: enough for a search, few enough to watch."""
+
 
 @dataclass(frozen=True, kw_only=True)
 class ReportPicture:
@@ -121,11 +124,12 @@ def _views(content: ReportInput, folder: Path) -> str:
     figures = side_by_side(*(figure(picture.path, picture.caption) for picture in content.views))
     shown = ""
     if content.video is not None:
-        episodes = "episode" if content.filmed == 1 else f"{content.filmed} episodes"
+        episodes = "One episode" if content.filmed == 1 else f"{content.filmed} episodes"
         shown = film(
             content.video,
             content.poster,
-            f"The first {episodes}: outside on the left, the wrist camera on the right, V_f (0 to 1) below.",
+            f"{episodes}, solved ones near to {FILM_MOVES} moves if there are any: outside on the left, the wrist "
+            "camera on the right, V_f (0 to 1) below.",
             folder,
         )
     return section("What the camera sees", shown, figures)
@@ -186,7 +190,7 @@ _ROWS = (
 
 
 def _table(metrics: Mapping[str, Any]) -> str:
-    columns = {"policy": metrics}
+    columns: dict[str, Mapping[str, Any]] = {"policy": metrics, **metrics.get("beside", {})}
     if (random := metrics.get("random_actions")) is not None:
         columns["random actions"] = random
     rows = []

@@ -85,6 +85,7 @@ def make_metrics(
     policy: dict[str, Any],
     wall_seconds: float,
     baseline: Sequence[EpisodeRecord] | None = None,
+    beside: Mapping[str, Sequence[EpisodeRecord]] | None = None,
     true_association: Sequence[EpisodeRecord] | None = None,
     seeable: Mapping[int, set[int]] | None = None,
 ) -> dict[str, Any]:
@@ -98,6 +99,7 @@ def make_metrics(
         policy: What the policy is: path, task and steps of its training.
         wall_seconds: Time that `episodes` took, in [s].
         baseline: What uniformly random actions did from the same seeds.
+        beside: What other policies did from them, by their names.
         true_association: What the policy did from the same seeds when the truth told it which fruit each detection is.
         seeable: The fruits of each row that can be seen fully, by its seed, where a camera inspected rows.
     """
@@ -113,6 +115,8 @@ def make_metrics(
     }
     if baseline is not None:
         metrics["random_actions"] = totals(summarise(baseline))
+    if beside:
+        metrics["beside"] = {name: totals(summarise(found)) for name, found in beside.items()}
     if seeable is not None:
         metrics |= summarise_inspections(episodes, seeable, success_threshold)
     if true_association is not None:

@@ -34,8 +34,8 @@ SLAB_TOP: Final = -0.12
 KEPT_FREE: Final = 1.2
 """Half of the length of the first row that is left to the plants of the game, in [m]."""
 
-REACH: Final = (5.0, 4.2, 3.6)
-"""How far along y the first, second and third row are planted, in [m]; farther plants would be a few pixels."""
+REACH: Final = (4.2, 3.4)
+"""How far along y the first and the second row are planted, in [m]; farther plants would be a few pixels."""
 
 VARIETY: Final = 6
 """Plants that these rows are made of, grown once per process."""
@@ -163,7 +163,7 @@ def _hardware(rng: np.random.Generator) -> list[sapien.render.RenderShape]:
 
 
 def _rows(rng: np.random.Generator, wool: sapien.render.RenderMaterial) -> list[sapien.render.RenderShape]:
-    """The plants beside those of the game, and two rows behind them."""
+    """The plants beside those of the game, and a row behind them."""
     shapes: list[sapien.render.RenderShape] = []
     materials: dict[str, sapien.render.RenderMaterial] = {}
     for k, reach in enumerate(REACH):

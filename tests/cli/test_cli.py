@@ -256,25 +256,28 @@ def test_a_run_on_another_plant_leaves_policies_that_say_so(
 
 
 def test_the_demo_names_its_report_and_its_policy(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    policy = tmp_path / "training" / "policy.pt"
     for _ in range(2):  # A second demo replaces the first.
-        main(["demo", "--out", str(tmp_path), "--minutes", "0.05", "--episodes", "2", "--no-video"])
+        main(["demo", "--out", str(tmp_path), "--minutes", "0.05", "--episodes", "1", "--no-video"])
     said = capsys.readouterr().out.splitlines()
-    assert said[-3:] == [
+    assert said[-4:] == [
         f"report  {tmp_path / 'report.html'}",
         "video   not wanted",
-        f"policy  {tmp_path / 'training' / 'policy.pt'}",
+        f"policy  {policy}",
+        f"watch   maniskill-tomato play --policy {policy}",
     ]
-    assert load_actor(tmp_path / "training/policy.pt").env_id == GUIDED
+    assert load_actor(policy).env_id == "TomatoViewpoint-v1"
+    metrics = json.loads((tmp_path / "metrics.json").read_text())
+    assert set(metrics["beside"]) == {"nbv", "lattice_oracle"} and "random_actions" in metrics
+    assert metrics["beside"]["lattice_oracle"]["success_rate"] == 1.0
     page = (tmp_path / "report.html").read_text()
-    assert "Training" in page and 'href="training/policy.pt"' in page
+    assert "Training" in page and "training/policy.pt" in page
+    assert all(f">{name}<" in page for name in ("nbv", "lattice_oracle", "random actions"))
 
 
 @pytest.mark.render
-def test_the_demo_films_episodes_when_it_can_render(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    main(["demo", "--out", str(tmp_path), "--minutes", "0.02", "--episodes", "1"])
-    assert f"video   {tmp_path / 'video.mp4'}" in capsys.readouterr().out
+def test_an_evaluation_films_an_episode_where_it_can_render(tmp_path: Path) -> None:
+    main(["eval", GUIDED, "--out", str(tmp_path), "--episodes", "1", "--no-baseline"])
     reader = imageio.get_reader(tmp_path / "video.mp4")
     assert reader.get_meta_data()["duration"] > 1.0
     frame = np.asarray(reader.get_data(5))
@@ -283,7 +286,7 @@ def test_the_demo_films_episodes_when_it_can_render(
     for name in ("first_view", "last_view", "first_pose", "last_pose"):
         assert imageio.imread(tmp_path / f"{name}.png").shape == (480, 640, 3)
     page = (tmp_path / "report.html").read_text()
-    assert 'src="video.mp4"' in page and "First view of the wrist camera" in page
+    assert 'src="data:video/mp4;base64,' in page and "First view of the wrist camera" in page
 
 
 def test_a_policy_that_is_damaged_or_of_another_task_is_an_error(
