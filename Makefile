@@ -43,7 +43,7 @@ browser: ## Install Chromium for the tests of the viewer, if missing (system pac
 	@scripts/install_browser.sh
 
 .PHONY: demo
-demo: $(STAMP) ## Train the guided task, evaluate it, write a report and a video
+demo: $(STAMP) ## Learn where to look, judge it on plants never seen, write a report and a film
 	@$(BIN)/maniskill-tomato demo $(ARGS)
 
 .PHONY: test

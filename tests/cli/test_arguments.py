@@ -106,6 +106,10 @@ ERRORS: dict[str, tuple[tuple[str, ...], str]] = {
         ("demonstrations", "--planner", "orakle"),
         "error: --planner: no policy at 'orakle'",
     ),
+    "policy beside another": (
+        ("eval", GENERAL, "--beside", "lattice_oracle,nbw"),
+        "error: --beside: no policy at 'nbw'",
+    ),
     "policy of a benchmark": (
         ("benchmark", "--policies", "nbv,oracel"),
         "error: --policies: no policy at 'oracel'",
