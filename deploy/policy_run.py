@@ -76,6 +76,7 @@ def run(
     confirm: Callable[[Proposal], bool] = lambda proposal: False,
     clock: Clock | None = None,
     keyboard: bool = False,
+    recorders: Sequence[Recorder] = (),
 ) -> RunResult:
     """Connects, runs, disconnects, and writes `result.json`, `report.html`, `report.png` and `run.mcap`.
 
@@ -84,6 +85,7 @@ def run(
         confirm: Asked before every move in the mode `confirm`.
         clock: Another clock than the profile's.
         keyboard: Whether keys in a terminal stop the run.
+        recorders: Are told every look, beside the recording and the report.
 
     Returns:
         How it ended; faults during the run are told there.
@@ -98,7 +100,7 @@ def run(
     sheet = ContactSheet()
     prepared = prepare(config, clock)
     with only_writer(config.out, "runs"):
-        result, facts = run_goal(config, prepared, None, [sheet], confirm, keyboard)
+        result, facts = run_goal(config, prepared, None, [sheet, *recorders], confirm, keyboard)
         return kept_result(result, lambda: write_report(config.out, result, facts, sheet))
 
 

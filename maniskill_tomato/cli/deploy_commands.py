@@ -1,5 +1,6 @@
 """`maniskill-tomato deploy`: the policy on an arm and a camera, or on their digital twin."""
 
+import contextlib
 import math
 import sys
 from dataclasses import dataclass
@@ -15,7 +16,9 @@ from maniskill_tomato.cli.early_checks import (
     check_profile,
 )
 from maniskill_tomato.cli.operator_prompt import FAULT_STATUS, end_by_signal, goes, one_mode, stopped_early
+from maniskill_tomato.cli.shared_options import say
 from maniskill_tomato.policies.layout import GENERAL_IDS
+from maniskill_tomato.view.page_address import check_port
 
 if TYPE_CHECKING:
     from maniskill_tomato.deploy.policy_run import RunConfig
@@ -71,15 +74,29 @@ class DeployRun(_Moving):
 
     out: Path = Path("runs/deploy")
     """Folder of result.json, report.html, report.png and run.mcap."""
+    view: bool = False
+    """Show every look in a browser while the run goes on; afterwards `play` opens the recording."""
+    view_port: int = 8080
+    """Port of that page, which is for this machine alone; 0 takes a free one."""
 
     def run(self) -> None:
         """Runs, and says how it ended."""
+        if self.view:
+            check_port("127.0.0.1", self.view_port)
         config = self._config(self.out)
 
         from maniskill_tomato.deploy.policy_run import run
 
-        with stopped_early():
-            result = run(config, confirm=_ask, keyboard=not self.confirm)
+        with contextlib.ExitStack() as stack:
+            watching = []
+            if self.view:
+                from maniskill_tomato.view.live_run import LiveView
+
+                live = stack.enter_context(LiveView(config.profile, self.view_port))
+                say(f"page    {live.url}")
+                watching.append(live)
+            with stopped_early():
+                result = run(config, confirm=_ask, keyboard=not self.confirm, recorders=watching)
         print(
             f"{result.reason}: {result.detail}; {result.moves} moves, V_f {result.visible_fraction:.2f}, "
             f"{result.seconds:.1f} s; {result.end_state}"

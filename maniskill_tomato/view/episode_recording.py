@@ -7,6 +7,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from maniskill_tomato.plants.organs import Plant
+from maniskill_tomato.robot.arm_model import ArmModel
+from maniskill_tomato.robot.iiwa14 import IIWA14
 
 Float32 = NDArray[np.float32]
 Float64 = NDArray[np.float64]
@@ -73,6 +75,16 @@ class MappedFruit:
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
+class SeenPoints:
+    """What a depth camera saw."""
+
+    positions: Float32
+    """In the world frame, in [m]. Shape (n, 3)."""
+    colours: UInt8
+    """sRGB. Shape (n, 3)."""
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
 class Snapshot:
     """One view of an episode, and what the policy decides on it."""
 
@@ -102,6 +114,22 @@ class Snapshot:
     """What the occlusion memory believes."""
     fruits: tuple[MappedFruit, ...] = ()
     """What a camera's map holds."""
+    points: SeenPoints | None = None
+    """What the camera saw, where no plant is known."""
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class HandView:
+    """What a camera that somebody took by hand sees of the target, as if no arm held it."""
+
+    T_w_camera: Float64
+    """Pose of its optical frame: it looks at where the target is believed to be. Shape (4, 4)."""
+    visible_fraction: float
+    """V_f of the target, as it is."""
+    is_reachable: bool
+    """Whether the arm could hold it there."""
+    picture: UInt8
+    """What it sees. Shape (H, W, 3)."""
 
 
 @dataclass(eq=False, kw_only=True)
@@ -110,14 +138,16 @@ class EpisodeRecording:
 
     title: str
     """What it is, in a line."""
-    plant: Plant
-    """The plant or the row."""
-    T_w_plant: Float64
-    """Its pose. Shape (4, 4)."""
     threshold: float
     """V_f above which the target counts as fully visible."""
-    fov_y: float
+    plant: Plant | None = None
+    """The plant or the row; None where it is not known."""
+    T_w_plant: Float64 = field(default_factory=lambda: np.eye(4))
+    """Its pose. Shape (4, 4)."""
+    fov_y: float = 0.75
     """Vertical field of view of the wrist's camera, in [rad]."""
+    model: ArmModel = IIWA14
+    """Of the arm."""
     snapshots: list[Snapshot] = field(default_factory=list)
     """In order."""
     outcome: str = ""

@@ -14,9 +14,10 @@ from viser import uplot
 
 from maniskill_tomato import report_design as design
 from maniskill_tomato.errors import TomatoError
+from maniskill_tomato.plants.kinds import PLANT_NAMES
 from maniskill_tomato.tasks import TASK_IDS
 from maniskill_tomato.view.episode_recording import EpisodeRecording, Float64
-from maniskill_tomato.view.page_scene import EpisodeScene
+from maniskill_tomato.view.page_scene import LAYERS, LAYERS_OF_RUNS, EpisodeScene, pose, vector
 from maniskill_tomato.view.page_server import close_server, open_server, stand_before
 from maniskill_tomato.view.play_settings import PERCEPTIONS
 from maniskill_tomato.view.player import Player
@@ -34,6 +35,13 @@ MOVE_FRAMES: Final = 15
 
 LAST_MOVES: Final = 6
 """Moves that are told in words."""
+
+
+OWN_PLANT: Final = "the task's own"
+
+
+HAND_COLOUR: Final = (200, 60, 160)
+"""Of the camera that is taken by hand."""
 
 
 class PlayPage:
@@ -55,7 +63,7 @@ class PlayPage:
         """viser's."""
         self._commands: queue.Queue[tuple[Callable[[], None], Future[None]] | None] = queue.Queue()
         self._drawn: tuple[EpisodeRecording, int] | None = None
-        self.scene = EpisodeScene(self.server.scene)
+        self.scene = EpisodeScene(self.server.scene, player.recording.model)
         """What is drawn."""
         self._build_controls()
         self.draw()
@@ -121,7 +129,7 @@ class PlayPage:
         gui.main_panel.dock_right()
         self._title = gui.add_markdown("")
         self._problem = gui.add_markdown("")
-        self._pictured = player.recording.snapshots[0].picture
+        self._pictured = np.full((3, 4, 3), 128, dtype=np.uint8)
         self._picture = gui.add_image(self._pictured, label="Wrist camera")
         self._play = gui.add_button("Play", icon=viser.Icon.PLAYER_PLAY)
         self._play.on_click(self._clicked(self._toggle))
@@ -145,6 +153,18 @@ class PlayPage:
             height=170,
         )
         self._moves = gui.add_markdown("")
+        if not player.is_stored:
+            self._build_choices()
+            self._build_hand()
+        with gui.add_folder("Show"):
+            for name, visible in self.scene.visible.items():
+                if name not in (LAYERS_OF_RUNS if player.is_stored else LAYERS):
+                    continue
+                box = gui.add_checkbox(name, visible)
+                box.on_update(self._layer(name))
+
+    def _build_choices(self) -> None:
+        gui, player = self.server.gui, self.player
         with gui.add_folder("Episode"):
             self._env_id: Any = gui.add_dropdown("Task", TASK_IDS, initial_value=player.settings.env_id)
             self._env_id.on_update(self._by_hand(lambda value: player.change(env_id=value)))
@@ -158,12 +178,89 @@ class PlayPage:
             self._perception.on_update(self._by_hand(lambda value: player.change(perception=value)))
             self._seed: Any = gui.add_number("Seed", player.settings.seed, min=0, step=1)
             self._seed.on_update(self._by_hand(lambda value: player.change(seed=int(value))))
-            others = gui.add_button_group("Seed", ("previous", "next"))
+            others = gui.add_button_group("Go to", ("previous", "next"))
             others.on_click(self._by_hand(self._next_seed))
-        with gui.add_folder("Show"):
-            for name, visible in self.scene.visible.items():
-                box = gui.add_checkbox(name, visible)
-                box.on_update(self._layer(name))
+        with gui.add_folder("Another plant", expand_by_default=False):
+            preset = gui.add_dropdown("Preset", (OWN_PLANT, *PLANT_NAMES), initial_value=OWN_PLANT)
+            seed = gui.add_number("Plant seed", 0, min=0, step=1)
+            density = gui.add_slider("Leaf density", min=0.2, max=2.0, step=0.1, initial_value=1.0)
+
+            def grow() -> None:
+                options = {
+                    "preset": preset.value,
+                    "seed": int(seed.value),
+                    "leaf_density": float(density.value),
+                }
+                player.change(plant_options={} if preset.value == OWN_PLANT else {"plant": options})
+
+            gui.add_button("Grow", icon=viser.Icon.PLANT).on_click(self._clicked(grow))
+
+    def _build_hand(self) -> None:
+        """A camera that one drags, always turned to the target."""
+        gui = self.server.gui
+        self._hand: Any = None
+        self._is_hand_asked = False
+        with gui.add_folder("Camera in the hand", expand_by_default=False):
+            box = gui.add_checkbox("Take it", False)
+            self._hand_words = gui.add_markdown(
+                "Drag it by its arrows: V_f from there is counted with rays at once."
+            )
+            self._hand_picture = gui.add_image(self._pictured, visible=False)
+
+        def taken(event: Any) -> None:
+            wanted = bool(event.target.value)
+            self.ask(lambda: self.take_hand(wanted))
+
+        box.on_update(taken)
+
+    def take_hand(self, is_taken: bool) -> None:
+        """Puts up the camera that one drags, where the wrist camera is now, or takes it away."""
+        self._hand_picture.visible = is_taken
+        if not is_taken:
+            self.server.scene.remove_by_name("/hand")
+            self.server.scene.remove_by_name("/hand_view")
+            self._hand = None
+        elif self._hand is None:
+            snapshot = self.player.recording.snapshots[self.player.shown]
+            self._hand = self.server.scene.add_transform_controls(
+                "/hand",
+                scale=0.15,
+                disable_rotations=True,
+                depth_test=False,
+                position=vector(snapshot.T_w_camera[:3, 3]),
+            )
+            self._hand.on_update(lambda _: self._ask_hand())
+            self._look_by_hand()
+
+    def _ask_hand(self) -> None:
+        """Looks from where the hand is when the thread comes to it; dragging asks more often than it can answer."""
+        if not self._is_hand_asked:
+            self._is_hand_asked = True
+            self.ask(self._look_by_hand)
+
+    def _look_by_hand(self) -> None:
+        self._is_hand_asked = False
+        if self._hand is None:
+            return
+        view = self.player.look_from(np.array(self._hand.position, dtype=np.float64))
+        if view is None:
+            return
+        height, width = view.picture.shape[:2]
+        wxyz, position = pose(view.T_w_camera)
+        self.server.scene.add_camera_frustum(
+            "/hand_view",
+            fov=self.player.recording.fov_y,
+            aspect=width / height,
+            scale=0.08,
+            thickness=0.003,
+            color=HAND_COLOUR,
+            cast_shadow=False,
+            wxyz=wxyz,
+            position=position,
+        )
+        self._hand_picture.image = view.picture
+        reach = "the arm reaches this place" if view.is_reachable else "the arm does **not** reach this place"
+        self._hand_words.content = f"V_f **{view.visible_fraction:.2f}** from here; {reach}"
 
     def _clicked(self, command: Callable[[], None]) -> Callable[[Any], None]:
         def clicked(_: Any) -> None:
@@ -196,6 +293,9 @@ class PlayPage:
     def draw(self) -> None:
         """Draws the shown snapshot; the arm is seen on its way if it is the one after the last that was drawn."""
         recording, shown = self.player.recording, self.player.shown
+        if not recording.snapshots:
+            self._title.content = f"{recording.title}\n\nThere was no look yet."
+            return
         if self._drawn == (recording, shown - 1):
             before = recording.snapshots[shown - 1].joint_positions
             self._animate(recording, shown - 1, before, recording.snapshots[shown].joint_positions)
@@ -230,6 +330,8 @@ class PlayPage:
             np.full(len(fractions), recording.threshold),
         )
         self._moves.content = last_moves(recording, shown)
+        if self.player.is_stored:
+            return
         self._env_id.value = settings.env_id
         self._policy.options = settings.policies()
         self._policy.value = settings.policy

@@ -39,7 +39,7 @@ def page_of(recording: EpisodeRecording) -> str:
     """The HTML of `export_page`."""
     with passing_server() as server:
         stand_before(server, recording)
-        scene = EpisodeScene(server.scene, small=True)
+        scene = EpisodeScene(server.scene, recording.model, small=True)
         scene.draw(recording, 0)
         film = server.get_scene_serializer()
         film.insert_sleep(HOLD_SECONDS)

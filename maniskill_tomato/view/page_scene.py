@@ -22,6 +22,7 @@ from maniskill_tomato.view.episode_recording import (
     EpisodeRecording,
     Float64,
     Foliage,
+    SeenPoints,
     Snapshot,
     Voxel,
 )
@@ -35,11 +36,15 @@ LAYERS: Final[dict[str, bool]] = {
     "candidates": True,
     "way": True,
     "fruit map": True,
+    "points": True,
     "blocked": False,
     "free": False,
     "unknown": False,
 }
 """What can be shown or hidden, and whether it is shown at first."""
+
+LAYERS_OF_RUNS: Final = ("arm", "picture", "way", "points")
+"""Those that the recording of a run has something of."""
 
 Rgb = tuple[int, int, int]
 
@@ -146,6 +151,7 @@ class EpisodeScene:
             self._shown = snapshot
             self._draw_target(snapshot)
             self._draw_fruits(snapshot)
+            self._draw_points(snapshot.points)
             self._draw_candidates(snapshot)
             self._draw_foliage(snapshot.foliage)
             self._draw_camera(recording, snapshot)
@@ -158,7 +164,8 @@ class EpisodeScene:
         for name in ("leaves", "neighbours"):
             self._handles[name] = []
         share = NEIGHBOURS_IN_SMALL if self._small else 1.0
-        for name, mesh in plant_layers(recording.plant, share).items():
+        layers = {} if recording.plant is None else plant_layers(recording.plant, share)
+        for name, mesh in layers.items():
             shown = self.visible.get(name, True)
             handle = self._scene.add_glb(f"/plant/{name}", glb(mesh), visible=shown)
             if name in self._handles:
@@ -196,6 +203,23 @@ class EpisodeScene:
                     cast_shadow=False,
                     position=vector(fruit.position),
                     visible=self.visible["fruit map"],
+                )
+            )
+
+    def _draw_points(self, points: SeenPoints | None) -> None:
+        self._scene.remove_by_name("/points")
+        self._handles["points"] = []
+        if points is not None and len(points.positions):
+            self._handles["points"].append(
+                self._scene.add_point_cloud(
+                    "/points",
+                    points.positions,
+                    points.colours,
+                    point_size=0.003,
+                    point_shape="square",
+                    point_shading="flat",
+                    precision="float32",
+                    visible=self.visible["points"],
                 )
             )
 
@@ -346,8 +370,8 @@ class EpisodeScene:
 
 def first_view(recording: EpisodeRecording) -> tuple[Float64, Float64]:
     """Where a viewer stands, and where it looks, so that arm and plant fill the picture: world frame, in [m]."""
-    plant = recording.T_w_plant[:3, 3]
-    middle = np.array([0.5 * plant[0], 0.5 * plant[1], 0.75])
+    seen = recording.snapshots[0].target_position if recording.plant is None else recording.T_w_plant[:3, 3]
+    middle = np.array([0.5 * seen[0], 0.5 * seen[1], 0.75])
     return middle + np.array([-1.6, -2.4, 0.9]), middle
 
 

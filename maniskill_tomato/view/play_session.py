@@ -10,8 +10,10 @@ from maniskill_tomato.policies.adapters import as_state_policy
 from maniskill_tomato.policies.lattice_planner import LatticePlanner
 from maniskill_tomato.policies.opening import RANDOM, open_policy, shipped_policy
 from maniskill_tomato.policies.protocol import Policy, reseed
+from maniskill_tomato.policies.reach import CameraReach
 from maniskill_tomato.robot.inverse_kinematics import Reach
 from maniskill_tomato.robot.kinematics import link_transforms
+from maniskill_tomato.robot.look_at import look_at_pose
 from maniskill_tomato.sensing.camera_perception import CameraPerception
 from maniskill_tomato.sensing.occlusion_memory import CELL_SIZE, OcclusionMemory
 from maniskill_tomato.tasks.vector_env import make_vector_env
@@ -20,6 +22,7 @@ from maniskill_tomato.view.episode_recording import (
     EpisodeRecording,
     Float64,
     Foliage,
+    HandView,
     MappedFruit,
     Snapshot,
     UInt8,
@@ -60,6 +63,7 @@ class PlaySession:
         self._world = self._env.world
         self._palette: tuple[Any, Float64] | None = None
         self._action: Tensor | None = None
+        self._reach: CameraReach | None = None
         self.recording: EpisodeRecording
         """The episode so far."""
         self.begin(settings.seed)
@@ -136,7 +140,7 @@ class PlaySession:
             target_position=_double(world.game.known_target()[0]),
             visible_fraction=float(info["visible_fraction"][0]),
             true_visible_fraction=None if true is None else float(true[0]),
-            picture=self._picture(),
+            picture=self._picture(world.T_w_camera[0], world.T_w_links[0]),
             target_organ=int(world.plant_batch.fruit_organ(world.state.target)[0]),
             event=event,
             was_refused=moved and int(info["reachability"][0]) == int(Reach.UNREACHABLE),
@@ -146,17 +150,36 @@ class PlaySession:
             fruits=() if perception is None else _fruits(perception),
         )
 
-    def _picture(self) -> UInt8:
-        """What the wrist camera sees, each organ in its mean colour. Shape (H, W, 3)."""
+    def look_from(self, position: Float64) -> HandView:
+        """What a camera elsewhere would see of the present target.
+
+        Args:
+            position: Of the camera, in the world frame, in [m]. Shape (3,).
+        """
+        world = self._world
+        target = world.game.known_target()[0].double()
+        place = torch.as_tensor(position, dtype=torch.float64)[None]
+        T = look_at_pose(place, target[None])
+        if self._reach is None:
+            self._reach = CameraReach(world.device)
+        return HandView(
+            T_w_camera=_double(T[0]),
+            visible_fraction=float(world.ground_truth.visible_fraction(T)[0]),
+            is_reachable=bool(self._reach.reachable(place, target)[0]),
+            picture=self._picture(T[0].float(), None),
+        )
+
+    def _picture(self, T_w_camera: Tensor, T_w_links: Tensor | None) -> UInt8:
+        """What a camera sees, each organ in its mean colour. Shape (H, W, 3)."""
         world = self._world
         plant = world.plant_batch.plants[0]
         if self._palette is None or self._palette[0] is not plant:
             self._palette = plant, np.concatenate([[SKY, ARM], organ_colours(plant)])
         picture = world.scene.picture(
             world.intrinsics.scaled(*PICTURE_SIZE),
-            world.T_w_camera[0],
+            T_w_camera,
             world.plant_batch.T_world_plant[0],
-            world.T_w_links[0],
+            T_w_links,
         )
         return picture.coloured(self._palette[1])
 

@@ -4,7 +4,7 @@ from collections.abc import Callable
 from dataclasses import replace
 from typing import Any, Protocol
 
-from maniskill_tomato.view.episode_recording import EpisodeRecording
+from maniskill_tomato.view.episode_recording import EpisodeRecording, Float64, HandView
 from maniskill_tomato.view.play_settings import SHIPPED, PlaySettings
 
 
@@ -32,6 +32,32 @@ class Session(Protocol):
         """Makes a move; whether there was one to make."""
         ...
 
+    def look_from(self, position: Float64) -> HandView | None:
+        """What a camera at a place would see of the target; None if that is not known. Shape (3,), in [m]."""
+        ...
+
+
+class StoredSession:
+    """An episode that happened elsewhere: all that can be done is to look at it."""
+
+    is_over = True
+
+    def __init__(self, recording: EpisodeRecording) -> None:
+        """Keeps the recording; snapshots that come later are shown too."""
+        self.settings = PlaySettings()
+        self.recording = recording
+
+    def begin(self, seed: int) -> None:
+        """Nothing: it has happened."""
+
+    def step(self) -> bool:
+        """There is never a move to make."""
+        return False
+
+    def look_from(self, position: Float64) -> HandView | None:
+        """There is no plant to look at."""
+        return None
+
 
 class Player:
     """Shows one snapshot of the episode of a session, and goes on from the last one."""
@@ -43,6 +69,8 @@ class Player:
             open_session: Makes a session; it may raise a `TomatoError`.
             settings: Of the first.
         """
+        self.is_stored = False
+        """Whether the episode happened elsewhere, so that no other can be chosen."""
         self._open = open_session
         self._session = open_session(settings)
         self.settings = settings
@@ -52,10 +80,21 @@ class Player:
         self.is_playing = False
         """Whether moves follow each other by themselves."""
 
+    @classmethod
+    def of(cls, recording: EpisodeRecording) -> "Player":
+        """Shows an episode that happened elsewhere."""
+        player = cls(lambda _: StoredSession(recording), PlaySettings())
+        player.is_stored = True
+        return player
+
     @property
     def recording(self) -> EpisodeRecording:
         """The episode so far."""
         return self._session.recording
+
+    def look_from(self, position: Float64) -> HandView | None:
+        """What a camera elsewhere would see of the present target; see `HandView`. Shape (3,), in [m]."""
+        return self._session.look_from(position)
 
     @property
     def is_at_end(self) -> bool:
@@ -83,6 +122,12 @@ class Player:
         """Shows a snapshot that was recorded; the nearest where there is none of this number."""
         self.is_playing = False
         self.shown = min(max(index, 0), self.recording.moves)
+
+    def follow(self) -> None:
+        """Shows the last snapshot if the one before it, or a later one, was shown: whoever went back stays there."""
+        last = self.recording.moves
+        if self.shown >= last - 1:
+            self.shown = max(last, 0)
 
     def reset(self) -> None:
         """Begins the same episode again."""

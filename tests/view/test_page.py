@@ -96,6 +96,15 @@ def test_a_layer_can_be_hidden_and_stays_so_at_the_next_view(page: PlayPage) -> 
     assert not node(page, "/candidates/best").visible and node(page, "/memory/blocked").visible
 
 
+def test_the_camera_in_the_hand_stands_in_the_scene_while_it_is_taken(page: PlayPage) -> None:
+    page.ask(lambda: page.take_hand(True)).result(PATIENCE_S)
+    camera = page.player.recording.snapshots[0].T_w_camera[:3, 3]
+    np.testing.assert_allclose(node(page, "/hand").position, camera, atol=1e-6)
+    np.testing.assert_allclose(node(page, "/hand_view").position, camera, atol=1e-6)
+    page.ask(lambda: page.take_hand(False)).result(PATIENCE_S)
+    assert page.server.scene.get_handle_by_name("/hand") is None
+
+
 def test_a_port_that_is_taken_is_refused_in_words() -> None:
     with socket.create_server(("127.0.0.1", 0)) as taken:
         port = taken.getsockname()[1]

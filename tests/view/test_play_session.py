@@ -1,10 +1,12 @@
 """Episodes stepped for a viewer: they are those of an evaluation, and snapshots tell what was known and decided."""
 
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 import torch
+import trimesh
 
 from maniskill_tomato.errors import InvalidInputError
 from maniskill_tomato.experiments.rollout import run_episode
@@ -12,6 +14,7 @@ from maniskill_tomato.policies.opening import open_policy
 from maniskill_tomato.sensing.occlusion_memory import CELL_SIZE
 from maniskill_tomato.tasks.vector_env import make_vector_env
 from maniskill_tomato.view.episode_recording import EpisodeRecording, Voxel
+from maniskill_tomato.view.plant_meshes import organ_colours
 from maniskill_tomato.view.play_session import PlaySession
 from maniskill_tomato.view.play_settings import PlaySettings
 
@@ -90,6 +93,7 @@ def test_blocked_voxels_are_where_leaves_are() -> None:
     recording = played(PlaySettings(policy="nbv"))
     foliage = recording.snapshots[-1].foliage
     assert foliage is not None
+    assert recording.plant is not None
     vertices = recording.plant.vertices @ recording.T_w_plant[:3, :3].T + recording.T_w_plant[:3, 3]
     corners = torch.as_tensor(vertices[recording.plant.faces].mean(1), dtype=torch.float32)
 
@@ -104,6 +108,7 @@ def test_a_camera_tells_its_map_of_fruits_and_the_truth_stands_beside_what_it_me
     session = PlaySession(PlaySettings(perception="occlusion_model", policy="nbv", target="any"))
     session.step()
     snapshot = session.recording.snapshots[-1]
+    assert session.recording.plant is not None
     centres = np.array([fruit.centre for fruit in session.recording.plant.fruits])
     centres = centres @ session.recording.T_w_plant[:3, :3].T + session.recording.T_w_plant[:3, 3]
     assert snapshot.true_visible_fraction is not None and len(snapshot.fruits) > 3
@@ -150,3 +155,36 @@ def test_the_wrist_picture_shows_a_red_target_where_it_is_expected() -> None:
 def test_settings_that_cannot_be_played_are_refused(options: dict[str, object], message: str) -> None:
     with pytest.raises(InvalidInputError, match=message):
         PlaySettings(**options)  # type: ignore[arg-type]
+
+
+def test_a_camera_taken_by_hand_sees_what_the_arm_would_see_from_there() -> None:
+    recording = played(PlaySettings(policy="nbv"))
+    session = PlaySession(PlaySettings(policy="nbv"))
+    last = recording.snapshots[-1]
+    view = session.look_from(last.T_w_camera[:3, 3])
+    assert view.is_reachable and view.visible_fraction == pytest.approx(last.visible_fraction, abs=0.03)
+    ahead = view.T_w_camera[:3, 2]
+    way = last.target_position - view.T_w_camera[:3, 3]
+    np.testing.assert_allclose(ahead, way / np.linalg.norm(way), atol=1e-6)
+    first = session.look_from(session.recording.snapshots[0].T_w_camera[:3, 3])
+    assert first.visible_fraction == pytest.approx(recording.snapshots[0].visible_fraction, abs=0.03)
+    assert not session.look_from(last.target_position + [-3.0, 0.0, 0.0]).is_reachable
+
+
+def test_plants_from_a_mesh_file_are_played_in_their_own_colours(tmp_path: Path) -> None:
+    shape: Any = trimesh.creation.icosphere(2, 0.03)
+    shape.visual.face_colors = [200, 30, 20, 255]
+    shape.apply_translation([0.0, 0.0, 0.8])
+    leaf: Any = trimesh.creation.box((0.002, 0.06, 0.06))
+    leaf.visual.face_colors = [20, 120, 30, 255]
+    leaf.apply_translation([-0.06, 0.02, 0.8])
+    scene: Any = trimesh.Scene({"fruit_0": shape, "leaf_0": leaf})
+    path = tmp_path / "plant.glb"
+    path.write_bytes(scene.export(file_type="glb"))
+    options = {"plant": {"mesh": str(path)}, "start_visibility": (0.0, 1.0)}
+    session = PlaySession(PlaySettings(policy="nbv", plant_options=options))
+    plant = session.recording.plant
+    assert plant is not None and len(plant.fruits) == 1
+    colours = dict(zip([o.semantic_class.name for o in plant.organs], organ_colours(plant), strict=True))
+    # The file's numbers are linear light.
+    np.testing.assert_allclose(colours["LEAF"], [79, 182, 96], atol=3)

@@ -5,7 +5,7 @@ import pytest
 
 from maniskill_tomato.errors import InvalidInputError
 from maniskill_tomato.plants.generator import generate_plant
-from maniskill_tomato.view.episode_recording import EpisodeRecording, Snapshot
+from maniskill_tomato.view.episode_recording import EpisodeRecording, Float64, HandView, Snapshot
 from maniskill_tomato.view.play_settings import SHIPPED, PlaySettings
 from maniskill_tomato.view.player import Player
 
@@ -34,6 +34,9 @@ class CountingSession:
     @property
     def is_over(self) -> bool:
         return self.recording.moves >= LENGTH
+
+    def look_from(self, position: Float64) -> HandView | None:
+        return None
 
     def step(self) -> bool:
         if self.is_over:
@@ -121,3 +124,31 @@ def test_settings_that_cannot_be_opened_leave_the_episode_as_it_was(player: Play
     with pytest.raises(InvalidInputError, match="broken"):
         player.change(policy="broken")
     assert player.recording is before and player.shown == 1 and player.settings.policy == SHIPPED
+
+
+def test_an_episode_that_happened_elsewhere_is_only_looked_at() -> None:
+    session = CountingSession(PlaySettings())
+    while session.step():
+        pass
+    player = Player.of(session.recording)
+    assert player.is_stored and player.shown == 0
+    for expected in (1, 2, 3, 3):
+        player.step()
+        assert player.shown == expected
+    assert player.is_at_end and player.recording.moves == LENGTH
+
+
+def test_a_run_that_goes_on_is_followed_unless_somebody_went_back() -> None:
+    session = CountingSession(PlaySettings())
+    player = Player.of(session.recording)
+    session.step()
+    player.follow()
+    assert player.shown == 1
+    player.show(0)
+    session.step()
+    player.follow()
+    assert player.shown == 0
+    player.show(2)
+    session.step()
+    player.follow()
+    assert player.shown == 3

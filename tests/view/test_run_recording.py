@@ -1,0 +1,102 @@
+"""Runs of `deploy` in the viewer: from their recordings, and live."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from maniskill_tomato.cli import main
+from maniskill_tomato.deploy.deploy_errors import RecordingError
+from maniskill_tomato.deploy.policy_run import RunConfig, run
+from maniskill_tomato.deploy.profile import load_profile
+from maniskill_tomato.deploy.run_records import KeptSteps, RunResult, Step
+from maniskill_tomato.view.episode_recording import EpisodeRecording
+from maniskill_tomato.view.live_run import LiveView
+from maniskill_tomato.view.run_recording import read_run
+
+
+@pytest.fixture(scope="module")
+def kept() -> KeptSteps:
+    return KeptSteps()
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return tmp_path_factory.mktemp("deploy")
+
+
+@pytest.fixture(scope="module")
+def live() -> EpisodeRecording:
+    return EpisodeRecording(title="", threshold=0.0)
+
+
+@pytest.fixture(scope="module")
+def result(folder: Path, kept: KeptSteps, live: EpisodeRecording) -> RunResult:
+    profile = load_profile("mock")
+    with LiveView(profile, 0) as view:
+        config = RunConfig(profile=profile, out=folder, policy="nbv")
+        done = run(config, recorders=[kept, view])
+        live.snapshots.extend(view.player.recording.snapshots)
+        live.outcome = view.player.recording.outcome
+    return done
+
+
+def test_a_recording_is_read_as_the_looks_of_its_run(
+    folder: Path, kept: KeptSteps, result: RunResult
+) -> None:
+    recording = read_run(folder / "run.mcap")
+    assert recording.plant is None and recording.moves == len(kept.steps) - 1 > 0
+    # The result is rounded to four decimals.
+    np.testing.assert_allclose(recording.visible_fractions, result.visible_fractions, atol=5.1e-5)
+    for snapshot, step in zip(recording.snapshots, kept.steps, strict=True):
+        np.testing.assert_allclose(snapshot.joint_positions, step.joint_positions)
+        np.testing.assert_allclose(snapshot.T_w_camera, step.T_world_camera)
+    assert recording.outcome.startswith(f"{result.reason}: {result.detail}")
+    assert [s.event.split(":")[0] for s in recording.snapshots[1:]] == [s.outcome for s in kept.steps[:-1]]
+
+
+def test_points_lie_where_the_camera_measured_depth(folder: Path, kept: KeptSteps, result: RunResult) -> None:
+    snapshot = read_run(folder / "run.mcap").snapshots[-1]
+    assert snapshot.points is not None and len(snapshot.points.positions) > 500
+    away = np.linalg.norm(snapshot.points.positions - snapshot.target_position, axis=1)
+    red, green, _ = snapshot.points.colours[away < 0.04].mean(0)
+    assert red > 1.5 * green
+    step: Step = kept.steps[-1]
+    in_camera = np.linalg.inv(step.T_world_camera)
+    depth = snapshot.points.positions @ in_camera[2, :3] + in_camera[2, 3]
+    assert 0.05 < depth.min() and depth.max() < 2.01
+
+
+def test_a_live_run_is_recorded_as_its_file_says(
+    folder: Path, result: RunResult, live: EpisodeRecording
+) -> None:
+    stored = read_run(folder / "run.mcap")
+    assert live.outcome == stored.outcome and live.moves == stored.moves
+    for now, then in zip(live.snapshots, stored.snapshots, strict=True):
+        assert (now.event, now.was_refused) == (then.event, then.was_refused)
+        np.testing.assert_array_equal(now.picture, then.picture)
+
+
+def test_what_fails_in_the_viewer_does_not_end_a_run(caplog: pytest.LogCaptureFixture) -> None:
+    with LiveView(load_profile("mock"), 0) as view:
+        view.step(None)  # type: ignore[arg-type]
+    assert "the run goes on" in caplog.text
+
+
+def test_the_folder_of_a_run_is_exported(
+    folder: Path, result: RunResult, capsys: pytest.CaptureFixture[str]
+) -> None:
+    page = folder / "page.html"
+    main(["play", str(folder), "--export", str(page)])
+    assert result.reason in capsys.readouterr().out
+    assert page.stat().st_size < 2_500_000
+
+
+def test_what_is_no_recording_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path = tmp_path / "run.mcap"
+    with pytest.raises(SystemExit) as ended:
+        main(["play", str(path)])
+    assert ended.value.code == 2 and "there is no file" in capsys.readouterr().err
+    path.write_bytes(b"no recording")
+    with pytest.raises(RecordingError, match="run.mcap"):
+        read_run(path)
