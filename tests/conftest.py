@@ -136,6 +136,10 @@ LONG_FILES = (
     "test_planners_env.py",
     "test_comparison.py",
     "test_worker_pool.py",
+    "test_play.py",
+    "test_page_browser.py",
+    "test_page.py",
+    "test_play_session.py",
 )
 """Those that take longest come first, so that no process is left with one of them at the end."""
 
