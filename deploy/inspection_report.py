@@ -24,6 +24,7 @@ from maniskill_tomato.report_design import (
     page,
     paragraph,
     percent,
+    photo,
     rgb,
     section,
     table,
@@ -81,7 +82,7 @@ def overview(
         cameras: Where the camera was at each look, base frame, in [m]. Each of shape (3,).
         pictures: Of the fruits.
     """
-    front = _front_view(fruits, cameras)
+    front = front_view(fruits, cameras)
     rows = math.ceil(len(pictures) / COLUMNS)
     width = max(FRONT_SIZE[0], COLUMNS * (SIDE + 8) + 8)
     head = wrap_text(title, width - 20, 0.55)
@@ -97,22 +98,24 @@ def overview(
     return sheet
 
 
-def write_page(
-    path: Path, facts: dict[str, Any], fruits: Sequence[dict[str, Any]], overview_file: Path
-) -> bytes:
+def write_page(path: Path, facts: dict[str, Any], fruits: Sequence[dict[str, Any]], front: bytes) -> bytes:
     """The content of `report.html`.
 
     Args:
         path: Where it will be; the fruits' pictures lie beside it.
         facts: Of the run, as in `inspection.json`.
         fruits: Its list.
-        overview_file: `report.png`.
+        front: PNG file of `front_view`.
     """
     ripe = [fruit for fruit in fruits if fruit["ripeness"] == "ripe"]
     full = sum(fruit["fully_seen"] for fruit in ripe)
     cells = [
-        tile(str(full), "ripe fruits fully seen", f"{len(fruits)} fruits listed, {len(ripe)} of them ripe"),
-        tile(str(facts["moves"]), "moves", f"{facts['refused_moves']} refused"),
+        tile(
+            f"{full} fruits",
+            "ripe and fully seen",
+            f"n = {len(fruits)} fruits listed, {len(ripe)} of them ripe",
+        ),
+        tile(f"{facts['moves']} moves", "for the row", f"{facts['refused_moves']} refused"),
         tile(f"{facts['device_seconds']:.0f} s", "by the run's clock", str(facts["reason"])),
     ]
     if facts.get("true_recall") is not None:
@@ -143,10 +146,11 @@ def write_page(
             section(
                 "The row",
                 paragraph(outcome),
-                figure(
-                    overview_file,
+                photo(
+                    front,
                     f"The row seen from the robot, in metres, n = {len(fruits)} fruits; thick ring: fully seen, "
                     "line: the camera's way",
+                    least_px=760,
                 ),
             ),
             section(
@@ -177,7 +181,7 @@ def _row(fruit: dict[str, Any], has_truth: bool) -> list[str]:
     return row
 
 
-def _front_view(fruits: Sequence[InspectedFruit], cameras: Sequence[Float64]) -> Picture:
+def front_view(fruits: Sequence[InspectedFruit], cameras: Sequence[Float64]) -> Picture:
     """y to the left and z upwards, as the robot sees them."""
     picture = np.full((FRONT_SIZE[1], FRONT_SIZE[0], 3), 255, dtype=np.uint8)
 
@@ -187,11 +191,11 @@ def _front_view(fruits: Sequence[InspectedFruit], cameras: Sequence[Float64]) ->
     for k in range(-8, 9, 2):
         column, _ = place(np.array([0.0, k / 10, TOP]))
         cv2.line(picture, (column, 0), (column, FRONT_SIZE[1]), rgb(GRID), 1)
-        write_text(picture, f"y {k / 10:.1f}", (column + 3, FRONT_SIZE[1] - 6), 0.36)
+        write_text(picture, f"y {k / 10:.1f} m", (column + 3, FRONT_SIZE[1] - 8), 0.65)
     for k in range(2, 10, 2):
         _, row = place(np.array([0.0, 0.0, k / 10]))
         cv2.line(picture, (0, row), (FRONT_SIZE[0], row), rgb(GRID), 1)
-        write_text(picture, f"z {k / 10:.1f} m", (4, row - 4), 0.36)
+        write_text(picture, f"z {k / 10:.1f} m", (4, row - 6), 0.65)
     way = [place(camera) for camera in cameras]
     for start, end in zip(way[:-1], way[1:], strict=True):
         cv2.line(picture, start, end, rgb(SKY), 1, cv2.LINE_AA)
@@ -207,7 +211,7 @@ def _front_view(fruits: Sequence[InspectedFruit], cameras: Sequence[Float64]) ->
             rgb(INK if fruit.is_fully_seen else MUTED),
             2 if fruit.is_fully_seen else 1,
         )
-        write_text(picture, str(fruit.number), (centre[0] - 6, centre[1] + 4), 0.36)
+        write_text(picture, str(fruit.number), (centre[0] - 8 * len(str(fruit.number)), centre[1] + 7), 0.65)
     return picture
 
 

@@ -9,7 +9,7 @@ import numpy as np
 
 from maniskill_tomato.deploy.clock import Clock
 from maniskill_tomato.deploy.deploy_errors import ProfileError
-from maniskill_tomato.deploy.inspection_report import fruit_picture, overview, write_page
+from maniskill_tomato.deploy.inspection_report import front_view, fruit_picture, overview, write_page
 from maniskill_tomato.deploy.interface import Float64
 from maniskill_tomato.deploy.policy_run import (
     Prepared,
@@ -123,7 +123,9 @@ def _report(
         # The list first: what matters most when the disk is nearly full.
         write_files(config.out, {"inspection.json": as_json(content), **files})
         html = config.out / "report.html"
-        write_files(config.out, {html.name: write_page(html, content, entries, config.out / "report.png")})
+        write_files(
+            config.out, {html.name: write_page(html, content, entries, as_png(front_view(fruits, cameras)))}
+        )
 
     result = kept_result(result, write)
     return InspectionResult(run=result, fruits=tuple(entries), totals=totals, judged=tuple(judged))

@@ -217,17 +217,20 @@ def figure(path: Path, caption: str) -> str:
     return photo(path.read_bytes(), caption)
 
 
-def photo(content: bytes, caption: str) -> str:
+def photo(content: bytes, caption: str, least_px: int = 0) -> str:
     """A picture that is no file, with its caption below.
 
     Args:
         content: Of a PNG or JPEG file.
         caption: As text.
+        least_px: Width at which it can still be read, in [px]; where the page is narrower it is scrolled.
     """
     text = html.escape(caption)
-    return (
-        f'<figure><img alt="{text}" src="{_picture_data(content)}"><figcaption>{text}</figcaption></figure>'
-    )
+    width = f' style="min-width: {least_px}px"' if least_px else ""
+    shown = f'<img alt="{text}" src="{_picture_data(content)}"{width}>'
+    if least_px:
+        shown = f'<div class="scroll">{shown}</div>'
+    return f"<figure>{shown}<figcaption>{text}</figcaption></figure>"
 
 
 def film(path: Path, poster: Path | None, caption: str, folder: Path) -> str:

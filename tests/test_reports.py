@@ -15,7 +15,7 @@ from matplotlib.text import Text
 
 import maniskill_tomato
 from maniskill_tomato import report_design
-from maniskill_tomato.report_design import figure, film, page, section, table, tile, tiles
+from maniskill_tomato.report_design import figure, film, page, photo, section, table, tile, tiles
 from maniskill_tomato.report_plots import (
     MOST_LINES,
     PANEL,
@@ -180,13 +180,15 @@ def test_a_large_film_is_linked_and_the_page_says_so(tmp_path: Path, monkeypatch
 def test_large_photos_are_packed_and_small_pictures_are_kept(tmp_path: Path) -> None:
     y, x = np.mgrid[0:480, 0:640]
     noise = np.random.default_rng(0).normal(0, 6, (480, 640, 3))
-    photo = np.clip(np.stack([x / 3, y / 2, (x + y) / 5], axis=-1) + noise, 0, 255).astype(np.uint8)
-    imageio.imwrite(tmp_path / "photo.png", photo)
-    imageio.imwrite(tmp_path / "small.png", photo[:40, :40])
+    pixels = np.clip(np.stack([x / 3, y / 2, (x + y) / 5], axis=-1) + noise, 0, 255).astype(np.uint8)
+    imageio.imwrite(tmp_path / "photo.png", pixels)
+    imageio.imwrite(tmp_path / "small.png", pixels[:40, :40])
     large = (tmp_path / "photo.png").stat().st_size
     packed = figure(tmp_path / "photo.png", "")
     assert "data:image/jpeg" in packed and len(packed) < large / 2
     assert "data:image/png" in figure(tmp_path / "small.png", "")
+    ((drawing, around),) = Elements(photo((tmp_path / "small.png").read_bytes(), "A drawing", 760)).all("img")
+    assert drawing["style"] == "min-width: 760px" and "scroll" in around
 
 
 def test_lines_are_told_apart_without_colour() -> None:

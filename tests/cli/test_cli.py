@@ -271,8 +271,9 @@ def test_the_demo_names_its_report_and_its_policy(tmp_path: Path, capsys: pytest
     assert set(metrics["beside"]) == {"nbv", "lattice_oracle"} and "random_actions" in metrics
     assert metrics["beside"]["lattice_oracle"]["success_rate"] == 1.0
     page = (tmp_path / "report.html").read_text()
-    assert "Training" in page and "training/policy.pt" in page
     assert all(f">{name}<" in page for name in ("nbv", "lattice_oracle", "random actions"))
+    assert "Training" in page and "<dd>training/policy.pt</dd>" in page
+    assert f"<code>maniskill-tomato demo --out {tmp_path} --minutes 0.05" in page
 
 
 @pytest.mark.render
@@ -286,7 +287,8 @@ def test_an_evaluation_films_an_episode_where_it_can_render(tmp_path: Path) -> N
     for name in ("first_view", "last_view", "first_pose", "last_pose"):
         assert imageio.imread(tmp_path / f"{name}.png").shape == (480, 640, 3)
     page = (tmp_path / "report.html").read_text()
-    assert 'src="data:video/mp4;base64,' in page and "First view of the wrist camera" in page
+    assert 'src="data:video/mp4;base64,' in page and 'poster="data:image/jpeg;base64,' in page
+    assert 'href="video.mp4"' in page and "First view of the wrist camera" in page
 
 
 def test_a_policy_that_is_damaged_or_of_another_task_is_an_error(
