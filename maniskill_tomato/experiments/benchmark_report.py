@@ -265,17 +265,18 @@ def _listed(label: str, episodes: Sequence[EpisodeRecord], content: BenchmarkInp
 
 
 def _tiles(rows: Sequence[Mapping[str, Any]], privileged: Sequence[str]) -> str:
-    """The best policy that does not know the truth, and the best of all."""
+    """The best policy that does not know the truth; of those that do, if there is no other."""
     fair = [row for row in rows if row["policy"] not in privileged] or list(rows)
     best = min(fair, key=lambda row: (-row["success_rate"], row["mean_moves"]))
     low, high = best["success_rate_interval_95"]
     moves_low, moves_high = best["mean_moves_interval_95"]
     count = f"n = {best['episodes']} episodes"
+    kind = "knows the truth" if best["policy"] in privileged else "does not know the truth"
     decision = best["decision_ms"]
     return tiles(
         tile(
             percent(best["success_rate"]),
-            f"solved by {best['policy']}, the best that does not know the truth",
+            f"solved by {best['policy']}, the best that {kind}",
             count,
             f"95 % interval {percent(low)} to {percent(high)}",
         ),

@@ -15,7 +15,8 @@ Among the feasible joint angles the one with the least
     sum_i (q_i - q_ref_i)^2 + w sum_i max(0, (|q_i| - (limit_i - margin)) / margin)^2
 
 is wanted, in rad^2. It is searched on a grid of 15 degrees within the intervals, at psi = 0 (the
-reference's own elbow position) and where q2 or q6 is closest to zero, then refined by Brent's method.
+reference's own elbow position) and where q2 or q6 is closest to zero, then refined by Brent's method over 15
+degrees to both sides, as far as the configuration stays feasible.
 """
 
 import math
@@ -46,6 +47,7 @@ wp.set_module_options({"enable_backward": False})
 
 BREAKS = wp.constant(23)
 breaks_type = wp.types.vector(length=23, dtype=wp.float64)
+sets_type = wp.types.vector(length=23, dtype=wp.int32)
 
 SPACING = wp.constant(wp.float64(math.radians(15.0)))
 GOLDEN = wp.constant(wp.float64(0.5 * (3.0 - math.sqrt(5.0))))
@@ -190,6 +192,34 @@ def sorted_breaks(breaks: breaks_type) -> breaks_type:
 
 
 @wp.func
+def interval_end(breaks: breaks_type, i: int) -> wp.float64:
+    """Where the interval that begins at a break ends, in [rad]."""
+    if i < BREAKS - 1:
+        return breaks[i + 1]
+    return breaks[0] + TWO_PI
+
+
+@wp.func
+def with_range(point: ArmAngle, breaks: breaks_type, feasible_after: sets_type) -> ArmAngle:
+    """A choice with the arm angles around it, at most `SPACING` away, at which its configuration stays feasible.
+
+    Most breaks end nothing: they are limits of other configurations, or where the reference's elbow stands.
+    """
+    point.low = point.psi - SPACING
+    point.high = point.psi + SPACING
+    for i in range(BREAKS):
+        end = interval_end(breaks, i)
+        if end > breaks[i] and (feasible_after[i] >> point.configuration) & 1 == 0:
+            for turn in range(-1, 2):
+                around = wp.float64(turn) * TWO_PI
+                if end + around <= point.psi:
+                    point.low = wp.max(point.low, end + around)
+                if breaks[i] + around >= point.psi:
+                    point.high = wp.min(point.high, breaks[i] + around)
+    return point
+
+
+@wp.func
 def sampled_choice(
     chain: Chain, circle: ElbowCircle, q_ref: vec7d, weights: Weights, tolerance: wp.float64
 ) -> ArmAngle:
@@ -211,19 +241,18 @@ def sampled_choice(
 
     best = ArmAngle()
     best.cost = NO_COST
+    feasible_after = sets_type()
+    for i in range(BREAKS):
+        middle = HALF * (breaks[i] + interval_end(breaks, i))
+        feasible_after[i] = feasible_configurations(
+            chain, evaluate(circle, wp.cos(middle), wp.sin(middle)), tolerance
+        )
     width_before = breaks[0] + TWO_PI - breaks[BREAKS - 1]
-    middle = HALF * (breaks[0] + TWO_PI + breaks[BREAKS - 1])
-    feasible_before = feasible_configurations(
-        chain, evaluate(circle, wp.cos(middle), wp.sin(middle)), tolerance
-    )
+    feasible_before = feasible_after[BREAKS - 1]
     for i in range(BREAKS):
         low = breaks[i]
-        high = breaks[0] + TWO_PI
-        if i < BREAKS - 1:
-            high = breaks[i + 1]
-        width = high - low
-        middle = HALF * (low + high)
-        feasible = feasible_configurations(chain, evaluate(circle, wp.cos(middle), wp.sin(middle)), tolerance)
+        width = interval_end(breaks, i) - low
+        feasible = feasible_after[i]
 
         # The root itself is only of interest if it is feasible alone, singular or where the reference stands.
         if i == 0 or width_before > ZERO:
@@ -237,12 +266,6 @@ def sampled_choice(
                 point = cheapest_configuration(chain, circle, c, s, values, here, q_ref, weights, tolerance)
                 if point.cost < best.cost:
                     point.psi = low
-                    point.low = low
-                    point.high = low
-                    if (feasible_before >> point.configuration) & 1 == 1:
-                        point.low = low - wp.min(width_before, SPACING)
-                    if (feasible >> point.configuration) & 1 == 1:
-                        point.high = low + wp.min(width, SPACING)
                     best = point
         if feasible != 0 and width > ZERO:
             count = int(width / SPACING) + 1
@@ -257,11 +280,11 @@ def sampled_choice(
                 )
                 if point.cost < best.cost:
                     point.psi = psi
-                    point.low = wp.max(psi - step, low)
-                    point.high = wp.min(psi + step, high)
                     best = point
         width_before = width
         feasible_before = feasible
+    if best.cost < NO_COST:
+        best = with_range(best, breaks, feasible_after)
     return best
 
 

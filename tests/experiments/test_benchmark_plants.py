@@ -47,7 +47,9 @@ def test_policies_run_on_hidden_starts_that_the_oracle_solves(tmp_path: Path) ->
     assert all(e.certified and e.oracle_moves is not None and e.start_visibility < 0.3 for e in listed)
     (row,) = json.loads((tmp_path / "out" / "benchmark.json").read_text())
     assert row["success_rate"] == 1.0 and row["mean_moves"] == sum(e.oracle_moves or 0 for e in listed) / 2
-    assert "plants: 2 of 2 (validation); oracle: lattice_oracle" in result.page.read_text(encoding="utf-8")
+    page = result.page.read_text(encoding="utf-8")
+    assert "<dt>plants</dt><dd>2 of 2 (validation)</dd><dt>oracle</dt><dd>lattice_oracle</dd>" in page
+    assert "lattice_oracle, the best that knows the truth" in page
     # Another plant under the same name is another benchmark.
     write_plant(tmp_path / "moved" / "validation" / "a.npz", (-0.1, 0.1, 0.8))
     with pytest.raises(InvalidInputError, match="another experiment.*plants differ"):

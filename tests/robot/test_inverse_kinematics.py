@@ -197,6 +197,19 @@ def test_a_small_change_of_pose_gives_a_small_change_of_the_joints(ik: InverseKi
     assert largest[1] < 5e-4
 
 
+def test_a_pose_moved_by_a_nanometre_never_gives_another_posture(ik: InverseKinematics) -> None:
+    # Elbows of these references stand in a plane, where several of the solver's special arm angles coincide.
+    generator = torch.Generator().manual_seed(1)
+    reference = 0.8 * UPPER * (2.0 * torch.rand(20_000, 7, generator=generator, dtype=torch.float64) - 1.0)
+    reference[:, [0, 2]] = 0.0
+    qpos = reference + 0.5 * torch.randn(reference.shape, generator=generator, dtype=torch.float64)
+    T = forward_kinematics(qpos.clamp(-0.95 * UPPER, 0.95 * UPPER))
+    moved = T.clone()
+    moved[:, :3, 3] += 1e-9 * torch.randn(len(T), 3, generator=generator, dtype=torch.float64)
+    before, after = (ik.solve(pose, reference, neighbour=False).qpos for pose in (T, moved))
+    assert float((before - after).abs().max()) < 1e-3
+
+
 def test_joints_follow_a_straight_path_of_the_camera_without_jumps(ik: InverseKinematics) -> None:
     qpos = torch.deg2rad(torch.tensor([[0.0, 20.0, 0.0, -70.0, 0.0, 90.0, 0.0]], dtype=torch.float64))
     start = forward_kinematics(qpos)
