@@ -278,9 +278,15 @@ def save_figure(figure: "Figure", path: Path, dpi: float | None = None) -> None:
     Raises:
         NotWrittenError: A file cannot be written.
     """
+    import matplotlib as mpl
+
     paths = [path, path.with_suffix(".svg")] if path.suffix == ".png" and dpi is None else [path]
     for each in paths:
         content = io.BytesIO()
         options: dict[str, Any] = {} if dpi is None else {"dpi": dpi}
-        figure.savefig(content, format=each.suffix[1:], **options)
+        if each.suffix == ".svg":
+            options["metadata"] = {"Date": None}
+        # Names drawn at random and the date would make every file another one.
+        with mpl.rc_context({"svg.hashsalt": each.stem}):
+            figure.savefig(content, format=each.suffix[1:], **options)
         write_atomically(each, content.getvalue())

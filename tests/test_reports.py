@@ -263,3 +263,14 @@ def test_the_commit_is_that_of_the_checkout_and_says_whether_it_is_clean(tmp_pat
     assert commit(inside) == f"{head}, clean"
     (inside / "code.py").write_text("2\n")
     assert commit(inside) == f"{head}, with changes in 1 file"
+
+
+def test_a_plot_that_is_drawn_again_is_the_same_file(tmp_path: Path) -> None:
+    contents = []
+    for folder in (tmp_path / "first", tmp_path / "second"):
+        folder.mkdir()
+        figure = Figure()
+        figure.subplots().plot([1, 2, 3], marker="o", label="line")
+        save_figure(figure, folder / "plot.png")
+        contents.append((folder / "plot.svg").read_bytes())
+    assert contents[0] == contents[1] and b"<dc:date>" not in contents[0]
