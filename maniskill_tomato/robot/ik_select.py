@@ -223,7 +223,7 @@ def with_range(point: ArmAngle, breaks: breaks_type, feasible_after: sets_type) 
 def sampled_choice(
     chain: Chain, circle: ElbowCircle, q_ref: vec7d, weights: Weights, tolerance: wp.float64
 ) -> ArmAngle:
-    """The best feasible point of the grid, with the range around it that belongs to the same interval."""
+    """The best feasible point of the grid, with the range around it in which its configuration stays feasible."""
     terms = circle.terms
     breaks = breaks_type()
     breaks = add_limit_roots(breaks, 0, terms[Q1_Y], terms[Q1_X], chain.limits[0])

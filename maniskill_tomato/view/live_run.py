@@ -47,7 +47,7 @@ class LiveView:
         try:
             self._recorder.step(step)
             self._page.ask(self.player.follow)
-        except Exception:
+        except Exception:  # Whatever fails on a page, it must not end a run that moves an arm.
             logger.exception("a look could not be shown; the run goes on")
 
     def event(self, stamp: float, text: str) -> None:
