@@ -15,8 +15,9 @@ import zstandard
 from maniskill_tomato.errors import InvalidInputError
 from maniskill_tomato.plants.generator import generate_plant
 from maniskill_tomato.plants.row import generate_row
-from maniskill_tomato.view.page import PlayPage, headline, last_moves
+from maniskill_tomato.view.page import PlayPage
 from maniskill_tomato.view.page_export import export_page
+from maniskill_tomato.view.page_head import headline, last_moves
 from maniskill_tomato.view.page_scene import score_colours
 from maniskill_tomato.view.plant_meshes import organ_colours, plant_layers
 from maniskill_tomato.view.play_session import PlaySession
@@ -97,11 +98,11 @@ def test_a_layer_can_be_hidden_and_stays_so_at_the_next_view(page: PlayPage) -> 
 
 
 def test_the_camera_in_the_hand_stands_in_the_scene_while_it_is_taken(page: PlayPage) -> None:
-    page.ask(lambda: page.take_hand(True)).result(PATIENCE_S)
+    page.ask(lambda: page.hand.take(True)).result(PATIENCE_S)
     camera = page.player.recording.snapshots[0].T_w_camera[:3, 3]
     np.testing.assert_allclose(node(page, "/hand").position, camera, atol=1e-6)
     np.testing.assert_allclose(node(page, "/hand_view").position, camera, atol=1e-6)
-    page.ask(lambda: page.take_hand(False)).result(PATIENCE_S)
+    page.ask(lambda: page.hand.take(False)).result(PATIENCE_S)
     assert page.server.scene.get_handle_by_name("/hand") is None
 
 

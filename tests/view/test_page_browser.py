@@ -5,10 +5,12 @@ from collections.abc import Callable, Iterator
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 from playwright.sync_api import ConsoleMessage, Page, sync_playwright
 
 from maniskill_tomato.view.page import PlayPage
 from maniskill_tomato.view.page_export import page_of
+from maniskill_tomato.view.page_scene import first_view
 from maniskill_tomato.view.play_session import PlaySession
 from maniskill_tomato.view.play_settings import PlaySettings
 from maniskill_tomato.view.player import Player
@@ -79,3 +81,36 @@ def test_an_exported_page_runs_by_itself(browser_page: Page) -> None:
     first = browser_page.screenshot()
     wait_for(browser_page, lambda: browser_page.screenshot() != first)
     assert [url for url in requests if url.startswith("http")] == []
+
+
+def test_on_a_phone_most_of_the_page_is_scene_and_the_panel_can_be_worked(browser_page: Page) -> None:
+    player = Player(PlaySession, PlaySettings(env_id="TomatoViewpointGuided-v1", policy="random", seed=2))
+    served = PlayPage(player, port=0)
+    try:
+        width, height = 390, 844
+        browser_page.set_viewport_size({"width": width, "height": height})
+        browser_page.goto(served.url)
+        browser_page.get_by_text("at move 0").wait_for()
+        # The sheet's own title is its upper end.
+        box = browser_page.get_by_text("maniskill-tomato", exact=True).bounding_box()
+        assert box is not None and box["y"] > 0.65 * height
+        for name in ("Play", "Step", "Reset"):
+            button = browser_page.get_by_role("button", name=name, exact=True).bounding_box()
+            assert button is not None and button["y"] + button["height"] < height
+            assert 0 <= button["x"] and button["x"] + button["width"] <= width
+        browser_page.get_by_role("button", name="Step").click()
+        browser_page.get_by_text("at move 1").wait_for()
+        browser_page.get_by_role("button", name="Expand panel Moves").click()
+        browser_page.get_by_role("tab", name="Episode").click()
+        browser_page.get_by_role("button", name="next").click()
+        browser_page.get_by_text("seed 3").wait_for()
+        assert player.settings.seed == 3
+        (client,) = served.server.get_clients().values()
+        place, at = first_view(player.recording)
+        wait_for(browser_page, lambda: distance(client.camera.position, at) > 1.2 * distance(place, at))
+    finally:
+        served.close()
+
+
+def distance(a: NDArray[np.float64], b: NDArray[np.float64]) -> float:
+    return float(np.linalg.norm(a - b))
