@@ -6,4 +6,4 @@ Importing this package registers the tasks by name; ManiSkill, SAPIEN and PyTorc
 
 from maniskill_tomato import tasks as tasks
 
-__version__ = "0.1.0"
+__version__ = "0.2.0.dev0"

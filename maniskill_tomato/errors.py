@@ -83,8 +83,20 @@ class SeedsFailedError(TomatoError):
     """Some of several training runs failed; the others are complete."""
 
 
+SIMULATOR_PACKAGES = ("mani_skill", "sapien")
+"""What an installation for a robot's PC leaves out."""
+
+
 class MissingPackageError(TomatoError):
     """Something needs a package that is not installed."""
+
+    @classmethod
+    def simulator(cls) -> "MissingPackageError":
+        """The error for `SIMULATOR_PACKAGES`."""
+        return cls(
+            "this needs ManiSkill and SAPIEN, which are not installed here; `make venv KIND=full` in a checkout "
+            "installs them, `pip install maniskill-tomato` elsewhere"
+        )
 
     @classmethod
     def extra(cls, package: str, extra: str) -> "MissingPackageError":

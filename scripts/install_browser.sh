@@ -7,37 +7,25 @@
 # People look at the viewer's page with the browser that they have; only the tests need this one.
 set -euo pipefail
 
-dry_run=0
-say() { printf 'browser: %s\n' "$*"; }
-fail() {
-    printf 'browser: error: %s\n' "$1" >&2
-    shift
-    if (($#)); then printf '         %s\n' "$@" >&2; fi
-    exit 1
-}
-
-case "${1:-}" in
-    "") ;;
-    --dry-run) dry_run=1 ;;
-    -h | --help)
-        sed -n '2,7s/^# \{0,1\}//p' "${BASH_SOURCE[0]}"
-        exit 0
-        ;;
-    *) fail "unknown option '$1'" "The only option is --dry-run." ;;
-esac
+name=browser
+# shellcheck source=scripts/preamble.sh
+. "$(dirname "${BASH_SOURCE[0]}")/preamble.sh"
+read_options "$@"
 
 # tests/conftest.py looks for the same names.
-for name in chromium chromium-browser google-chrome; do
-    if path="$(command -v "$name")"; then
+for program in chromium chromium-browser google-chrome; do
+    if path="$(command -v "$program")"; then
         say "nothing to install: $path"
         exit 0
     fi
 done
 command -v apt-get >/dev/null || fail "this script installs packages on Debian only" \
     "Install Chromium or Google Chrome with your system's own tools; a program 'chromium' on PATH is enough."
-sudo=()
-if ((EUID != 0)); then sudo=(sudo); fi
-for command in "apt-get -q update" "env DEBIAN_FRONTEND=noninteractive apt-get -q install -y --no-install-recommends chromium"; do
+commands=("${apt_update[*]}" "${apt_install[*]} chromium")
+if ! ((dry_run)) && ! may_install; then
+    fail "this needs root, and there is no sudo here" "Run these as root:" "${commands[@]}"
+fi
+for command in "${commands[@]}"; do
     say "${sudo[*]:+${sudo[*]} }$command"
     # shellcheck disable=SC2086
     if ! ((dry_run)); then "${sudo[@]}" $command; fi

@@ -17,25 +17,10 @@ apt_dir="${APT_DIR:-/etc/apt}"
 backports="bookworm-backports"
 # SAPIEN links against libX11 even when it never opens a window.
 packages=(mesa-vulkan-drivers libvulkan1 libx11-6)
-dry_run=0
-
-say() { printf 'vulkan: %s\n' "$*"; }
-fail() {
-    printf 'vulkan: error: %s\n' "$1" >&2
-    shift
-    if (($#)); then printf '        %s\n' "$@" >&2; fi
-    exit 1
-}
-
-case "${1:-}" in
-    "") ;;
-    --dry-run) dry_run=1 ;;
-    -h | --help)
-        sed -n '2,10s/^# \{0,1\}//p' "${BASH_SOURCE[0]}"
-        exit 0
-        ;;
-    *) fail "unknown option '$1'" "The only option is --dry-run." ;;
-esac
+name=vulkan
+# shellcheck source=scripts/preamble.sh
+. "$here/preamble.sh"
+read_options "$@"
 
 # Asks Vulkan itself. Status 0: usable; 1: not usable; 2: there is no Python to ask with.
 check_device() {
@@ -70,12 +55,12 @@ field() { (
 id="$(field ID)"
 id_like="$(field ID_LIKE)"
 version="$(field VERSION_ID)"
-name="$(field PRETTY_NAME)"
+distribution="$(field PRETTY_NAME)"
 major="${version%%.*}"
 [[ $major =~ ^[0-9]+$ ]] || major=""
 
 by_hand() {
-    fail "this script installs packages on Debian and Ubuntu only; this is ${name:-$id}" \
+    fail "this script installs packages on Debian and Ubuntu only; this is ${distribution:-$id}" \
         "Install lavapipe with:  $1" "then run this script again: it checks the result."
 }
 
@@ -88,14 +73,14 @@ case "$id" in
         elif ((major == 12)); then
             suite=(-t "$backports")
         else
-            fail "$name has a Mesa too old for SAPIEN, and its backports do not help" "Debian 12 or newer works."
+            fail "$distribution has a Mesa too old for SAPIEN, and its backports do not help" "Debian 12 or newer works."
         fi
         ;;
     ubuntu)
         if [[ -n $major ]] && ((major < 22)); then
-            fail "$name has a Mesa too old for SAPIEN" "Ubuntu 24.04 or newer works."
+            fail "$distribution has a Mesa too old for SAPIEN" "Ubuntu 24.04 or newer works."
         elif [[ -n $major ]] && ((major < 24)); then
-            note="$name has Mesa 23.2 or older, which may lack the feature; the check after the installation tells"
+            note="$distribution has Mesa 23.2 or older, which may lack the feature; the check after the installation tells"
         fi
         ;;
     fedora | rhel | centos | rocky | almalinux) by_hand "sudo dnf install mesa-vulkan-drivers vulkan-loader libX11" ;;
@@ -103,13 +88,13 @@ case "$id" in
     opensuse* | suse | sles) by_hand "sudo zypper install libvulkan_lvp libvulkan1 libX11-6" ;;
     *)
         if [[ " $id_like " == *" debian "* || " $id_like " == *" ubuntu "* ]]; then
-            note="${name:-$id} is treated like the Debian or Ubuntu it derives from; the check after the installation tells"
+            note="${distribution:-$id} is treated like the Debian or Ubuntu it derives from; the check after the installation tells"
         else
             by_hand "your package manager (Mesa's Vulkan drivers, 23.3 or newer, with lavapipe, and the Vulkan loader)"
         fi
         ;;
 esac
-((dry_run)) || command -v apt-get >/dev/null || fail "there is no apt-get on this ${name:-machine}" \
+((dry_run)) || command -v apt-get >/dev/null || fail "there is no apt-get on this ${distribution:-machine}" \
     "Install by hand: ${packages[*]}"
 
 # The files with apt sources, in apt's order.
@@ -188,12 +173,7 @@ if ((${#suite[@]})) && [[ -z "$(find_source "$backports")" ]]; then
     if [[ $key == /* ]]; then new_text+=$'\n'"Signed-By: $key"; fi
 fi
 
-sudo=()
-if ((EUID != 0)); then
-    command -v sudo >/dev/null && sudo=(sudo)
-fi
-update=(apt-get -q update)
-install=(env DEBIAN_FRONTEND=noninteractive apt-get -q install -y --no-install-recommends "${suite[@]}" "${packages[@]}")
+install=("${apt_install[@]}" "${suite[@]}" "${packages[@]}")
 
 plan() {
     if [[ -n $new_file ]]; then
@@ -202,23 +182,23 @@ plan() {
         while IFS= read -r line; do printf "'%s' " "$line"; done <<<"$new_text"
         printf '| %s > /dev/null\n' "${sudo[*]:+${sudo[*]} }tee $new_file"
     fi
-    echo "${sudo[*]:+${sudo[*]} }${update[*]}"
+    echo "${sudo[*]:+${sudo[*]} }${apt_update[*]}"
     echo "${sudo[*]:+${sudo[*]} }${install[*]}"
 }
 
 if [[ -n $note ]]; then say "$note"; fi
 if ((dry_run)); then
-    say "on ${name:-$id} this would run:"
+    say "on ${distribution:-$id} this would run:"
     plan
     exit 0
 fi
-if ((EUID != 0)) && ! ((${#sudo[@]})); then
+if ! may_install; then
     say "this needs root, and there is no sudo here; run these as root:" >&2
     plan >&2
     exit 1
 fi
 
-say "on ${name:-$id} this runs:"
+say "on ${distribution:-$id} this runs:"
 plan | sed 's/^/    /'
 log="$(mktemp)"
 trap 'rm -f "$log"' EXIT
@@ -235,7 +215,7 @@ if [[ -n $new_file ]]; then
     printf '%s\n' "$new_text" | "${sudo[@]}" tee "$new_file" >/dev/null || fail "cannot write $new_file" \
         "Run this script as a user who may."
 fi
-if ! run "${update[@]}"; then
+if ! run "${apt_update[@]}"; then
     undo
     fail "apt-get update failed (above)" \
         "Check the network and $apt_dir${new_file:+, and that your mirror carries $backports}; then run this script again."

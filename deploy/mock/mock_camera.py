@@ -168,8 +168,8 @@ def _rendered_view(world: TwinWorld, renderer: Renderer) -> Any:
     except (ImportError, RuntimeError) as error:
         if renderer == "sapien":
             raise ProfileError(
-                f"twin.renderer is 'sapien', which cannot render here ({error}); use 'rays' or 'auto', or install "
-                "Vulkan with `make vulkan`"
+                f"twin.renderer is 'sapien', which cannot render here ({error}); use 'rays' or 'auto', or "
+                "`maniskill-tomato doctor`, which says what is missing"
             ) from error
         _logger.info("no SAPIEN renderer here (%s); the twin's pictures have flat colours", error)
         return None

@@ -12,7 +12,7 @@ import os
 import sys
 import traceback
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, NoReturn
 
 from maniskill_tomato.cli.command_table import (
     COMMANDS,
@@ -24,7 +24,9 @@ from maniskill_tomato.cli.command_table import (
     unknown,
 )
 from maniskill_tomato.errors import (
+    SIMULATOR_PACKAGES,
     InvalidInputError,
+    MissingPackageError,
     NotWrittenError,
     SeedsFailedError,
     TomatoError,
@@ -66,9 +68,12 @@ def main(argv: Sequence[str] | None = None) -> None:
     except OSError as error:
         where = f": {error.filename}" if error.filename else ""
         _end(f"{error.strerror or error}{where}", FAILED)
+    except ModuleNotFoundError as error:
+        if (error.name or "").partition(".")[0] in SIMULATOR_PACKAGES:
+            _end(str(MissingPackageError.simulator()), USAGE)
+        _end_by_fault()
     except Exception:
-        traceback.print_exc()
-        _end("this is a fault of maniskill-tomato; please report it with the lines above", FAILED)
+        _end_by_fault()
 
 
 def run(argv: list[str]) -> None:
@@ -126,6 +131,11 @@ def _status(error: TomatoError) -> int:
     return FAILED if isinstance(error, failed) else USAGE
 
 
-def _end(message: str, status: int) -> None:
+def _end_by_fault() -> NoReturn:
+    traceback.print_exc()
+    _end("this is a fault of maniskill-tomato; please report it with the lines above", FAILED)
+
+
+def _end(message: str, status: int) -> NoReturn:
     print(f"error: {message}", file=sys.stderr)
     raise SystemExit(status) from None

@@ -31,7 +31,7 @@ CV2_WHEELS: Final = (
 LEAST_DISK: Final = 2.0
 """Free space for runs, in [GB]: a training with its checkpoints takes up to 1."""
 
-REBUILD: Final = "make the environment anew: rm -rf .venv && make venv"
+REBUILD: Final = "make the environment anew: rm -rf .venv && make venv, with the TORCH and KIND that it had"
 
 
 @dataclass(frozen=True)
@@ -123,8 +123,8 @@ def check_maniskill() -> Finding:
     if find_spec("mani_skill") is None:
         return Finding(
             "note",
-            "ManiSkill is not installed: deploy, detect and the worlds without a simulator work",
-            "gym.make, dataset and films need it: pip install maniskill-tomato",
+            "ManiSkill is not installed, as on a robot's PC: worlds, training, play, detect and deploy work without",
+            "gym.make, dataset and films need it: make venv KIND=full, or pip install maniskill-tomato",
         )
     importlib.import_module("mani_skill.envs")
     return Finding("ok", f"mani-skill {version('mani-skill')} with sapien {version('sapien')}")
@@ -168,6 +168,12 @@ def check_cuda() -> Finding:
     if torch.cuda.is_available():
         names = [torch.cuda.get_device_name(k) for k in range(torch.cuda.device_count())]
         return Finding("ok", f"CUDA {torch.version.cuda}: {', '.join(names)}")
+    if os.path.exists("/dev/nvidiactl") and torch.version.cuda is None:
+        return Finding(
+            "note",
+            f"there is an NVIDIA GPU, which torch {torch.__version__}, built for the CPU, does not use",
+            "make venv TORCH=cuda",
+        )
     if os.path.exists("/dev/nvidiactl"):
         return Finding(
             "problem",

@@ -5,7 +5,10 @@ import logging
 import os
 import subprocess
 import sys
+from importlib.util import find_spec
 from typing import Literal
+
+from maniskill_tomato.errors import MissingPackageError
 
 logger = logging.getLogger(__name__)
 
@@ -37,6 +40,8 @@ def rendering_available() -> bool:
 
 def rendering_problem() -> str | None:
     """Why ManiSkill can take no pictures here and what to do; None if it can."""
+    if find_spec("sapien") is None:
+        return str(MissingPackageError.simulator())
     if render_backend() != "none":
         return None
     answer = _ask_for_a_picture("cpu")
@@ -54,6 +59,8 @@ def render_backend() -> Literal["gpu", "cpu", "none"]:
     shaders: the usual ones need the same device and compile for about ten seconds. A machine that is too busy to answer
     in time may still render, so that `cpu` is the answer there, with a warning.
     """
+    if find_spec("sapien") is None:
+        return "none"
     if sys.platform.startswith("linux") and os.path.exists("/dev/nvidiactl"):
         try:
             if not _ask_for_a_picture("cuda"):
