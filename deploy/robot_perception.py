@@ -178,7 +178,7 @@ class ImagePerception:
             PerceptionError: The picture cannot be used.
         """
         try:
-            measured = self._detector.measure(self._posed(frame, T_world_camera))
+            measured = self._detector.measure(self._posed(frame, T_world_camera), self.map.crop)
         except TomatoError as error:
             raise PerceptionError(f"the picture cannot be segmented: {error}") from error
         return self._perception.add(0, measured)

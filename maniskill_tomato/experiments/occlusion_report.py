@@ -26,7 +26,6 @@ from maniskill_tomato.run_facts import run_facts
 from maniskill_tomato.segmentation.datasets.annotations import AnnotatedImage
 from maniskill_tomato.segmentation.datasets.reading import read_annotated
 from maniskill_tomato.segmentation.segmenter import make_segmenter
-from maniskill_tomato.sensing.fruit_detector import robots_model
 from maniskill_tomato.sensing.visible_fraction.occlusion_models import make_occlusion_model
 from maniskill_tomato.sensing.visible_fraction.thesis import ThesisModel
 
@@ -60,10 +59,7 @@ def report_occlusion(
     found_by = None if segmenter is None else make_segmenter(segmenter)
     judged, milliseconds = judge(
         tuple(images),
-        {
-            name: robots_model() if found_by and name == "sphere" else make_occlusion_model(name)
-            for name in models
-        },
+        {name: make_occlusion_model(name) for name in models},
         segmenter=found_by,
         min_visible=min_visible,
         min_total=min_total,

@@ -68,14 +68,19 @@ class AxisSearch:
 
     def miss(self, measurement: Measurement) -> None:
         """Takes in a view in which the fruit was not found."""
-        frame, radius = measurement.frame, self._config.usual_radius_m
+        frame, radius = measurement.frame, measurement.crop.radius_m
         for k, place in enumerate(self._places):
             shown = shown_of_sphere(np.array([*place, radius]), frame, frame.unshadowed_m)
             if shown is not None:
                 self._missed[k] *= 1.0 - self._config.detection_rate * shown
 
-    def place(self, tracks: Iterable[Track]) -> Position:
-        """The likeliest place, world frame, in [m], by the views and the other fruits. Shape (3,)."""
+    def place(self, tracks: Iterable[Track], radius_m: float) -> Position:
+        """The likeliest place, world frame, in [m], by the views and the other fruits. Shape (3,).
+
+        Args:
+            tracks: The other fruits.
+            radius_m: Of a fruit that was not found yet, in [m].
+        """
         near, free = np.full(len(self._places), ALONE), np.ones(len(self._places))
         for track in tracks:
             apart = np.linalg.norm(self._places - track.position_w, axis=1)
@@ -83,7 +88,7 @@ class AxisSearch:
             if spread < LARGEST_SPREAD:
                 near += track.existence * np.exp(-0.5 * (apart / NEIGHBOUR_DISTANCE) ** 2)
             if spread < SOLID_SPREAD:
-                touching = SOLID_SHARE * (track.radius_m + self._config.usual_radius_m)
+                touching = SOLID_SHARE * (track.radius_m + radius_m)
                 free[apart < touching] *= 1.0 - SOLID * track.existence
         usual = np.exp(-0.5 * ((self._distances - USUAL_DISTANCE) / DISTANCE_SPREAD) ** 2)
         blur = np.exp(-0.5 * ((self._distances[:, None] - self._distances) / BLUR) ** 2)

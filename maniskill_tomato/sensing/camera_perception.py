@@ -205,7 +205,8 @@ class CameraPerception:
                 f"frames must be {self.num_envs}, one for each environment; got {len(frames)}"
             )
         moved = [
-            frame is not None and self.add(k, self.detector.measure(frame)) for k, frame in enumerate(frames)
+            frame is not None and self.add(k, self.detector.measure(frame, self._searches[k].map.crop))
+            for k, frame in enumerate(frames)
         ]
         return torch.tensor(moved, device=self._device)
 
@@ -340,7 +341,7 @@ class CameraPerception:
         weights = {}
         for number, track in search.map.tracks.items():
             ruled_out = any(search.map.current(other) == number for other in search.ruled_out)
-            if not track.is_ripe or ruled_out or not self._is_apart(track):
+            if not track.is_ripe or ruled_out or not self._is_apart(search, track):
                 continue
             spread = track.covariance[:3, :3] + search.place_error**2 * np.eye(3)
             off = track.position_w - search.place
@@ -355,10 +356,11 @@ class CameraPerception:
         elif search.target is not None and best is not None and weights[best] <= unseen:
             search.target = None
 
-    def _is_apart(self, track: Track) -> bool:
+    @staticmethod
+    def _is_apart(search: _Search, track: Track) -> bool:
         """Whether its place tells a track from a fruit beside it; a view without depth gives a direction only."""
         largest = float(np.linalg.eigvalsh(track.covariance[:3, :3])[-1])
-        return largest < self.config.usual_radius_m**2
+        return largest < search.map.crop.radius_m**2
 
     def _choose_anew(self, search: _Search, view: MappedView) -> None:
         """Chooses a target where there is none, or where views have long shown no more of it."""
@@ -402,7 +404,11 @@ class CameraPerception:
         elif search.looks_at is not None:
             towards = search.looks_at
         else:
-            towards = np.zeros(3) if search.axis is None else search.axis.place(search.map.tracks.values())
+            towards = (
+                np.zeros(3)
+                if search.axis is None
+                else search.axis.place(search.map.tracks.values(), search.map.crop.radius_m)
+            )
         if view is not None:
             index = view.detection(search.target)
             search.fraction = search.map.fraction(view.measurement, index, search.target)

@@ -20,6 +20,7 @@ from maniskill_tomato.robot.d435 import CameraIntrinsics
 from maniskill_tomato.segmentation.masks import BinaryMask
 from maniskill_tomato.sensing.measurement import DetectedFruit, Measurement, Position
 from maniskill_tomato.sensing.posed_frame import PosedFrame
+from maniskill_tomato.sensing.visible_fraction.crop import CropShape, WholeFruit
 from maniskill_tomato.sensing.visible_fraction.estimate import Float64
 from maniskill_tomato.sensing.visible_fraction.sphere import SphereConfig, round_outline, whole_silhouette
 
@@ -49,10 +50,6 @@ class MapConfig:
     """The same of the radius."""
     few_pixels: float = 30.0
     """Visible pixels at which the variances are twice as large."""
-    usual_radius_m: float = 0.027
-    """Radius of a fruit of which nothing is known, in [m]."""
-    radius_spread_m: float = 0.003
-    """Standard deviation of that, in [m]."""
     fruit_density: float = 1000.0
     """Fruits in a cubic metre of a truss, in [1/m^3]: how likely another fruit stands at a place beside a known one."""
     detection_rate: float = 0.95
@@ -94,6 +91,8 @@ class Track:
     """Views that it was detected in."""
     apart_from: set[int] = field(default_factory=set)
     """Numbers of tracks that were detected beside it in one view: they are other fruits."""
+    seen_whole: WholeFruit | None = None
+    """Size and shape in the last view that showed all of it."""
 
     @property
     def position_w(self) -> Position:
@@ -166,6 +165,8 @@ class FruitMap:
         self.config = config or MapConfig()
         self.tracks: dict[int, Track] = {}
         """By their numbers."""
+        self.crop = CropShape()
+        """What the fruits that were seen whole tell about the size and shape of the others."""
         self._divide = divide
         self._next = 0
         self._merged: dict[int, int] = {}
@@ -211,6 +212,11 @@ class FruitMap:
             self._merge()
             kept = {number: self.current(number) for number in assigned}
             names = {number: number if now is None else now for number, now in kept.items()}
+        self.crop = CropShape.of(
+            track.seen_whole
+            for track in self.tracks.values()
+            if track.is_ripe and track.seen_whole is not None
+        )
         return MappedView(measurement=measurement, tracks=tuple(names[number] for number in assigned))
 
     def again(self, measurement: Measurement, last: MappedView) -> MappedView:
@@ -265,9 +271,9 @@ class FruitMap:
         centre, radius_m = fruit.centre_w, fruit.radius_m
         if not fruit.is_depth_measured:
             along = max(UNMEASURED_DEPTH, UNMEASURED_SHARE * float(np.linalg.norm(centre - camera))) ** 2
-            radius += c.radius_spread_m**2
+            radius += self.crop.radius_spread_m**2
         if not np.isfinite(radius_m):
-            radius_m, radius = c.usual_radius_m, c.radius_spread_m**2
+            radius_m, radius = self.crop.radius_m, self.crop.radius_spread_m**2
         away = (centre - camera) / max(float(np.linalg.norm(centre - camera)), 1e-9)
         covariance = np.zeros((4, 4))
         covariance[:3, :3] = lateral * np.eye(3) + (along - lateral) * np.outer(away, away)
@@ -288,7 +294,7 @@ class FruitMap:
             return Fraction.nothing()
         c, fruit, track = self.config, measurement.fruits[index], self.tracks[number]
         single = float(fruit.visible_fraction)
-        fused = _fused_fraction(measurement, index, track)
+        fused = _fused_fraction(measurement, index, track, self.crop.flatness)
         parts = []
         if np.isfinite(single) and fruit.is_depth_measured:
             parts.append((single, fraction_error(single, c.single_error)))
@@ -367,17 +373,16 @@ class FruitMap:
 
     def _new_density(self) -> float:
         """Logarithm of the density of other fruits in place and radius, in [1/m^4]."""
-        c = self.config
-        return float(np.log(c.fruit_density / (np.sqrt(2.0 * np.pi) * c.radius_spread_m)))
+        density = self.config.fruit_density / (np.sqrt(2.0 * np.pi) * self.crop.radius_spread_m)
+        return float(np.log(density))
 
     # ------------------------------------------------------------------ tracks
 
     def _born(self, number: int, mean: Float64, covariance: Float64) -> Track:
         # The radius is known beforehand, from other fruits.
         track = Track(number=number, mean=mean.copy(), covariance=covariance.copy())
-        c = self.config
-        gain = track.covariance[:, 3] / (track.covariance[3, 3] + c.radius_spread_m**2)
-        track.mean = track.mean + gain * (c.usual_radius_m - track.mean[3])
+        gain = track.covariance[:, 3] / (track.covariance[3, 3] + self.crop.radius_spread_m**2)
+        track.mean = track.mean + gain * (self.crop.radius_m - track.mean[3])
         track.covariance = track.covariance - np.outer(gain, track.covariance[3])
         return track
 
@@ -404,6 +409,8 @@ class FruitMap:
         )
         track.existence_log_odds = min(track.existence_log_odds, LARGEST_LOG_ODDS)
         track.views += 1
+        if fruit.seen_whole is not None:
+            track.seen_whole = fruit.seen_whole
 
     def _miss(self, measurement: Measurement, detected: set[int]) -> None:
         """Takes existence from tracks that should have been detected; those that are hidden keep theirs."""
@@ -432,6 +439,7 @@ class FruitMap:
             )
             first.existence_log_odds = max(first.existence_log_odds, second.existence_log_odds)
             first.views += second.views
+            first.seen_whole = first.seen_whole or second.seen_whole
             first.apart_from |= second.apart_from
             self._merged[b] = a
             del self.tracks[b]
@@ -648,7 +656,7 @@ def _outline_error(measurement: Measurement, track: Track) -> float:
     return 2.0 * along / distance
 
 
-def _fused_fraction(measurement: Measurement, index: int, track: Track) -> float:
+def _fused_fraction(measurement: Measurement, index: int, track: Track, flatness: float) -> float:
     """V_f of a detection by the track's sphere: visible pixels over those and the hidden ones of its outline."""
     frame = measurement.frame
     circle = outline(track.mean, frame.T_world_camera, frame.intrinsics)
@@ -656,7 +664,7 @@ def _fused_fraction(measurement: Measurement, index: int, track: Track) -> float
         return float("nan")
     mask = measurement.mask(index)
     pose = frame.T_world_camera
-    stretch = round_outline(pose[2, :3], pose[:3, :3].T @ (track.position_w - pose[:3, 3]))
+    stretch = round_outline(pose[2, :3], pose[:3, :3].T @ (track.position_w - pose[:3, 3]), flatness)
     depth, fruits, owns = measurement.depth_by_fruits
     own = owns[index]
     # Without depth nobody knows what is hidden: all of the outline that is not seen counts.

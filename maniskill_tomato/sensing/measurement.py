@@ -11,6 +11,7 @@ from maniskill_tomato.raycast.view_rays import ViewRays
 from maniskill_tomato.segmentation.masks import BinaryMask
 from maniskill_tomato.sensing.posed_frame import PosedFrame
 from maniskill_tomato.sensing.view_pattern import sample_view
+from maniskill_tomato.sensing.visible_fraction.crop import CropShape, WholeFruit
 from maniskill_tomato.sensing.visible_fraction.estimate import fruit_depth
 
 Position = NDArray[np.float64]
@@ -43,6 +44,8 @@ class DetectedFruit:
     """Unit vector from the camera through the middle of the visible pixels, world frame. Shape (3,)."""
     redness: float = float("nan")
     """(R - G) / (R + G) of the mean colour of the visible pixels; NaN where that is not known."""
+    seen_whole: WholeFruit | None = None
+    """Size and shape, where the whole outline is seen."""
 
     @property
     def is_ripe(self) -> bool:
@@ -63,6 +66,8 @@ class Measurement:
     """The picture."""
     fruits: tuple[DetectedFruit, ...]
     """All fruits that were found in it, best score first."""
+    crop: CropShape = CropShape()
+    """What was known of the fruits' size and shape when it was measured."""
 
     @property
     def camera_position(self) -> Position:

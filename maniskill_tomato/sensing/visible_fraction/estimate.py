@@ -10,12 +10,7 @@ from numpy.typing import NDArray
 from maniskill_tomato.errors import InvalidInputError
 from maniskill_tomato.robot.d435 import STEREO_BASELINE, CameraIntrinsics, T_color_optical_depth_optical
 from maniskill_tomato.segmentation.masks import BinaryMask
-
-USUAL_RADIUS: Final = 0.029
-"""Median radius of the tasks' tomatoes, in [m]."""
-
-RADIUS_SPREAD: Final = 0.14
-"""Standard deviation of the logarithm of their radius."""
+from maniskill_tomato.sensing.visible_fraction.crop import CropShape, WholeFruit
 
 Float64 = NDArray[np.float64]
 UInt8 = NDArray[np.uint8]
@@ -37,6 +32,8 @@ class SegmentedImage:
     """Unit vector upwards in the optical frame; None if it is not known. Shape (3,)."""
     filled_m: Float64 | None = None
     """`filled_depth` of the depth, where it was worked out before. Shape (height, width)."""
+    crop: CropShape | None = None
+    """What is known of the fruits beforehand; None leaves it to the model."""
 
     def __post_init__(self) -> None:
         if self.rgb.dtype != np.uint8 or self.rgb.ndim != 3 or self.rgb.shape[2] != 3 or self.rgb.size == 0:
@@ -78,6 +75,8 @@ class Estimate:
     """The tomato's centre in the optical frame, in [m], if the model knows it."""
     radius_m: float = float("nan")
     """Its radius in [m]; NaN if the model does not know it."""
+    seen_whole: WholeFruit | None = None
+    """Size and shape, where the model sees the whole outline."""
 
     @property
     def visible_fraction(self) -> float:

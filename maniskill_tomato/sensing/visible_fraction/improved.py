@@ -12,8 +12,8 @@ import numpy as np
 from maniskill_tomato.errors import InvalidInputError
 from maniskill_tomato.segmentation.masks import BinaryMask
 from maniskill_tomato.sensing.visible_fraction import image_operations as operations
+from maniskill_tomato.sensing.visible_fraction.crop import USUAL_RADIUS
 from maniskill_tomato.sensing.visible_fraction.estimate import (
-    USUAL_RADIUS,
     Estimate,
     Float64,
     SegmentedImage,

@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 from maniskill_tomato.errors import InvalidInputError
 from maniskill_tomato.robot.d435 import CameraIntrinsics
 from maniskill_tomato.segmentation.masks import BinaryMask
+from maniskill_tomato.sensing.visible_fraction.crop import FLATNESS, WholeFruit
 from maniskill_tomato.sensing.visible_fraction.estimate import (
     Estimate,
     Float64,
@@ -34,6 +35,13 @@ Floats = NDArray[np.floating[Any]]
 
 NEAREST_MEASURED: Final = 0.15
 """A fruit at least as far away as this, in [m], has depth unless something nearer shadows it."""
+
+SMALLEST_OUTLINE: Final = 10.0
+"""Half the width and height, in [px], from which an outline tells a fruit's size and shape."""
+
+LEAST_FLATNESS: Final = 0.6
+LARGEST_FLATNESS: Final = 1.8
+"""Heights over widths beyond which a mask is no whole fruit's."""
 
 SAMPLES: Final = 64
 """Points of each kind that a circle is judged by."""
@@ -79,17 +87,24 @@ class SphereConfig:
                 raise InvalidInputError(f"{name} must be positive, got {getattr(self, name)}")
 
 
-FLATNESS: Final = 0.85
-"""Height of a tomato over its width. Of 99 ripe ones on validation plants it is 0.81 to 0.89, and the axis within 17
-degrees of the vertical (19 of 20)."""
+OPEN_SHARE: Final = 0.8
+"""Share of a mask's edge beyond which the image gets deeper, from which the whole outline counts as seen; the calyx
+takes the rest."""
+
+FILLED_SHARE: Final = 0.95
+"""Least area of a whole fruit's mask over that of the ellipse with its moments; two fruits in one mask fill it less."""
+
+STEEPEST: Final = 0.7
+"""Height over width is not told from farther above or below than this: the cosine of the angle to the vertical."""
 
 
-def round_outline(up: Float64 | None, ray: Float64) -> Float64:
+def round_outline(up: Float64 | None, ray: Float64, flatness: float = FLATNESS) -> Float64:
     """What makes the outline of a hanging, flat tomato round: a stretch of the picture along the vertical.
 
     Args:
         up: Unit vector upwards in the optical frame; None if it is not known. Shape (3,).
         ray: Towards the tomato, optical frame. Shape (3,).
+        flatness: Its height over its width.
 
     Returns:
         Shape (2, 2).
@@ -101,7 +116,7 @@ def round_outline(up: Float64 | None, ray: Float64) -> Float64:
     across = up[:2] - along * away[:2]
     # Seen along its axis it is round.
     direction = across / max(float(np.linalg.norm(across)), 1e-9)
-    height = float(np.sqrt(FLATNESS**2 * (1.0 - along**2) + along**2))
+    height = float(np.sqrt(flatness**2 * (1.0 - along**2) + along**2))
     return np.asarray(np.eye(2) + (1.0 / height - 1.0) * np.outer(direction, direction))
 
 
@@ -152,19 +167,21 @@ class SphereModel:
     def __call__(self, view: SegmentedImage) -> list[Estimate]:
         """Estimates V and T of every mask; an empty one has failed. Without depth the outline alone decides."""
         depth = filled_depth(view.depth_m) if view.filled_m is None else view.filled_m
-        fits = [_Fit.prepare(view, depth, mask, self.config) for mask in view.masks]
+        config, crop = self.config, view.crop
+        if crop is not None:
+            config = replace(config, radius_m=crop.radius_m, radius_spread=crop.radius_spread)
+        flatness = FLATNESS if crop is None else crop.flatness
+        fits = [_Fit.prepare(view, depth, mask, config, flatness) for mask in view.masks]
         for fit in fits:
             if fit is not None:
-                fit.search(self.config)
-        clear = [
-            f for f in fits if f is not None and f.measured and f.outline_share() >= self.config.clear_share
-        ]
+                fit.search(config)
+        clear = [f for f in fits if f is not None and f.measured and f.outline_share() >= config.clear_share]
         if clear:
             own = float(np.median([f.radius_m for f in clear]))
-            crop = replace(self.config, radius_m=own, radius_spread=self.config.crop_spread)
+            alike = replace(config, radius_m=own, radius_spread=config.crop_spread)
             for fit in fits:
                 if fit is not None and fit.measured and not any(fit is f for f in clear):
-                    fit.search(crop)
+                    fit.search(alike)
         shown = depth
         if len(fits) > 1:
             # Of two tomatoes that touch, the nearer one as a whole hides the other.
@@ -176,8 +193,7 @@ class SphereModel:
         for mask in view.masks:
             fruits |= mask
         return [
-            Estimate.failed() if fit is None else fit.estimate(view, shown, self.config, fruits)
-            for fit in fits
+            Estimate.failed() if fit is None else fit.estimate(view, shown, config, fruits) for fit in fits
         ]
 
 
@@ -193,14 +209,15 @@ class _Fit:
         measured: bool,
         focal: float,
         stretch: Float64,
+        whole: WholeFruit | None,
     ) -> None:
-        self.mask, self.evidence, self.corner = mask, evidence, corner
+        self.mask, self.evidence, self.corner, self.whole = mask, evidence, corner, whole
         self.own, self.measured, self.focal, self.stretch = own, measured, focal, stretch
         self.circle = np.zeros(3)
 
     @classmethod
     def prepare(
-        cls, view: SegmentedImage, depth: Float64, mask: BinaryMask, config: SphereConfig
+        cls, view: SegmentedImage, depth: Float64, mask: BinaryMask, config: SphereConfig, flatness: float
     ) -> "_Fit | None":
         """Collects the evidence in a window; None for an empty mask."""
         first_x, first_y, width, height = cv2.boundingRect(mask.view(np.uint8))
@@ -221,12 +238,16 @@ class _Fit:
         top, left = max(first_y - reach, 0), max(first_x - reach, 0)
         window = (slice(top, first_y + height + reach), slice(left, first_x + width + reach))
         z = depth[window] if measured else np.zeros_like(depth[window])
-        evidence = _collect(mask[window], z, view.depth_m[window], own, size, config.edge_step_m)
+        evidence, open_share = _collect(mask[window], z, view.depth_m[window], own, size, config.edge_step_m)
         i = view.intrinsics
         middle = (first_x + 0.5 * width, first_y + 0.5 * height)
         ray = np.array([(middle[0] - i.cx) / i.fx, (middle[1] - i.cy) / i.fy, 1.0])
-        stretch = round_outline(view.up_optical, ray)
-        return cls(mask, evidence.stretched(stretch), (left, top), own, measured, focal, stretch)
+        stretch = round_outline(view.up_optical, ray, flatness)
+        inside = first_x > 0 and first_y > 0 and first_x + width < i.width and first_y + height < i.height
+        whole = None
+        if measured and inside and open_share >= OPEN_SHARE and view.up_optical is not None:
+            whole = _whole_fruit(mask[box], view.up_optical, ray, own, focal)
+        return cls(mask, evidence.stretched(stretch), (left, top), own, measured, focal, stretch, whole)
 
     @property
     def radius_m(self) -> float:
@@ -275,6 +296,7 @@ class _Fit:
             whole=whole,
             centre_optical=centre,
             radius_m=radius_m,
+            seen_whole=self.whole,
         )
 
 
@@ -327,8 +349,8 @@ def whole_silhouette(
 
 def _collect(
     here: BinaryMask, z: Float64, measured: Float64, own: float, size: float, step: float
-) -> _Evidence:
-    """Samples of the four kinds of evidence, as x, y in the window, in [px].
+) -> tuple[_Evidence, float]:
+    """Samples of the four kinds of evidence, as x, y in the window, in [px], and the share of the edge that is open.
 
     Args:
         here: The mask in the window.
@@ -367,12 +389,43 @@ def _collect(
     behind = (z > own + 2 * step) & (cv2.dilate(image, patch) == 0)
     core = (cv2.erode(image, patch) > 0) & (measured > 0)
     inner = _thinned(_pixels(core))
-    return _Evidence(
+    evidence = _Evidence(
         edge=_thinned(rim[deeper]) + 0.5,
         mask=_thinned(rim if len(rim) else _pixels(here)) + 0.5,
         background=_thinned(_pixels(behind), 2 * SAMPLES) + 0.5,
         mask_depth=np.concatenate([inner + 0.5, measured[inner[:, 1], inner[:, 0]][:, None]], 1),
     )
+    return evidence, float(deeper.mean()) if len(deeper) else 0.0
+
+
+def _whole_fruit(mask: BinaryMask, up: Float64, ray: Float64, own: float, focal: float) -> WholeFruit | None:
+    """Size and shape by the moments of a mask whose whole outline is the fruit's; None where they do not tell.
+
+    Args:
+        mask: Its pixels, in the smallest box that holds them.
+        up: Unit vector upwards in the optical frame. Shape (3,).
+        ray: Towards the fruit, optical frame. Shape (3,).
+        own: Depth of its visible surface, in [m].
+        focal: In [px].
+    """
+    away = ray / np.linalg.norm(ray)
+    along = float(up @ away)
+    if abs(along) > STEEPEST:
+        return None
+    direction = up[:2] - along * away[:2]
+    direction = direction / np.linalg.norm(direction)
+    rows, columns = np.nonzero(mask)
+    upright = float(np.std(columns * direction[0] + rows * direction[1]))
+    across = float(np.std(columns * direction[1] - rows * direction[0]))
+    if 2.0 * min(upright, across) < SMALLEST_OUTLINE or len(rows) < FILLED_SHARE * 4.0 * np.pi * upright * across:
+        return None
+    squared = ((upright / across) ** 2 - along**2) / (1.0 - along**2)
+    if not LEAST_FLATNESS**2 < squared < LARGEST_FLATNESS**2:
+        return None
+    # The middle lies behind the visible surface's median depth by 0.7 of a radius.
+    tangent = 2.0 * across / focal
+    radius = tangent * (own + 0.7 * tangent * own) / float(np.hypot(1.0, tangent))
+    return WholeFruit(radius_m=radius, flatness=float(np.sqrt(squared)))
 
 
 def _pixels(mask: BinaryMask) -> NDArray[np.int64]:
