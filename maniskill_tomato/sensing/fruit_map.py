@@ -105,6 +105,11 @@ class Track:
         return float(self.mean[3])
 
     @property
+    def deviation_m(self) -> float:
+        """Standard deviation of its place, in [m]."""
+        return float(np.sqrt(np.trace(self.covariance[:3, :3])))
+
+    @property
     def is_ripe(self) -> bool:
         """Whether it is more likely ripe than not."""
         return self.ripe_log_odds > 0.0
@@ -429,20 +434,30 @@ class FruitMap:
             if a not in self.tracks or b not in self.tracks:
                 continue
             first, second = self.tracks[a], self.tracks[b]
+            if _overlap(first, second):
+                # At most one of both places is right.
+                if second.deviation_m < first.deviation_m:
+                    first.mean, first.covariance = second.mean, second.covariance
+                self._absorb(first, second)
+                continue
             if (b in first.apart_from or a in second.apart_from) and not _is_same_place(first, second):
                 continue
             if not self._is_one(first, second):
                 continue
             self._correct(first, second.mean, second.covariance)
-            first.ripe_log_odds = float(
-                np.clip(first.ripe_log_odds + second.ripe_log_odds, -LARGEST_LOG_ODDS, LARGEST_LOG_ODDS)
-            )
-            first.existence_log_odds = max(first.existence_log_odds, second.existence_log_odds)
-            first.views += second.views
-            first.seen_whole = first.seen_whole or second.seen_whole
-            first.apart_from |= second.apart_from
-            self._merged[b] = a
-            del self.tracks[b]
+            self._absorb(first, second)
+
+    def _absorb(self, first: Track, second: Track) -> None:
+        """Ends the second track, which the first one stands for from now on."""
+        first.ripe_log_odds = float(
+            np.clip(first.ripe_log_odds + second.ripe_log_odds, -LARGEST_LOG_ODDS, LARGEST_LOG_ODDS)
+        )
+        first.existence_log_odds = max(first.existence_log_odds, second.existence_log_odds)
+        first.views += second.views
+        first.seen_whole = first.seen_whole or second.seen_whole
+        first.apart_from |= second.apart_from
+        self._merged[second.number] = first.number
+        del self.tracks[second.number]
 
     def _is_one(self, first: Track, second: Track) -> bool:
         difference = first.mean - second.mean
@@ -540,6 +555,9 @@ SAME_PLACE: Final = 0.25
 """Tracks that were detected beside each other are one fruit when they are nearer than this share of the sum of their
 radii."""
 
+SOLID_OVERLAP: Final = 0.4
+"""Centres nearer than this share of the sum of the radii belong to one fruit, as for the detections of one view."""
+
 SURE_VIEWS: Final = 2
 """A mask is divided only among tracks that were detected in so many views."""
 
@@ -582,8 +600,7 @@ def shown_share(track: Track, measurement: Measurement) -> float | None:
         it lies outside the picture.
     """
     frame = measurement.frame
-    deviation = float(np.sqrt(np.trace(track.covariance[:3, :3])))
-    return shown_of_sphere(track.mean, frame, frame.depth_m, deviation)
+    return shown_of_sphere(track.mean, frame, frame.depth_m, track.deviation_m)
 
 
 def shown_of_sphere(
@@ -626,6 +643,14 @@ def fraction_error(fraction: float, half: float) -> float:
         half: The error at V_f = 0.5.
     """
     return float(LEAST_FRACTION_ERROR + half * (4.0 * fraction * (1.0 - fraction)) ** 0.7)
+
+
+def _overlap(first: Track, second: Track) -> bool:
+    """Whether two tracks stand in each other as no two solids can, and both places are well known."""
+    radii = first.radius_m + second.radius_m
+    apart = float(np.linalg.norm(first.position_w - second.position_w))
+    known = max(first.deviation_m, second.deviation_m)
+    return apart < SOLID_OVERLAP * radii and known < SOLID_OVERLAP * radii
 
 
 def _is_same_place(first: Track, second: Track) -> bool:

@@ -12,7 +12,7 @@ from maniskill_tomato.segmentation.datasets.annotations import AnnotatedImage, C
 from maniskill_tomato.segmentation.datasets.picture_files import write_picture
 from maniskill_tomato.segmentation.instances import Instances, mask_box
 from maniskill_tomato.segmentation.masks import EncodedMask
-from maniskill_tomato.sensing.fruit_detector import robots_model
+from maniskill_tomato.sensing.visible_fraction.sphere import SphereModel
 
 
 def test_scores_follow_from_the_errors() -> None:
@@ -85,12 +85,12 @@ def test_fruits_that_a_segmenter_misses_are_failures_and_the_others_are_measured
             masks=np.array(found),
         )
 
-    judged, _ = judge((image,), {"sphere": robots_model()}, segmenter=segmenter, min_total=0)
+    judged, _ = judge((image,), {"sphere": SphereModel()}, segmenter=segmenter, min_total=0)
     assert [j.truth for j in judged] == pytest.approx([1.0, 0.5, 1.0], abs=0.03)
     assert judged[0].estimate == pytest.approx(1.0, abs=0.1)
     assert judged[1].estimate == pytest.approx(0.5, abs=0.1)
     assert np.isnan(judged[2].estimate) and score(judged).failures == 1
     # A mask that shares less than half with a fruit is not that fruit's.
     found = [np.roll(masks[0], 25, axis=1), masks[1]]
-    judged, _ = judge((image,), {"sphere": robots_model()}, segmenter=segmenter, min_total=0)
+    judged, _ = judge((image,), {"sphere": SphereModel()}, segmenter=segmenter, min_total=0)
     assert np.isnan(judged[0].estimate) and np.isfinite(judged[1].estimate)

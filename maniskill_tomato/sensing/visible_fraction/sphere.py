@@ -417,7 +417,10 @@ def _whole_fruit(mask: BinaryMask, up: Float64, ray: Float64, own: float, focal:
     rows, columns = np.nonzero(mask)
     upright = float(np.std(columns * direction[0] + rows * direction[1]))
     across = float(np.std(columns * direction[1] - rows * direction[0]))
-    if 2.0 * min(upright, across) < SMALLEST_OUTLINE or len(rows) < FILLED_SHARE * 4.0 * np.pi * upright * across:
+    if (
+        2.0 * min(upright, across) < SMALLEST_OUTLINE
+        or len(rows) < FILLED_SHARE * 4.0 * np.pi * upright * across
+    ):
         return None
     squared = ((upright / across) ** 2 - along**2) / (1.0 - along**2)
     if not LEAST_FLATNESS**2 < squared < LARGEST_FLATNESS**2:
