@@ -8,11 +8,12 @@ import numpy as np
 
 from maniskill_tomato.errors import InvalidInputError
 from maniskill_tomato.plants.clutter import clutter_organs
+from maniskill_tomato.plants.flower import grow_flowers
 from maniskill_tomato.plants.fruit import berry_patch, draw_berry
 from maniskill_tomato.plants.hiding import choose_clear_directions, clear_view, hang_curtain
 from maniskill_tomato.plants.kinds import config_of
 from maniskill_tomato.plants.leaf import Leaf, draw_leaf, draw_rachis, leaf_parts, wilted
-from maniskill_tomato.plants.meshing import Float64, join
+from maniskill_tomato.plants.meshing import join
 from maniskill_tomato.plants.organs import Fruit, Organ, Plant, Ripeness, SemanticClass, placed
 from maniskill_tomato.plants.plant_config import PlantConfig
 from maniskill_tomato.plants.random_streams import Stream, normal, stream, uniform
@@ -31,13 +32,6 @@ FRUIT_CLASS: dict[Ripeness, SemanticClass] = {
     "turning": SemanticClass.FRUIT_TURNING,
     "green": SemanticClass.FRUIT_GREEN,
 }
-
-
-def _on_stem(shoot: Shoot, height: float, azimuth: float) -> Float64:
-    """A point just under the skin of the stem on one of its sides, in [m]. Shape (3,)."""
-    z = np.array(height)
-    side = np.array([cos(azimuth), sin(azimuth), 0.0])
-    return np.asarray(shoot.axis(z) + 0.6 * float(shoot.radius(z)) * side)
 
 
 def _grow_trusses(config: PlantConfig, shoot: Shoot, seed: int) -> list[Truss]:
@@ -59,7 +53,7 @@ def _grow_trusses(config: PlantConfig, shoot: Shoot, seed: int) -> list[Truss]:
         berries = [
             draw_berry(config.fruit, stream(seed, Stream.FRUIT, 100 * k + i), k, i) for i in range(count)
         ]
-        truss = draw_truss(config.truss, rng, _on_stem(shoot, height, azimuth), azimuth, berries)
+        truss = draw_truss(config.truss, rng, shoot.on_skin(height, azimuth), azimuth, berries)
         trusses.append(truss)
     return trusses
 
@@ -87,7 +81,7 @@ def _grow_leaves(config: PlantConfig, shoot: Shoot, seed: int, fruits: list[Hang
             if side_shoot:
                 azimuth += radians(SIDE_ANGLES_DEG[turn - 1]) * (1.0 if rng.random() < 0.5 else -1.0)
                 vigour *= 0.75
-            base = _on_stem(shoot, float(shoot.heights[node]), azimuth)
+            base = shoot.on_skin(float(shoot.heights[node]), azimuth)
             if hiding and node in curtains and not side_shoot:
                 leaf = hang_curtain(hiding, config.leaf, seed, node, base, hidden, curtains[node])
             else:
@@ -134,6 +128,8 @@ def _shoot(config: PlantConfig, seed: int, detail: Detail) -> Plant:
         radius = round(float(np.sqrt((away * away).sum(1).max())), 6) + 1e-6
         described.append(Fruit(len(organs), centre.astype(np.float32), radius, berry.ripeness))
         organs.append(Organ(f"fruit_{i:02d}", FRUIT_CLASS[berry.ripeness], (skin,)))
+    for i, parts in enumerate(grow_flowers(config, shoot, seed)):
+        organs.append(Organ(f"flowers_{i:02d}", SemanticClass.STEM, parts))
     return Plant(preset=config.name, seed=seed, detail=detail, organs=tuple(organs), fruits=tuple(described))
 
 

@@ -39,6 +39,7 @@ def _make_materials() -> dict[str, Material]:
         "petiole": Material(partial(stalk_texture, 1, (112, 146, 70), streak=0.08), 0.7, 0.3),
         "truss": Material(partial(stalk_texture, 2, (96, 132, 58), streak=0.07), 0.7, 0.3),
         "calyx": Material(calyx_texture, 0.7, 0.3),
+        "petal": Material(partial(stalk_texture, 3, (236, 204, 46), streak=0.06), 0.6, 0.3),
     }
     for k in range(LEAF_VARIANTS):
         materials[f"leaf_upper_{k}"] = Material(partial(leaf_texture, k, upper=True), 0.55, 0.4)

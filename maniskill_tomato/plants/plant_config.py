@@ -207,6 +207,34 @@ class TrussConfig:
 
 
 @dataclass(frozen=True, kw_only=True)
+class FlowerConfig:
+    """Flowers of a truss that has set no fruit yet."""
+
+    count_range: tuple[int, int] = (4, 8)
+    """Open flowers of a truss; [practice] as many as fruits or a few more."""
+    spacing: float = 0.014
+    """Peduncle between flowers, in [m]; [looks]."""
+    pedicel_length_range: tuple[float, float] = (0.012, 0.02)
+    """Length of a flower's stalk, in [m]; [looks]."""
+    end_angle_deg: float = 120.0
+    """Angle of the peduncle's tip to the upward vertical, in [deg]; no fruit pulls at it yet; [looks]."""
+    bud_radius: float = 0.0025
+    """Radius of what the sepals and petals stand on, in [m]; [looks]."""
+    sepal_length: float = 0.009
+    """Length of a sepal, in [m]; [looks]."""
+    petal_length_range: tuple[float, float] = (0.009, 0.013)
+    """Length of a petal, in [m]; [looks]."""
+    petal_width: float = 0.005
+    """Largest width of a petal, in [m]; [looks]."""
+    petal_bend_deg: float = 110.0
+    """Turn of a petal from its base to its tip, backwards, in [deg]; [looks]."""
+    petal_bend_spread_deg: float = 25.0
+    """Standard deviation of that turn, in [deg]; [looks]."""
+    anther_length: float = 0.008
+    """Length of the cone of anthers, in [m]; [looks]."""
+
+
+@dataclass(frozen=True, kw_only=True)
 class FruitConfig:
     """Berries: size, shape and how ripe they are."""
 
@@ -309,6 +337,8 @@ class PlantConfig:
     """Numbers of the trusses."""
     fruit: FruitConfig = field(default_factory=FruitConfig)
     """Numbers of the fruits."""
+    flower: FlowerConfig = field(default_factory=FlowerConfig)
+    """Numbers of the flowers."""
     fruits_per_truss: tuple[int, ...] = (6, 6, 5, 4, 2)
     """Fruits of each truss from the lowest up; ~8 on cocktail, 6-7 on plum trusses before pruning;
     [practice]."""
@@ -331,6 +361,8 @@ class PlantConfig:
     """Lean of a bush's shoots away from its middle, in [deg]; [looks]."""
     wilted_share: float = 0.0
     """Share of the leaves that are dying: they hang, are rolled up and yellow."""
+    flowering_trusses: int = 0
+    """Trusses in flower above those with fruits, as far as the stem's height leaves room for them."""
     clutter: int = 0
     """Things about the plant that are no plant: boards, boxes, strings, loose triangles."""
 
@@ -347,6 +379,8 @@ class PlantConfig:
             raise InvalidInputError("hiding needs a single shoot; leave shoots at 1")
         if not 0.0 <= self.wilted_share <= 1.0:
             raise InvalidInputError(f"wilted_share must be from 0 to 1, got {self.wilted_share}")
+        if not 0 <= self.flowering_trusses <= 4:
+            raise InvalidInputError(f"flowering_trusses must be from 0 to 4, got {self.flowering_trusses}")
         if not 0 <= self.clutter <= 40:
             raise InvalidInputError(f"clutter must be from 0 to 40, got {self.clutter}")
         if (

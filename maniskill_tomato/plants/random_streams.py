@@ -21,6 +21,7 @@ class Stream(IntEnum):
     CLUTTER = 10
     SHOOT = 11
     WILTED = 12
+    FLOWER = 13
 
 
 def stream(seed: int, kind: Stream, index: int = 0) -> Generator:

@@ -1,7 +1,7 @@
 """The main shoot: where its nodes are, where they point, and its mesh."""
 
 from dataclasses import dataclass
-from math import pi, radians
+from math import cos, pi, radians, sin
 
 import numpy as np
 
@@ -23,6 +23,12 @@ class Shoot:
     phases: Float64
     """Phases of the sideways wander, in [rad]. Shape (4,)."""
     config: PlantConfig
+
+    def on_skin(self, height: float, azimuth: float) -> Float64:
+        """A point just under the skin of the stem on one of its sides, in [m]. Shape (3,)."""
+        z = np.array(height)
+        side = np.array([cos(azimuth), sin(azimuth), 0.0])
+        return np.asarray(self.axis(z) + 0.6 * float(self.radius(z)) * side)
 
     def axis(self, z: Float64) -> Float64:
         """Points of the stem's axis at given heights, in [m]. Shape (..., 3)."""

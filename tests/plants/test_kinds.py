@@ -11,7 +11,7 @@ from maniskill_tomato.errors import InvalidInputError
 from maniskill_tomato.plants.generator import generate_plant
 from maniskill_tomato.plants.kinds import KINDS, LEAST_BEYOND, TRAITS, draw_kind, draw_traits
 from maniskill_tomato.plants.organs import Plant, SemanticClass
-from maniskill_tomato.plants.plant_config import PlantConfig
+from maniskill_tomato.plants.plant_config import PlantConfig, StemConfig
 from maniskill_tomato.plants.spec import ROW_PLANT, PlantSpec
 
 SEEDS = range(1_000_000, 1_000_300)
@@ -84,6 +84,35 @@ def test_density_wilting_and_clutter_do_what_they_say() -> None:
     assert min(organ.vertices[:, 2].min() for organ in things) > -0.2
 
 
+def test_flowers_stand_above_the_fruits_and_change_nothing_else() -> None:
+    config = PlantConfig(stem=StemConfig(height=2.0), fruits_per_truss=(4, 3))
+    plain = generate_plant(config, 5, "picture")
+    flowering = generate_plant(dataclasses.replace(config, flowering_trusses=2), 5, "picture")
+    flowers = [organ for organ in flowering.organs if organ.name.startswith("flowers")]
+
+    assert len(flowers) == 2
+    assert all(organ.semantic_class is SemanticClass.STEM for organ in flowers)
+    fruits = [plain.organs[fruit.organ_index] for fruit in plain.fruits]
+    assert min(f.vertices[:, 2].min() for f in flowers) > max(f.vertices[:, 2].max() for f in fruits)
+    for before, after in zip(plain.organs, flowering.organs, strict=False):
+        assert before.name == after.name
+        np.testing.assert_array_equal(before.vertices, after.vertices)
+    for organ in flowers:
+        (petals,) = [part for part in organ.parts if part.material == "petal"]
+        normals, faces = petals.normals, petals.faces
+        assert np.allclose(np.linalg.norm(normals, axis=1), 1.0, atol=1e-3)
+        a, b, c = (petals.vertices[faces[:, k]].astype(float) for k in range(3))
+        across = np.cross(b - a, c - a)
+        inside = np.linalg.norm(across, axis=1) > 1e-12
+        turned = (across * normals[faces].mean(1)).sum(1)[inside] > 0
+        assert turned.mean() > 0.98
+
+
+def test_a_stem_that_is_too_short_bears_no_flowers() -> None:
+    names = [organ.name for organ in generate_plant(PlantConfig(flowering_trusses=4), 0).organs]
+    assert not any(name.startswith("flowers") for name in names)
+
+
 def test_a_task_takes_the_density_of_the_kind_unless_another_is_asked_for() -> None:
     assert PlantSpec.parse("varied", ROW_PLANT).leaf_density is None
     assert PlantSpec.parse({"preset": "other_kind"}, ROW_PLANT).leaf_density is None
@@ -93,7 +122,8 @@ def test_a_task_takes_the_density_of_the_kind_unless_another_is_asked_for() -> N
 
 
 @pytest.mark.parametrize(
-    ("field", "value"), [("shoots", 0), ("shoots", 9), ("wilted_share", 1.5), ("clutter", -1)]
+    ("field", "value"),
+    [("shoots", 0), ("shoots", 9), ("wilted_share", 1.5), ("clutter", -1), ("flowering_trusses", 5)],
 )
 def test_a_number_out_of_range_is_named(field: str, value: Any) -> None:
     with pytest.raises(InvalidInputError, match=field):

@@ -13,6 +13,7 @@ import trimesh
 from maniskill_tomato.cli import main, parse
 from maniskill_tomato.cli.image_commands import Dataset
 from maniskill_tomato.errors import InvalidInputError
+from maniskill_tomato.plants.generator import generate_plant
 from maniskill_tomato.robot.d435 import (
     CameraIntrinsics,
     color_intrinsics,
@@ -150,6 +151,36 @@ def test_a_data_set_on_mesh_files_is_another_one_and_needs_plants_of_its_split(t
     (tmp_path / "data" / "dataset.json").write_text(json.dumps(DatasetConfig(plants=plants).identity()))
     with pytest.raises(InvalidInputError, match="another plants"):
         make_dataset(DatasetConfig(count=1), tmp_path / "data")
+
+
+@pytest.mark.render
+def test_the_sun_lights_the_row_in_front_and_leaves_shade_it() -> None:
+    from maniskill_tomato.segmentation.synthesis.appearance import draw_appearance
+    from maniskill_tomato.segmentation.synthesis.greenhouse import GreenhouseScene
+
+    intrinsics = color_intrinsics(160, 120)
+    bright = replace(
+        draw_appearance(np.random.default_rng(2), vary_crop=False),
+        sun=(2.0, 2.0, 2.0),
+        sun_direction=(0.6, 0.1, -0.79),
+        sky=0.6,
+        backdrop="gutters",
+        robot=False,
+    )
+    plant = generate_plant("full", 3)
+    scene = GreenhouseScene(plant, bright, intrinsics, np.random.default_rng(0))
+    T = np.eye(4)
+    # From the robot's side, level: x to the right is -y of the plant, y down, z away.
+    T[:3, :3] = [[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]]
+    T[:3, 3] = [-0.7, 0.0, 0.9]
+    lit = scene.shoot(T)
+    scene.relight(replace(bright, sun=(0.0, 0.0, 0.0)))
+    dull = scene.shoot(T)
+
+    front = (lit.thing >= 0) & (lit.depth_m < 0.9)
+    gain = (lit.light - dull.light).mean(-1)[front]
+    # Without shadows 0.4 of these pixels would gain as much, those of surfaces that face the sun; leaves shade most.
+    assert 0.08 < np.mean(gain > 0.05) < 0.3
 
 
 @pytest.mark.render

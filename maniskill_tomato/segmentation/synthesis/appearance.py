@@ -10,7 +10,9 @@ from typing import Literal
 import numpy as np
 from numpy.random import Generator
 
+from maniskill_tomato.plants.kinds import draw_kind
 from maniskill_tomato.plants.plant_config import (
+    MAX_LEAF_DENSITY,
     FruitConfig,
     LeafConfig,
     PlantConfig,
@@ -73,9 +75,26 @@ def _gain(rng: Generator, spread: float) -> Colour:
     return float(red), float(green), float(blue)
 
 
+OTHER_CROPS = 0.4
+"""Share of the rows that are of any kind of plant that `varied` draws, with fruits of any shape."""
+
+OBLATENESS = (0.75, 1.45)
+"""Height over width of their fruits: from beef tomatoes to plum tomatoes and peppers, whose boxes photos show too."""
+
+
 def draw_crop(rng: Generator) -> PlantConfig:
-    """The plants of a row: mostly truss tomatoes, some cherry or beef tomatoes."""
-    base = make_full_config()
+    """The plants of a row: truss, cherry, beef and plum tomatoes on a wire, or any kind of `plants.kinds`."""
+    flowering = int(rng.integers(0, 3))
+    if rng.random() < OTHER_CROPS:
+        return replace(_any_kind(rng), flowering_trusses=flowering)
+    full = make_full_config()
+    base = replace(
+        full,
+        stem=replace(full.stem, height=full.stem.height + 0.22 * flowering),
+        flowering_trusses=flowering,
+        leaves_kept_below_truss=int(rng.integers(1, 4)),
+        wilted_share=max(float(rng.uniform(-0.1, 0.12)), 0.0),
+    )
     kind = rng.random()
     leaf = replace(
         LeafConfig(), leaflet_aspect=float(rng.uniform(0.6, 0.8)), lobe_depth=float(rng.uniform(0.1, 0.4))
@@ -83,7 +102,7 @@ def draw_crop(rng: Generator) -> PlantConfig:
     truss = replace(TrussConfig(), azimuth_spread_deg=float(rng.uniform(30, 60)))
     fruit = FruitConfig()
     counts = base.fruits_per_truss
-    if kind < 0.35:  # Cherry tomatoes: long trusses of small fruits.
+    if kind < 0.3:  # Cherry tomatoes: long trusses of small fruits.
         small = float(rng.uniform(0.013, 0.02))
         fruit = replace(
             fruit,
@@ -97,10 +116,22 @@ def draw_crop(rng: Generator) -> PlantConfig:
             truss, pedicel_spacing=float(rng.uniform(0.016, 0.022)), pedicel_length_range=(0.012, 0.022)
         )
         counts = (11, 11, 10, 8, 4)
-    elif kind < 0.45:  # Beef tomatoes: few, large, ribbed.
+    elif kind < 0.4:  # Beef tomatoes: few, large, ribbed.
         fruit = replace(fruit, radius_range=(0.036, 0.046), rib_depth_range=(0.015, 0.04))
         truss = replace(truss, pedicel_spacing=0.036)
         counts = (4, 4, 4, 3, 2)
+    elif kind < 0.55:  # Plum tomatoes: longer than wide, smooth.
+        narrow = float(rng.uniform(0.016, 0.025))
+        fruit = replace(
+            fruit,
+            radius_range=(narrow, narrow * 1.15),
+            oblateness_range=(1.15, 1.5),
+            ribs_range=(2, 4),
+            shoulder_dent=0.08,
+            truss_ripening_step=float(rng.uniform(0.12, 0.3)),
+        )
+        truss = replace(truss, pedicel_spacing=0.022)
+        counts = (8, 8, 7, 6, 3)
     else:
         fruit = replace(
             fruit,
@@ -108,6 +139,20 @@ def draw_crop(rng: Generator) -> PlantConfig:
             fruit_ripening_step=float(rng.uniform(0.02, 0.07)),
         )
     return replace(base, leaf=leaf, truss=truss, fruit=fruit, fruits_per_truss=counts)
+
+
+def _any_kind(rng: Generator) -> PlantConfig:
+    crop = draw_kind(int(rng.integers(2**31)))
+    tall, deep = float(rng.uniform(*OBLATENESS)), float(rng.uniform(0.004, 0.08))
+    return replace(
+        crop,
+        fruit=replace(
+            crop.fruit,
+            oblateness_range=(0.96 * tall, 1.04 * tall),
+            ribs_range=(3, 6),
+            rib_depth_range=(0.5 * deep, deep),
+        ),
+    )
 
 
 def draw_appearance(rng: Generator, *, vary_crop: bool = True) -> SceneAppearance:
@@ -132,7 +177,9 @@ def draw_appearance(rng: Generator, *, vary_crop: bool = True) -> SceneAppearanc
     wall = float(np.exp(rng.uniform(np.log(0.2), np.log(3.0))))
     return SceneAppearance(
         crop=crop,
-        leaf_density=float(rng.uniform(0.6, 1.9)) if vary_crop else 1.0,
+        leaf_density=min(crop.leaf_density * float(rng.uniform(0.6, 1.9)), MAX_LEAF_DENSITY)
+        if vary_crop
+        else 1.0,
         sun_direction=(
             float(np.cos(azimuth) * np.cos(height)),
             float(np.sin(azimuth) * np.cos(height)),

@@ -40,7 +40,7 @@ Split = Literal["train", "validation", "held_out"]
 VIEWS_PER_SCENE: Final = 12
 """Images of one scene; growing and building it takes as long as several of them."""
 
-FORMAT: Final = 3
+FORMAT: Final = 4
 """Raised when the same seed gives other images."""
 
 CONFIG_FILE: Final = "dataset.json"

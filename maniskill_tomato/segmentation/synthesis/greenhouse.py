@@ -130,6 +130,9 @@ class GreenhouseScene:
         self._thing_of_id: dict[int, int] = {}
         self._materials = PlantMaterials(appearance, rng)
         for organ in row.organs:
+            if organ.semantic_class == SemanticClass.OBJECT:
+                self._add_parts(organ.parts, sapien.Pose())
+                continue
             category = CATEGORY[organ.semantic_class]
             fruit = category.startswith("tomato")
             thing = Thing(
@@ -221,7 +224,7 @@ class GreenhouseScene:
                 self._add_parts(merged_parts(green), pose)
                 T = pose.to_transformation_matrix()
                 for organ in plant.organs:
-                    if organ.semantic_class <= SemanticClass.LEAF:
+                    if not CATEGORY.get(organ.semantic_class, "").startswith("tomato"):
                         continue
                     vertices = (organ.vertices @ T[:3, :3].T + T[:3, 3]).astype(np.float32)
                     name = f"{BEHIND}{k}_{j}/{organ.name}"
@@ -237,6 +240,8 @@ class GreenhouseScene:
             shadow=True,
             position=_SUN_CENTRE,
             shadow_scale=1.4,
+            shadow_near=-1.9,
+            shadow_far=4.0,
             shadow_map_size=2048,
         )
         self._scene.set_environment_map(_sky(round(appearance.sky, 1)))

@@ -63,9 +63,11 @@ class PlantMaterials(dict[str, sapien.render.RenderMaterial]):
 
 
 def _blemished(colour: NDArray[np.floating[Any]], share: float, rng: Generator) -> NDArray[np.floating[Any]]:
-    """Yellow between the veins and a few dry spots."""
+    """Yellow between the veins, a few dry spots, and a dry tip."""
     size = colour.shape[0]
     yellow = np.clip((cloud(rng, size, size, 3) - (1 - share)) / 0.5, 0, 1)[..., None] * 0.5
     colour = colour * (1 - yellow) + np.array([0.56, 0.58, 0.2]) * yellow
     dry = np.clip((cloud(rng, size, size, 9, octaves=2) - (1.05 - 0.5 * share)) / 0.08, 0, 1)[..., None]
+    ends = 1.0 - 0.25 * share + 0.06 * cloud(rng, size, size, 6)
+    dry = np.maximum(dry, np.clip((np.linspace(0, 1, size)[None] - ends) / 0.03, 0, 1)[..., None])
     return np.asarray(colour * (1 - dry) + np.array([0.62, 0.5, 0.3]) * dry)
