@@ -36,9 +36,13 @@ def write_atomically(path: Path, content: bytes) -> None:
     except OSError as error:
         with contextlib.suppress(OSError):
             temporary.unlink(missing_ok=True)
+        if isinstance(error, (FileExistsError, NotADirectoryError)):
+            raise NotWrittenError(
+                f"cannot write {path}: a file stands where its folder should be; choose another place"
+            ) from error
         raise NotWrittenError(
             f"cannot write {path}: {error.strerror or error}; what was there before is kept. Free some space "
-            "or choose another --out; a run goes on with --resume"
+            "or choose another place; a run goes on with --resume"
         ) from error
 
 

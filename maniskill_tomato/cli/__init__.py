@@ -23,6 +23,7 @@ from maniskill_tomato.cli.command_table import (
     family_list,
     unknown,
 )
+from maniskill_tomato.cli.interruption import keyboard_interrupts
 from maniskill_tomato.errors import (
     SIMULATOR_PACKAGES,
     InvalidInputError,
@@ -55,7 +56,8 @@ def main(argv: Sequence[str] | None = None) -> None:
     logging.basicConfig(level=logging.WARNING, format="%(message)s", stream=sys.stderr)
     logging.getLogger("maniskill_tomato").setLevel(logging.INFO)
     try:
-        run(list(sys.argv[1:] if argv is None else argv))
+        with keyboard_interrupts():
+            run(list(sys.argv[1:] if argv is None else argv))
     except TomatoError as error:
         _end(str(error), _status(error))
     except KeyboardInterrupt:
@@ -98,6 +100,10 @@ def run(argv: list[str]) -> None:
     else:
         command = parse(argv)
         try:
+            if getattr(command, "out", None) is not None:
+                from maniskill_tomato.cli.early_checks import check_out
+
+                check_out(command.out, getattr(command, "writes_file", False))
             with running_command([PROGRAM, *argv]):
                 command.run()
         except InvalidInputError as error:

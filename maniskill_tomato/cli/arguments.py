@@ -60,9 +60,10 @@ def parse_arguments(kind: type[T], argv: Sequence[str], prog: str, default: T | 
         default: What holds without arguments.
 
     Raises:
-        InvalidInputError: A value cannot be used; the message names the flag.
+        InvalidInputError: There is no such option, or a value cannot be used; the message names the flag.
         SystemExit: The arguments cannot be read (2), or help was asked for (0).
     """
+    _check_options(kind, argv, prog)
     try:
         return tyro.cli(
             kind,
@@ -87,13 +88,25 @@ def with_flags(message: str, kind: type, owner: type | None = None) -> str:
     name = re.match(r"[a-z][a-z0-9_]*(?= must |: )", message)
     if name is None:
         return message
-    for dataclass, field, flag in _flags(kind):
+    for dataclass, field, flag in options_of(kind):
         if field == name.group() and owner in (None, dataclass):
             return flag + message[name.end() :]
     return message
 
 
-def _flags(kind: type, prefix: str = "") -> Iterator[tuple[type, str, str]]:
+def _check_options(kind: type, argv: Sequence[str], prog: str) -> None:
+    """Refuses a mistyped option, which tyro does not mention as long as an argument is missing."""
+    known = {flag for _, _, flag in options_of(kind)}
+    for word in argv:
+        flag = word.partition("=")[0].replace("_", "-")
+        asked = flag.replace("--no-", "--", 1)
+        if re.match("--[a-z]", flag) and flag != "--help" and not {flag, asked} & known:
+            raise InvalidInputError(
+                f"{prog} has no option {flag}{did_you_mean(flag, known)} ({prog} --help lists them)"
+            )
+
+
+def options_of(kind: type, prefix: str = "") -> Iterator[tuple[type, str, str]]:
     """Dataclass, field and flag of every option of a command."""
     hints = get_type_hints(kind, include_extras=True)
     for field in dataclasses.fields(kind):
@@ -104,7 +117,7 @@ def _flags(kind: type, prefix: str = "") -> Iterator[tuple[type, str, str]]:
         inner = get_args(hint)[0] if get_origin(hint) is Annotated else hint
         words = f"{prefix}{own}".replace("_", "-")
         if isinstance(inner, type) and dataclasses.is_dataclass(inner):
-            yield from _flags(inner, f"{words}." if words else "")
+            yield from options_of(inner, f"{words}." if words else "")
         else:
             yield kind, field.name, f"--{words}"
 

@@ -1,5 +1,6 @@
 """What can be checked of arguments without PyTorch, ManiSkill or a device, so that a typo costs no seconds."""
 
+import os
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -29,14 +30,37 @@ def check_counts(least: int = 1, **values: int | None) -> None:
 
 def check_file(flag: str, path: Path | None) -> None:
     """Accepts a file, or none."""
+    if path is not None and path.is_dir():
+        raise InvalidInputError(f"{flag} must be a file, and {path} is a folder")
     if path is not None and not path.is_file():
         raise InvalidInputError(f"{flag}: there is no file {path}{_neighbour(path)}")
 
 
 def check_folder(flag: str, path: Path | None) -> None:
     """Accepts a folder, or none."""
+    if path is not None and path.is_file():
+        raise InvalidInputError(f"{flag} must be a folder, and {path} is a file")
     if path is not None and not path.is_dir():
         raise InvalidInputError(f"{flag}: there is no folder {path}{_neighbour(path)}")
+
+
+def check_out(out: Path, is_file: bool) -> None:
+    """Accepts a place for results that is there or can be made, before the work of hours is lost there.
+
+    Args:
+        out: What `--out` names.
+        is_file: Whether that is a file, not a folder.
+    """
+    if is_file and out.is_dir():
+        raise InvalidInputError(f"--out must be a file, and {out} is a folder")
+    nearest = out
+    while not os.path.lexists(nearest) and nearest != nearest.parent:
+        nearest = nearest.parent
+    if not nearest.is_dir() and not (is_file and nearest == out):
+        beyond = "" if nearest == out else f", so that {out} cannot be made"
+        raise InvalidInputError(f"{nearest} is a file{beyond}; choose another --out")
+    if not os.access(nearest, os.W_OK):
+        raise InvalidInputError(f"cannot write to {nearest}: it may only be read; choose another --out")
 
 
 def check_policy(

@@ -3,7 +3,7 @@
 import os
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, ClassVar, Literal
 
 import tyro
 
@@ -82,6 +82,7 @@ class Detect:
     """light, colour, mask_rcnn or yolo, or a file of weights; by default the weights that ship."""
     out: Path = Path("detections.json")
     """File of the list."""
+    writes_file: ClassVar = True
     score_threshold: float = 0.05
     """Leave out what is less certain; 0.3 is a good compromise to look at, lower ones to compute average precision."""
     quick: bool = False

@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, ClassVar
 
 import tyro
 
@@ -88,6 +88,7 @@ class TrainDeepMoveToSee:
 
     out: Path
     """File of the network."""
+    writes_file: ClassVar = True
     episodes: int = 1000
     """Episodes on training plants whose views are learned from."""
     moves: int = 10

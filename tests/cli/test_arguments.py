@@ -13,8 +13,9 @@ import pytest
 
 from maniskill_tomato import __version__
 from maniskill_tomato.cli import main
-from maniskill_tomato.cli.arguments import Flat, field_texts, parse_arguments, with_flags
+from maniskill_tomato.cli.arguments import Flat, field_texts, options_of, parse_arguments, with_flags
 from maniskill_tomato.cli.command_table import COMMANDS, FAMILIES, GROUPS, members
+from maniskill_tomato.cli.early_checks import check_out
 from maniskill_tomato.cli.shared_options import parse_env_options, tell_policy
 from maniskill_tomato.errors import InvalidInputError, NotWrittenError, RenderingUnavailableError
 
@@ -51,7 +52,8 @@ def plain(text: str) -> str:
 ERRORS: dict[str, tuple[tuple[str, ...], str]] = {
     "command": (("trian", GUIDED), "maniskill-tomato has no command 'trian'"),
     "command of a family": (("deploy", "rnu"), "maniskill-tomato deploy has no command 'rnu'"),
-    "flag": (("train", GUIDED, "--gama", "0.9"), "Unrecognized options: --gama"),
+    "flag": (("train", GUIDED, "--gama", "0.9"), "error: maniskill-tomato train has no option --gama"),
+    "flag beside an argument that is missing": (("eval", "--polcy", "x"), "eval has no option --polcy"),
     "value that is missing": (("train", GUIDED, "--out"), "Missing value for argument '--out'"),
     "argument that is missing": (("detect",), "IMAGE_OR_FOLDER"),
     "task": (("train", "TomatoViewpointGuide-v1"), "ENV_ID must be one of 'TomatoViewpointGuided-v1'"),
@@ -126,12 +128,22 @@ ERRORS: dict[str, tuple[tuple[str, ...], str]] = {
     "rows": (("benchmark-rows", "--rows", "0"), "error: --rows must be 1 or more, got 0"),
     "split of rows": (("benchmark-rows", "--split", "test"), "error: --split must be one of"),
     "runs to compare": (("compare", "no"), "error: RUN: there is no folder no"),
+    "file instead of a run": (("compare", "Makefile"), "error: RUN must be a folder, and Makefile is a file"),
+    "folder instead of a file": (
+        ("export", "--policy", "docs"),
+        "error: --policy must be a file, and docs is a folder",
+    ),
     "no runs": (("compare",), "error: give one run folder or more"),
     "experiment": (("reproduce", "guidet"), "'guidet' is none of guided, sparse"),
     "variant": (("reproduce", "guided", "--variant", "small-action"), "small-action"),
     "variant of the learner": (("ablate", "--variants", "n-step"), "n-step"),
     "task of an ablation": (("ablate", "--env-ids", "Tomato"), "error: --env-ids must be one of"),
     "twin": (("judge", "twin", "--profile", "mok"), "error: --profile: no profile 'mok'"),
+    "folder of an evaluation": (
+        ("eval", GUIDED, "--out", "Makefile"),
+        "error: Makefile is a file; choose another",
+    ),
+    "file of a list": (("detect", ".", "--out", "docs"), "error: --out must be a file, and docs is a folder"),
     "minutes": (("demo", "--minutes", "0"), "error: --minutes must be above 0"),
 }
 """Command lines that cannot be done as asked, and what is said."""
@@ -139,7 +151,8 @@ ERRORS: dict[str, tuple[tuple[str, ...], str]] = {
 SUGGESTIONS = {
     "command": "did you mean 'train'?",
     "command of a family": "did you mean 'run'?",
-    "flag": "Perhaps you meant: --gamma FLOAT",
+    "flag": "did you mean '--gamma'?",
+    "flag beside an argument that is missing": "did you mean '--policy'?",
     "task": "did you mean 'TomatoViewpointGuided-v1'?",
     "preset": "did you mean 'td3'?",
     "split": "did you mean 'train'?",
@@ -153,6 +166,32 @@ SUGGESTIONS = {
     "demonstrations": "did you mean 'oracle'?",
 }
 """What is offered instead of a mistyped word."""
+
+
+@pytest.mark.parametrize(
+    ("out", "is_file", "words"),
+    [
+        ("file", False, "file is a file; choose another --out"),
+        ("file/run", False, "file is a file, so that {out} cannot be made; choose another --out"),
+        ("file/list.json", True, "file is a file, so that {out} cannot be made"),
+        ("folder", True, "--out must be a file, and {out} is a folder"),
+        ("/proc/self/run", False, "cannot write to /proc/self: it may only be read; choose another --out"),
+    ],
+)
+def test_a_place_where_results_cannot_be_written_is_refused(
+    out: str, is_file: bool, words: str, tmp_path: Path
+) -> None:
+    (tmp_path / "file").touch()
+    (tmp_path / "folder").mkdir()
+    with pytest.raises(InvalidInputError) as refused:
+        check_out(tmp_path / out, is_file)
+    assert words.format(out=tmp_path / out) in str(refused.value)
+
+
+def test_a_place_for_results_that_can_be_made_is_accepted(tmp_path: Path) -> None:
+    (tmp_path / "file").touch()
+    for out, is_file in (("a/b/c", False), (".", False), ("a/list.json", True), ("file", True)):
+        check_out(tmp_path / out, is_file)
 
 
 @pytest.fixture(scope="module")
@@ -182,6 +221,19 @@ def test_what_is_shown_of_commands_is_narrow_and_loads_nothing_heavy() -> None:
         assert "None" not in said and "{None}" not in said and "tyro" not in said, line
         if line in helps:
             assert said.startswith(f"usage: maniskill-tomato {' '.join(line[:-1])} "), line
+
+
+def test_every_option_is_suggested_for_its_name_without_the_last_letter() -> None:
+    lines, names = [], []
+    for name, entry in COMMANDS.items():
+        flags = {flag for _, _, flag in options_of(entry.load())}
+        for flag in sorted(flags):
+            if flag[:-1] not in flags and len(flag) > 5:
+                lines.append((*name.split(), flag[:-1]))
+                names.append(flag)
+    assert len(lines) > 200
+    for line, flag, (status, said, _) in zip(lines, names, light_run(*lines), strict=True):
+        assert status == 2 and f"has no option {flag[:-1]}; did you mean '{flag}'?" in said, (line, said)
 
 
 def test_the_list_shows_every_command_once(capsys: pytest.CaptureFixture[str]) -> None:
