@@ -191,7 +191,7 @@ def check_vulkan() -> Finding:
 
     problem = rendering_problem()
     if problem is not None:
-        return Finding("problem", problem, "make vulkan")
+        return Finding("problem", problem, "" if "`make vulkan`" in problem else "make vulkan")
     return Finding("ok", f"Vulkan renders on the {render_backend().upper()}")
 
 

@@ -47,8 +47,20 @@ def rendering_problem() -> str | None:
     answer = _ask_for_a_picture("cpu")
     words = answer.lower()
     if any(word in words for word in ("vk::", "vulkan", "find device", "find a device")):
-        return f"{NO_RENDERING_HINT} ({answer})"
+        return _hidden_drivers() or f"{NO_RENDERING_HINT} ({answer})"
     return f"SAPIEN cannot take a picture here ({answer})"
+
+
+def _hidden_drivers() -> str | None:
+    """Says which variable names drivers that are not there, so that Vulkan sees none at all."""
+    for variable in ("VK_DRIVER_FILES", "VK_ICD_FILENAMES"):
+        named = [path for path in os.environ.get(variable, "").split(os.pathsep) if path]
+        if named and not any(os.path.exists(path) for path in named):
+            return (
+                f"Vulkan sees no driver, because {variable} names files that are not there ({', '.join(named)}); "
+                f"`unset {variable}`, and if there is no driver then, `make vulkan` installs one"
+            )
+    return None
 
 
 @functools.cache
@@ -90,5 +102,5 @@ def _ask_for_a_picture(device: str) -> str:
     if result.returncode == 0 and "picture" in result.stdout:
         return ""
     lines = result.stderr.strip().splitlines() or [f"exit status {result.returncode}"]
-    logger.info("SAPIEN cannot render on %s: %s", device, lines[-1])
+    logger.debug("SAPIEN cannot render on %s: %s", device, lines[-1])
     return lines[-1]

@@ -51,3 +51,16 @@ def test_a_dataset_is_refused_with_what_happened(
     with pytest.raises(RenderingUnavailableError, match=reason) as refused:
         make_dataset(DatasetConfig(count=1), tmp_path / "data")
     assert ("make vulkan" in str(refused.value)) == hint
+
+
+def test_a_variable_that_hides_all_drivers_is_named_instead_of_an_installation(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(vulkan_probe, "_PROBE", "raise RuntimeError('vk::createInstanceUnique: none')")
+    monkeypatch.setenv("VK_DRIVER_FILES", f"{tmp_path}/gone.json")
+    monkeypatch.delenv("VK_ICD_FILENAMES", raising=False)
+    problem = vulkan_probe.rendering_problem()
+    assert problem is not None and "`unset VK_DRIVER_FILES`" in problem and "gone.json" in problem
+    (tmp_path / "gone.json").touch()
+    problem = vulkan_probe.rendering_problem()
+    assert problem is not None and problem.startswith(vulkan_probe.NO_RENDERING_HINT)
