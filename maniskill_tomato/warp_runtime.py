@@ -1,13 +1,24 @@
 """NVIDIA Warp: a quiet start, and kernels recorded with their arguments."""
 
+import atexit
+import logging
 import os
+import shutil
 import sys
+import tempfile
 from collections.abc import Sequence
 from functools import cache, lru_cache
 from typing import Any, Final
 
 import torch
 import warp as wp
+
+from maniskill_tomato.errors import UnsoundEnvironmentError
+
+logger = logging.getLogger(__name__)
+
+CACHE_VARIABLE: Final = "WARP_CACHE_PATH"
+"""Names the folder in which Warp keeps its kernels; by default it is one below the home."""
 
 
 @cache
@@ -16,7 +27,37 @@ def start_warp() -> None:
 
     A log level that the user has set is left as it is. Where there is no GPU, Warp's native library says so
     on the process's standard error, past Python's streams; that line is dropped as well.
+
+    A home that may not be written costs the kernels, which then go to a folder that lives as long as the process.
+
+    Raises:
+        UnsoundEnvironmentError: The folder that `CACHE_VARIABLE` names cannot be written.
     """
+    level = wp.config.log_level
+    try:
+        _start_quietly()
+    except OSError as error:
+        if CACHE_VARIABLE in os.environ:
+            raise UnsoundEnvironmentError(
+                f"warp cannot keep its kernels in {os.environ[CACHE_VARIABLE]} ({error.strerror}); set "
+                f"{CACHE_VARIABLE} to a folder that may be written"
+            ) from error
+        folder = tempfile.mkdtemp(prefix="warp-kernels-")
+        atexit.register(shutil.rmtree, folder, ignore_errors=True)
+        os.environ[CACHE_VARIABLE] = folder  # For processes that this one starts.
+        wp.config.kernel_cache_dir = folder
+        wp.config.log_level = level
+        logger.warning(
+            "%s cannot be written (%s), so that kernels are compiled anew in every run; set %s to a folder that may be "
+            "written",
+            error.filename,
+            error.strerror,
+            CACHE_VARIABLE,
+        )
+        _start_quietly()
+
+
+def _start_quietly() -> None:
     if wp.config.log_level != wp.LOG_INFO:
         wp.init()
         return

@@ -144,20 +144,22 @@ def check_kernels() -> Finding:
     """Warp compiles kernels into a folder that it may write."""
     import warp as wp
 
-    from maniskill_tomato.warp_runtime import start_warp
+    from maniskill_tomato.warp_runtime import CACHE_VARIABLE, start_warp
 
-    folder = os.environ.get("WARP_CACHE_PATH") or "its folder"
+    remedy = f"set {CACHE_VARIABLE} to a folder that may be written"
+    named = os.environ.get(CACHE_VARIABLE)
+    folder = named or "its folder"
     try:
         start_warp()
         folder = wp.config.kernel_cache_dir
         with tempfile.TemporaryFile(dir=folder):
             pass
-    except OSError as error:
-        return Finding(
-            "problem",
-            f"warp cannot keep its kernels in {folder} ({error.strerror})",
-            "set WARP_CACHE_PATH to a folder that may be written",
-        )
+    except (OSError, UnsoundEnvironmentError) as error:
+        cause = error if isinstance(error, OSError) else error.__cause__
+        reason = getattr(cause, "strerror", error)
+        return Finding("problem", f"warp cannot keep its kernels in {folder} ({reason})", remedy)
+    if os.environ.get(CACHE_VARIABLE) != named:
+        return Finding("note", f"warp {wp.config.version} compiles its kernels anew in every run", remedy)
     return Finding("ok", f"warp {wp.config.version}, kernels in {folder}")
 
 
