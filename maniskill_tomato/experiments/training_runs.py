@@ -1,7 +1,7 @@
 """Training runs as their folders tell of them."""
 
 import csv
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -45,6 +45,22 @@ class Run:
     def training_seconds(self) -> float | None:
         """Training time, in [s], breaks between interrupted and resumed parts left out."""
         return None if self.clock is None else float(self.clock[-1, 1])
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Group:
+    """The runs of one configuration on one task, which differ in their seeds only."""
+
+    env_id: str
+    label: str
+    """Short name that tells the configuration from the other ones."""
+    runs: Sequence[Run]
+
+    def scores(self, metric: str) -> Float64:
+        """A figure of metrics.json for every evaluated run. Shape (evaluated runs,)."""
+        return np.array(
+            [run.metrics[metric] for run in self.runs if run.metrics is not None], dtype=np.float64
+        )
 
 
 def find_runs(folders: Iterable[Path]) -> list[Path]:

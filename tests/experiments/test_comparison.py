@@ -13,18 +13,16 @@ from torch.utils.tensorboard import SummaryWriter
 
 from maniskill_tomato.cli import main
 from maniskill_tomato.errors import InvalidInputError
+from maniskill_tomato.experiments.comparison_plots import trailing_mean, training_curve
 from maniskill_tomato.experiments.configs import RunComparisonConfig
 from maniskill_tomato.experiments.evaluation import evaluate_run
 from maniskill_tomato.experiments.run_comparison import (
-    Group,
     compare_runs,
     group_runs,
     make_rows,
-    trailing_mean,
-    training_curve,
     write_comparison,
 )
-from maniskill_tomato.experiments.training_runs import find_runs, load_run, read_clock
+from maniskill_tomato.experiments.training_runs import Group, find_runs, load_run, read_clock
 from maniskill_tomato.files import write_tensors
 from maniskill_tomato.learning.rl.agent import make_agent
 from maniskill_tomato.learning.rl.checkpoint import make_checkpoint
