@@ -47,8 +47,6 @@ class Play:
     """Seed of the episode; its number in the list where the task has one."""
     plants: Annotated[PlantOptions, Flat] = PlantOptions()
     """Another plant."""
-    mesh: Path | None = None
-    """Plants from a mesh file or from a folder of them, in place of grown ones (docs/plants.md)."""
     episode_list: str | None = None
     """Episodes of a fixed list, TomatoViewpoint-v1 only: validation, held_out, or a file; by default held_out, unless
     options of the plants are given."""
@@ -120,20 +118,13 @@ class Play:
                 check_choice("--episode-list", self.episode_list, (*EPISODE_LISTS, "FILE.json"))
         check_choice("--perception", self.perception, PERCEPTIONS)
         camera_options(self.env_id, self.perception, self.target, None)
-        plant_options = self.plants.env_options()
-        if self.mesh is not None:
-            if not self.mesh.exists():
-                raise InvalidInputError(f"--mesh: there is no file or folder {self.mesh}")
-            if self.plants.plant is not None:
-                raise InvalidInputError("--mesh goes without --plant: its plants are read, not grown")
-            plant_options["plant"] = {**plant_options.get("plant", {}), "mesh": str(self.mesh)}
         return PlaySettings(
             env_id=self.env_id,
             policy=self.policy or SHIPPED,
             seed=self.seed,
             perception=self.perception,
             target=self.target,
-            plant_options=plant_options,
+            plant_options=self.plants.env_options(),
             episode_list=self.episode_list,
         )
 

@@ -25,8 +25,12 @@ class PlantOptions:
 
     plant: Literal["one_tomato", "three_tomatoes", "full", "varied", "other_kind"] | None = None
     """Preset of the plant."""
+    mesh: Path | None = None
+    """Plants from a mesh file, or from a folder of them with a new one in every episode, in place of grown ones
+    (docs/plants.md)."""
     plant_seed: str | None = None
-    """Its seed, or train, validation or held_out for a new plant of that split in every episode."""
+    """Its seed, or train, validation or held_out for a new plant of that split in every episode; with --mesh also
+    all."""
     plant_pool: int | None = None
     """With a split, draw only from this number of its plants; plants seen before need not grow again."""
     plant_pose: tuple[float, float, float] | None = None
@@ -35,15 +39,16 @@ class PlantOptions:
     """Half ranges of a uniform addition to that in every episode: x [m], y [m], yaw [rad]."""
 
     def __post_init__(self) -> None:
-        if (
-            self.plant_seed is not None
-            and not self.plant_seed.isdigit()
-            and self.plant_seed not in SEED_SPLITS
-        ):
+        splits = tuple(SEED_SPLITS) if self.mesh is None else (*SEED_SPLITS, "all")
+        if self.plant_seed is not None and not self.plant_seed.isdigit() and self.plant_seed not in splits:
             raise InvalidInputError(
-                f"plant_seed must be a number or one of {', '.join(SEED_SPLITS)}; got {self.plant_seed!r}"
-                f"{did_you_mean(self.plant_seed, SEED_SPLITS)}"
+                f"plant_seed must be a number or one of {', '.join(splits)}; got {self.plant_seed!r}"
+                f"{did_you_mean(self.plant_seed, splits)}"
             )
+        if self.mesh is not None and not self.mesh.exists():
+            raise InvalidInputError(f"--mesh: there is no file or folder {self.mesh}")
+        if self.mesh is not None and self.plant is not None:
+            raise InvalidInputError("--mesh goes without --plant: its plants are read, not grown")
         if self.plant_pool is not None and self.plant_pool < 1:
             raise InvalidInputError(f"plant_pool must be 1 or more, got {self.plant_pool}")
 
@@ -52,6 +57,8 @@ class PlantOptions:
         plant: dict[str, Any] = {}
         if self.plant is not None:
             plant["preset"] = self.plant
+        if self.mesh is not None:
+            plant["mesh"] = str(self.mesh.absolute())
         if self.plant_seed is not None:
             plant["seed"] = int(self.plant_seed) if self.plant_seed.isdigit() else self.plant_seed
         if self.plant_pool is not None:

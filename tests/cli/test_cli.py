@@ -12,6 +12,7 @@ import imageio.v2 as imageio
 import numpy as np
 import pytest
 import torch
+import trimesh
 
 from maniskill_tomato.cli import main, parse
 from maniskill_tomato.cli.eval_command import Eval
@@ -155,6 +156,43 @@ def test_another_plant_can_be_asked_for() -> None:
     assert command.plants.env_options() == options
     assert PlantOptions(plant_seed="7").env_options() == {"plant": {"seed": 7}}
     assert PlantOptions().env_options() == {}
+
+
+def make_mesh(folder: Path) -> Path:
+    """A stem with one ripe fruit on the robot's side."""
+    stem = trimesh.creation.box((0.02, 0.02, 1.2)).apply_translation([0, 0, 0.6])
+    fruit = trimesh.creation.icosphere(subdivisions=1, radius=0.03).apply_translation([-0.1, 0, 0.75])
+    np.savez(folder / "plant.npz", stem=stem.triangles, fruit_0=fruit.triangles)
+    return folder / "plant.npz"
+
+
+def test_plants_from_meshes_are_trained_on_judged_and_run_again(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    mesh = make_mesh(tmp_path)
+    main(["train", GUIDED, "--mesh", "plant.npz", "--total-timesteps", "20", "--out", "run"])
+    options = {"plant": {"mesh": str(mesh)}}
+    assert json.loads(Path("run/config.json").read_text())["env_options"] == options
+    asked = ["--mesh", "plant.npz", "--policy", "run/policy.pt", "--no-video", "--no-baseline"]
+    main(["eval", GUIDED, *asked, "--episodes", "2", "--out", "eval"])
+    assert (
+        f"--seed 1001 --episodes 1 --no-baseline --out runs/again-1001 --mesh {mesh}"
+        in Path("eval/report.html").read_text()
+    )
+    # The fruit hangs where the file says.
+    target = np.load("eval/trajectories.npz")["target"]
+    np.testing.assert_allclose(target, np.broadcast_to(target[0], target.shape))
+    assert target[0, 2] == pytest.approx(0.75, abs=0.01)
+
+
+@pytest.mark.parametrize("command", ["eval", "train", "play"])
+def test_a_mesh_that_is_not_there_is_refused(
+    tmp_path: Path, command: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert "there is no file or folder" in fails(
+        capsys, command, GUIDED, "--mesh", str(tmp_path / "vine.glb")
+    )
 
 
 @pytest.mark.parametrize("preset", PLANT_NAMES)
