@@ -4,12 +4,11 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from maniskill_tomato.deploy.run_records import RunResult
-from maniskill_tomato.report_design import many_small, page, paragraph, photo, section, table, tile, tiles
+from maniskill_tomato.report_design import many_small, page, paragraph, pixels, section, table, tile, tiles
 from maniskill_tomato.run_facts import run_facts
 
 
@@ -76,9 +75,7 @@ def run_page(
             ),
             section(
                 f"Looks, {count}",
-                many_small(
-                    *(photo(_packed(look.picture), f"{look.title}. {look.outcome}.") for look in looks)
-                ),
+                many_small(*(pixels(look.picture, f"{look.title}. {look.outcome}.") for look in looks)),
                 table(
                     ("look", "V_f (0 to 1)", "outcome", "why", "camera x, y, z [m]", "wall time [ms]"),
                     rows,
@@ -96,9 +93,3 @@ def _words(description: object) -> str:
     if isinstance(description, Mapping):
         return ", ".join(f"{name.replace('_', ' ')} {value}" for name, value in description.items())
     return str(description)
-
-
-def _packed(picture: NDArray[np.uint8]) -> bytes:
-    """A picture as JPEG."""
-    _, packed = cv2.imencode(".jpg", picture[..., ::-1], (cv2.IMWRITE_JPEG_QUALITY, 88))
-    return packed.tobytes()

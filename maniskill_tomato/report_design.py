@@ -9,6 +9,9 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Final
 
+import numpy as np
+from numpy.typing import NDArray
+
 import maniskill_tomato
 from maniskill_tomato.files import write_atomically
 
@@ -27,6 +30,9 @@ LARGEST_FILM: Final = 6_000_000
 
 TEXT_PX_PER_PT: Final = 1.1
 """A plot is never shown smaller than so many pixels for each of its points: its texts of 8.5 pt have 9 px or more."""
+
+LARGEST_PX_PER_PT: Final = 1.9
+"""Nor larger than this, so that its title stays smaller than the page's headings."""
 
 _THEMED: Final = {
     INK: "ink",
@@ -50,14 +56,14 @@ _STYLE: Final = """
   --ink: #1f2a24; --muted: #5f6b64; --paper: #fafaf7; --card: #ffffff; --line: #e1e6e0; --grid: #e3e7e2;
   --axis: #b9c2bb; --head: #1f2a24; --note: #fdf4e3; --note-line: #ecd9ae;
   --tomato: #c8402c; --leaf: #3f7d4e; --straw: #c98a1b; --sky: #3b6ea5; --plum: #8a5aa5; --teal: #3a8f8f;
-  --bark: #8c6d4f; --link: #2f6b42;
+  --bark: #8c6d4f; --link: #2f6b42; --shade: #1f2a2440;
 }
 @media (prefers-color-scheme: dark) {
   :root {
     --ink: #e4eae6; --muted: #9faba4; --paper: #141916; --card: #1c231f; --line: #313b35; --grid: #2b342f;
     --axis: #56625b; --head: #0d110f; --note: #2d2716; --note-line: #5b4c21;
     --tomato: #f0806b; --leaf: #7cc48e; --straw: #e6b75c; --sky: #7fb2e6; --plum: #c7a1de; --teal: #6cc4c4;
-    --bark: #c9ab8c; --link: #8fd0a0;
+    --bark: #c9ab8c; --link: #8fd0a0; --shade: #000000b0;
   }
 }
 * { box-sizing: border-box; }
@@ -94,22 +100,33 @@ figure {
   margin: 0 0 18px; background: var(--card); border: 1px solid var(--line); border-radius: 10px; padding: 14px;
 }
 .scroll { overflow-x: auto; }
+.card.scroll {
+  background:
+    linear-gradient(to right, var(--card) 40%, transparent) left / 36px 100% no-repeat local,
+    linear-gradient(to left, var(--card) 40%, transparent) right / 36px 100% no-repeat local,
+    linear-gradient(to right, var(--shade), transparent) left / 12px 100% no-repeat scroll,
+    linear-gradient(to left, var(--shade), transparent) right / 12px 100% no-repeat scroll,
+    var(--card);
+}
 .tall { max-height: 560px; overflow: auto; }
 .card { background: var(--card); border: 1px solid var(--line); border-radius: 10px; margin-bottom: 14px; }
 img, video, svg { display: block; width: 100%; height: auto; }
 img, video { border-radius: 6px; }
 figcaption, .caption { color: var(--muted); font-size: 14px; margin: 10px 2px 0; }
+p.caption { margin-bottom: 16px; }
 .pairs { display: grid; grid-template-columns: repeat(auto-fit, minmax(min(100%, 380px), 1fr)); gap: 0 16px; }
 .small { display: grid; grid-template-columns: repeat(auto-fill, minmax(min(46%, 190px), 1fr)); gap: 0 12px; }
 table { width: 100%; border-collapse: collapse; font-variant-numeric: tabular-nums; }
 th, td { padding: 9px 14px; border-bottom: 1px solid var(--line); text-align: right; white-space: nowrap; }
 tbody th { text-align: left; font-weight: 500; white-space: normal; min-width: 7em; }
 thead th {
-  color: var(--muted); font-weight: 600; font-size: 14px; min-width: 4.6em; vertical-align: bottom; white-space: normal;
+  color: var(--muted); font-weight: 600; font-size: 14px; min-width: 6.2em; vertical-align: bottom; white-space: normal;
 }
 thead th:first-child, .words { text-align: left; }
+.dense th, .dense td { padding: 8px 7px; font-size: 14px; }
+.dense thead th { font-size: 13px; min-width: 4em; }
 .tall thead th { position: sticky; top: 0; background: var(--card); }
-td.words { white-space: normal; min-width: 15em; }
+td.words, tbody th.words { white-space: normal; min-width: 15em; }
 td.command { text-align: left; }
 tbody tr:last-child > * { border-bottom: 0; }
 .bad { color: var(--tomato); font-weight: 600; }
@@ -126,6 +143,7 @@ footer { padding-top: 18px; padding-bottom: 34px; color: var(--muted); font-size
   .tiles { grid-template-columns: 1fr; }
   figure { padding: 10px; }
   th, td { padding: 8px 8px; font-size: 15px; }
+  thead th { min-width: 4.6em; }
   dl { grid-template-columns: 1fr; gap: 0; }
   dd { margin-bottom: 10px; }
 }
@@ -233,6 +251,25 @@ def photo(content: bytes, caption: str, least_px: int = 0) -> str:
     return f"<figure>{shown}<figcaption>{text}</figcaption></figure>"
 
 
+def pixels(picture: NDArray[np.uint8], caption: str, widest: int | None = None, least_px: int = 0) -> str:
+    """A picture in memory, packed as JPEG, with its caption below.
+
+    Args:
+        picture: Red, green, blue. Shape (H, W, 3).
+        caption: As text.
+        widest: Pixels in a line from which on it is made smaller; None keeps its size.
+        least_px: As for `photo`.
+    """
+    import cv2
+
+    height, width = picture.shape[:2]
+    if widest is not None and width > widest:
+        size = widest, max(round(widest * height / width), 1)
+        picture = np.asarray(cv2.resize(picture, size, interpolation=cv2.INTER_AREA), np.uint8)
+    _, packed = cv2.imencode(".jpg", picture[..., ::-1], (cv2.IMWRITE_JPEG_QUALITY, 88))
+    return photo(packed.tobytes(), caption, least_px)
+
+
 def film(path: Path, poster: Path | None, caption: str, folder: Path) -> str:
     """A film with the picture that is shown before it plays.
 
@@ -291,11 +328,11 @@ def table(
         for column, text in enumerate(head)
     )
     body = "".join(
-        f'<tr><th scope="row">{html.escape(row[0])}</th>'
+        f'<tr><th scope="row"{" class=words" if 0 in words else ""}>{html.escape(row[0])}</th>'
         f"{''.join(cell(column, text) for column, text in enumerate(row[1:], start=1))}</tr>"
         for row in rows
     )
-    kind = "card scroll tall" if tall else "card scroll"
+    kind = "card scroll" + " tall" * tall + " dense" * (len(head) >= 8)
     return f'<div class="{kind}"><table><thead><tr>{cells}</tr></thead><tbody>{body}</tbody></table></div>'
 
 
@@ -371,10 +408,11 @@ def _plot(path: Path, alt: str) -> str:
         text = text.replace(f": {colour}", f": var(--{name})")
     match = re.search(r'width="([0-9.]+)pt"', text)
     assert match is not None
-    least = float(match[1]) * TEXT_PX_PER_PT
+    least, most = (float(match[1]) * factor for factor in (TEXT_PX_PER_PT, LARGEST_PX_PER_PT))
     # The size comes from the page; what is left is the picture's shape.
     text = re.sub(r'(width|height)="[0-9.]+pt" ?', "", text, count=2)
-    text = text.replace("<svg ", f'<svg role="img" aria-label="{alt}" style="min-width: {least:.0f}px" ', 1)
+    size = f"min-width: {least:.0f}px; max-width: {most:.0f}px"
+    text = text.replace("<svg ", f'<svg role="img" aria-label="{alt}" style="{size}" ', 1)
     text = text.replace(' xmlns="http://www.w3.org/2000/svg"', "")
     text = re.sub(r' xmlns:xlink="[^"]*"', "", text).replace("xlink:href", "href")
     return f'<div class="scroll">{text}</div>'
@@ -385,7 +423,6 @@ def _picture_data(content: bytes) -> str:
     kind = "png" if content.startswith(b"\x89PNG") else "jpeg"
     if kind == "png" and len(content) > LARGEST_PICTURE:
         import cv2
-        import numpy as np
 
         picture = cv2.imdecode(np.frombuffer(content, np.uint8), cv2.IMREAD_COLOR)
         if picture is not None:

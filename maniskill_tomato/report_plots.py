@@ -186,7 +186,10 @@ def plot_intervals(
         axes.set_ylim(sum(heights), 0.0)
         axes.set_xlim(*limits)
         low, high = axes.get_xlim()
+        ticks = [tick for tick in axes.get_xticks() if low <= tick <= high]
+        # Room for the numbers.
         axes.set_xlim(low, high + 0.16 * (high - low))
+        axes.set_xticks(ticks)
         axes.grid(False, axis="y")
         axes.set_title(title, loc="left")
         axes.set_xlabel(label)

@@ -153,9 +153,13 @@ def test_nothing_is_wider_than_a_phone_unless_it_scrolls_by_itself(whole_page: s
     assert re.search(r"\.scroll \{ overflow-x: auto; \}", whole_page)
     assert re.search(r"img, video, svg \{[^}]*width: 100%", whole_page)
     for values, _ in elements.all("svg"):
-        least = float(re.fullmatch(r"min-width: (\d+)px", values["style"])[1])  # type: ignore[index]
+        match = re.fullmatch(r"min-width: (\d+)px; max-width: (\d+)px", values["style"])
+        assert match is not None
+        least, most = float(match[1]), float(match[2])
         # Texts of 8.5 pt; a phone of 390 px leaves 340 px to what is in a figure.
         assert least / (PANEL[0] * 72.0) * 8.5 >= 9.0 and least <= 340
+        # Titles of 10.5 pt; the page's own headings have 20 px.
+        assert most / (PANEL[0] * 72.0) * 10.5 <= 20.0
 
 
 def test_texts_are_shown_as_they_are(whole_page: str) -> None:

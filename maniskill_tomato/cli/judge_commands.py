@@ -31,7 +31,7 @@ class JudgeOcclusion:
     data: Path
     """A folder of `maniskill-tomato dataset`."""
     out: Path = Path("runs/occlusion")
-    """Folder of report.html and occlusion.json, or of steps.png."""
+    """Folder of report.html, and of occlusion.json or steps.png."""
     models: tuple[OcclusionModelName, ...] = ("thesis", "improved", "sphere", "amodal")
     """Which models."""
     segmenter: str | None = None
@@ -68,6 +68,7 @@ class JudgeOcclusion:
                 self.data, self.figure, self.out, models=self.models, min_visible=self.min_visible
             )
             print(f"figure {path}")
+            print(f"report {self.out / 'report.html'}")
             return
         images = read_annotated(self.data).images[: self.count]
         with tqdm(total=len(images), unit="image", disable=None) as bar:
@@ -109,10 +110,16 @@ class JudgeSegmenter:
         check_segmenter("--segmenter", self.segmenter)
         check_counts(limit=self.limit)
 
+        from tqdm import tqdm
+
         from maniskill_tomato.files import write_atomically
         from maniskill_tomato.segmentation.datasets.annotations import SMALLEST_SHARE
         from maniskill_tomato.segmentation.datasets.reading import read_place
-        from maniskill_tomato.segmentation.metrics.detector_evaluation import coco_table, evaluate_segmenter
+        from maniskill_tomato.segmentation.metrics.detector_evaluation import (
+            chosen_images,
+            coco_table,
+            evaluate_segmenter,
+        )
         from maniskill_tomato.segmentation.metrics.evaluation_page import write_evaluation_page
         from maniskill_tomato.segmentation.segmenter import open_for_files
 
@@ -121,7 +128,10 @@ class JudgeSegmenter:
         if found.skipped:
             print(f"{self.data}: {found.skipped_text()}", file=sys.stderr)
         share = SMALLEST_SHARE if self.smallest_share is None else self.smallest_share
-        metrics = evaluate_segmenter(segmenter, found.images, self.out, self.limit, share)
+        images = chosen_images(found.images, self.limit)
+        with tqdm(total=len(images), unit="image", disable=None) as bar:
+            judged = evaluate_segmenter(segmenter, images, self.out, share, bar.update)
+        metrics = judged.metrics
         described = {"segmenter": self.segmenter, "thorough": self.thorough, "data": self.data, **metrics}
         write_atomically(self.out / "metrics.json", json.dumps(described, indent=1).encode())
         for name, value in metrics.items():
@@ -129,7 +139,7 @@ class JudgeSegmenter:
                 print(f"{name:24} {value:.4g}")
         print(coco_table(metrics))
         about = {"segmenter": self.segmenter, "data": self.data, "thorough": str(self.thorough)}
-        print(f"report {write_evaluation_page(metrics, self.out, about)}")
+        print(f"report {write_evaluation_page(judged, self.out, about)}")
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -171,6 +171,11 @@ def write_ablation(config: AblationConfig, variants: Sequence[Variant], results:
         "What each option of the learner is worth",
         f"{len(results)} trainings of {len({row.variant for row in rows})} variants of {config.preset}",
         [
+            paragraph(
+                "Each variant is the preset with one option changed. It is trained anew from every seed, and judged by "
+                "evaluation episodes without exploration. A variant is better or worse than the preset only where "
+                "the intervals lie apart."
+            ),
             section(
                 f"Variants, n = {len(results)} trainings",
                 html_table(HEAD, [_cells(row) for row in rows], words=(1,)),
@@ -187,7 +192,9 @@ def _plot(task: str, rows: Sequence[AblationRow], out: Path) -> str:
     """The success of the variants on a task, as HTML."""
     own = [row for row in rows if row.task == task]
     path = out / f"success-{task.replace(' ', '-')}.png"
-    plot_intervals({row.title: ends(row.success_rate) for row in own}, task, "share of episodes solved", path)
+    plot_intervals(
+        {row.title: ends(row.success_rate) for row in own}, task, "share of episodes solved", path, (0.0, 1.0)
+    )
     seeds = " or ".join(str(n) for n in sorted({row.runs for row in own}))
     return figure(
         path,

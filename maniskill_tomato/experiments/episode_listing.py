@@ -3,7 +3,7 @@
 import shlex
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, Final
+from typing import Any, Final, Literal
 
 from maniskill_tomato.experiments.camera_metrics import Cause, failure_cause
 from maniskill_tomato.experiments.episode_record import EpisodeRecord
@@ -56,7 +56,11 @@ def list_episode(
     """
     shown = record.visible_fraction if record.true_visible_fraction is None else record.true_visible_fraction
     cause = _cause(record, threshold)
-    success = record.success if cause is None and not _has_camera(record) else cause is None
+    if record.row is not None:
+        # A robot that inspects a row ends when it believes that it has seen all.
+        success = record.success and set(record.row.targets) <= set(record.row.seen)
+    else:
+        success = record.success if cause is None and not _has_camera(record) else cause is None
     return ListedEpisode(
         seed=record.seed,
         success=success,
@@ -76,7 +80,9 @@ def reason(record: EpisodeRecord, threshold: float, horizon: int | None) -> str:
     if (cause := _cause(record, threshold)) is not None:
         words = [CAUSES[cause]]
     elif record.row is not None:
-        words = [f"{len(record.row.seen)} of {len(record.row.targets)} tomatoes seen when moves ran out"]
+        ended = "the robot ended its search" if record.success else "moves ran out"
+        seen = len(set(record.row.seen) & set(record.row.targets))
+        words = [f"{seen} of {len(record.row.targets)} tomatoes seen when {ended}"]
     elif horizon is not None and record.steps < horizon and record.steps and bool(record.refused[-1]):
         words = ["the camera was sent out of the arm's workspace, which ends the episode"]
         refused -= 1
@@ -102,17 +108,20 @@ def failures_first(episodes: Iterable[ListedEpisode]) -> list[ListedEpisode]:
     )
 
 
-def episode_list(episodes: Sequence[ListedEpisode], title: str | None = None) -> str:
+def episode_list(
+    episodes: Sequence[ListedEpisode], title: str | None = None, noun: Literal["episode", "row"] = "episode"
+) -> str:
     """The list as HTML.
 
     Args:
         episodes: In any order.
         title: Folds the list under it; None shows it at once.
+        noun: What an episode is called.
     """
     ordered = failures_first(episodes)
     shown = ordered[:LISTED]
     failed = sum(not e.success for e in episodes)
-    counted = f"{failed} of {len(episodes)} episodes failed."
+    counted = f"{failed} of {len(episodes)} {noun}{'' if len(episodes) == 1 else 's'} failed."
     if len(ordered) > len(shown):
         counted += f" The first {len(shown)} lines are shown."
     rows = [
@@ -127,7 +136,10 @@ def episode_list(episodes: Sequence[ListedEpisode], title: str | None = None) ->
         )
         for e in shown
     ]
-    parts = (paragraph(counted, "caption"), table(HEAD, rows, words=(2,), commands=(6,), tall=True))
+    parts = (
+        paragraph(counted, "caption"),
+        table((noun, *HEAD[1:]), rows, words=(2,), commands=(6,), tall=True),
+    )
     return "".join(parts) if title is None else folded(f"{title}: {counted}", parts[1])
 
 
@@ -154,7 +166,12 @@ def replay_with_eval(
     flags: list[str] = []
     plant = options.pop("plant", {})
     plant = {"preset": plant} if isinstance(plant, str) else dict(plant)
-    for name, flag in (("preset", "--plant"), ("seed", "--plant-seed"), ("pool", "--plant-pool")):
+    for name, flag in (
+        ("preset", "--plant"),
+        ("mesh", "--mesh"),
+        ("seed", "--plant-seed"),
+        ("pool", "--plant-pool"),
+    ):
         if plant.get(name) is not None:
             flags += [flag, str(plant[name])]
         plant.pop(name, None)

@@ -126,7 +126,11 @@ def evaluate(config: EvaluationConfig) -> EvaluationResult:
     facts["evaluation time"] = duration(metrics["wall_seconds"])
     source = str(config.policy or shipped_policy(config.env_id))
 
+    repeats = policy.name != RANDOM
+
     def replay(seed: int) -> str | None:
+        if not repeats:
+            return None
         return replay_with_eval(
             config.env_id, source, seed, config.env_options, allow_other_task=config.allow_other_task
         )
@@ -139,6 +143,7 @@ def evaluate(config: EvaluationConfig) -> EvaluationResult:
         evaluation=_plot_episodes(config, episodes, threshold),
         views=shown.views,
         episodes=list_episodes(episodes, threshold, limits.horizon, replay),
+        repeats=repeats,
         video=shown.video,
         poster=shown.poster,
         filmed=shown.count,

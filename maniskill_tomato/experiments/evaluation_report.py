@@ -50,6 +50,8 @@ class ReportInput:
     """First and last views; two by two."""
     episodes: Sequence[ListedEpisode] = ()
     """What became of each episode."""
+    repeats: bool = True
+    """Whether an episode that is run alone is the same."""
     video: Path | None = None
     poster: Path | None = None
     """What the video shows before it plays."""
@@ -144,12 +146,20 @@ def _episodes(content: ReportInput) -> str:
         "Episodes, failures first",
         paragraph(
             "V_f is the visible fraction of the target, from 0 to 1"
-            f"{', by the truth and not as the camera measured it' if causes else ''}. The command runs the episode "
-            "again, with its film where this machine can render."
+            f"{', by the truth and not as the camera measured it' if causes else ''}. "
+            f"{AGAIN if content.repeats else NOT_AGAIN}"
             f"{f' Failures by cause: {told}.' if told else ''}"
         ),
         episode_list(content.episodes),
     )
+
+
+AGAIN = "The command runs the episode again, with its film where this machine can render."
+
+NOT_AGAIN = (
+    "These random actions come from one stream over all episodes: the whole evaluation gives the same episodes again, "
+    "one of them alone has other actions, and so has the film."
+)
 
 
 def _gallery(title: str, pictures: Sequence[ReportPicture], text: str) -> str:

@@ -20,7 +20,7 @@ from PIL import ImageDraw, ImageFont
 
 from maniskill_tomato import report_design as design
 from maniskill_tomato.errors import NotWrittenError
-from maniskill_tomato.experiments.rollout import run_batch
+from maniskill_tomato.experiments.rollout import run_episode
 from maniskill_tomato.policies.protocol import Policy, StatePolicy
 from maniskill_tomato.rendering import vulkan_probe
 from maniskill_tomato.report_design import rgb
@@ -162,7 +162,7 @@ def photograph(
         camera: What takes the pictures; a `Photographer` if None.
     """
     camera = camera or Photographer(env)
-    (record,) = run_batch(env, policy, [seed], watcher=camera)
+    record = run_episode(env, policy, seed, watcher=camera)
     first, last = camera.snapshots
     world: Any = env.unwrapped
     return Film(

@@ -16,7 +16,7 @@ from maniskill_tomato.plants.mesh_plant import plant_from_mesh
 from maniskill_tomato.plants.mesh_set import MeshSource
 from maniskill_tomato.plants.organs import Plant, SemanticClass
 from maniskill_tomato.raycast.scene import RayScene
-from maniskill_tomato.report_design import markdown_table, paragraph, report, section, table
+from maniskill_tomato.report_design import markdown_table, paragraph, report, section, table, tile, tiles
 from maniskill_tomato.robot.d435 import color_intrinsics
 from maniskill_tomato.robot.look_at import look_at_pose
 from maniskill_tomato.run_facts import run_facts
@@ -33,6 +33,18 @@ DISTANCE: Final = 0.35
 
 FULL: Final = GeneralTaskConfig().full_visibility
 """V_f above which the tasks call a fruit fully visible."""
+
+COLUMNS: Final = (
+    "V_f is the share of a fruit's outline in the image that nothing hides, from 0 to 1. Its change is "
+    "that from the file's own triangles to those that are kept. Views across "
+    f"{FULL}: those in which this change decides whether the fruit counts as fully visible. Many of them say that the "
+    "budget is too small."
+)
+
+UNCHANGED: Final = (
+    "All triangles are kept: no plant has more than the budget, or there is none. "
+    "--triangles judges another one."
+)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -94,21 +106,42 @@ def judge_meshes(
             on_plant(1)
     head, cells, told = _table(rows, rules.triangles)
     write_atomically(out / "plants.json", json.dumps([asdict(row) for row in rows], indent=1).encode())
+    _write_report(rows, rules.triangles, split, out)
+    text = markdown_table(head, cells) + "\n"
+    return f"{told}\n\n{text}" if told else text
+
+
+def _write_report(rows: list[MeshRow], budget: int | None, split: str, out: Path) -> None:
+    """Writes report.html, the plants that change most first."""
+    worst_first = sorted(rows, key=lambda row: (-row.crossed, -row.largest_change))
+    head, cells, told = _table(worst_first, budget)
+    plants = f"n = {len(rows)} plant{'' if len(rows) == 1 else 's'}"
+    views, crossed = sum(row.views for row in rows), sum(row.crossed for row in rows)
+    judged = f"n = {views} views of ripe fruits, {plants}"
+    sums = [
+        tile(f"{sum(row.ripe for row in rows)} ripe", f"of {sum(row.fruits for row in rows)} fruits", plants),
+        tile(f"{sum(row.triangles for row in rows) / len(rows):,.0f} triangles", "of a file, mean", plants),
+    ]
+    if views:
+        largest = max(row.largest_change for row in rows)
+        sums += [
+            tile(f"{largest:.3f}", "largest change of V_f by the budget (0 to 1)", judged),
+            tile(f"{crossed} views", f"in which the budget decides whether V_f is above {FULL}", judged),
+        ]
     report(
         out,
         "Plants from mesh files",
         f"{len(rows)} plants, split {split}",
         [
+            tiles(*sums),
             section(
-                f"Plants, n = {len(rows)}",
+                f"Plants, {plants}" + (", largest change first" if views else ""),
                 table(head, cells),
-                paragraph(told or "All triangles are kept: there is no budget to judge.", "caption"),
-            )
+                paragraph(f"{told} {COLUMNS}" if told else UNCHANGED, "caption"),
+            ),
         ],
         run_facts(),
     )
-    text = markdown_table(head, cells) + "\n"
-    return f"{told}\n\n{text}" if told else text
 
 
 def fixed_views(centre: NDArray[np.floating[Any]]) -> torch.Tensor:

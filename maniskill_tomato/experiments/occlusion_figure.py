@@ -38,10 +38,10 @@ def draw_steps(
         ("(e) red over green, cleaned, depth", result.binary),
         ("(f) contours", _outlined(view.rgb, list(result.contours))),
         ("(g) ellipses", ellipses),
-        ("(h) without background, V / T", view.rgb),
+        ("(h) without background, V_f", view.rgb),
     ]
     for name in extra:
-        panels.append((f"{name}, V / T", view.rgb))
+        panels.append((f"{name}, V_f", view.rgb))
     columns = 4
     rows = -(-len(panels) // columns)
     figure, axes = plt.subplots(rows, columns, figsize=(4 * columns, 3.2 * rows), constrained_layout=True)

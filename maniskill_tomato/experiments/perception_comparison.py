@@ -131,7 +131,7 @@ def _write_report(
         won = [bool(r["success"]) for r in results if (r["policy"], r["perception"]) == (policy, perception)]
         shares[f"{policy}, {perception}"] = (sum(won) / len(won), *wilson_interval(sum(won), len(won)))
     plot = config.out / "success.png"
-    plot_intervals(shares, "Success", "share of episodes", plot)
+    plot_intervals(shares, "Success", "share of episodes", plot, (0.0, 1.0))
     count = f"n = {config.episodes} episodes"
 
     def listed(policy: str, perception: str) -> str:
@@ -156,15 +156,19 @@ def _write_report(
         f"{config.episodes} episodes of {config.episode_list} from {config.seed}, success at V_f > "
         f"{task.full_visibility:g}",
         [
+            paragraph(
+                "The same policy runs the same episodes once with the simulator's truth (ground_truth) and once with "
+                "what it measures in camera images. The difference of the success rates is what perception costs."
+            ),
             section(
                 f"Policies and perceptions, {count} each",
                 table(HEAD, _cells(results)),
+                paragraph(METHOD, "caption"),
                 figure(
                     plot,
                     f"Share of episodes (0 to 1) that end with the target truly fully visible, with 95 % intervals "
                     f"(Wilson); {count} a line.",
                 ),
-                paragraph(METHOD, "caption"),
             ),
             section(
                 "Episodes, failures first",

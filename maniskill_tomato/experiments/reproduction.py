@@ -22,7 +22,7 @@ from maniskill_tomato.folder_lock import only_writer
 from maniskill_tomato.learning.rl.agent import make_actor, make_normalizer
 from maniskill_tomato.learning.rl.envs import make_env
 from maniskill_tomato.learning.rl.presets import TrainConfig
-from maniskill_tomato.report_design import figure, markdown_table, section, table
+from maniskill_tomato.report_design import figure, markdown_table, paragraph, section, table
 from maniskill_tomato.report_plots import plot_intervals
 from maniskill_tomato.robot.inverse_kinematics import Reach
 from maniskill_tomato.run_facts import run_facts
@@ -38,6 +38,18 @@ HEAD = (
     "saturated outputs",
     "training steps",
     "first action unreachable",
+)
+
+ABOUT = (
+    "The experiment of the thesis, trained from several seeds and judged without exploration. An episode is solved "
+    "when the target is fully visible."
+)
+
+COLUMNS = (
+    "Steps of an episode that is not solved are its longest length. A step is unreachable if the arm cannot take the "
+    f"pose that the policy asks for. An output of the actor is saturated from {SATURATED} of its largest size on; "
+    "saturated actors hardly learn. First action unreachable: the share of freshly initialised actors whose first "
+    "action leads out of reach."
 )
 
 
@@ -111,23 +123,26 @@ def _write_report(
 ) -> Path:
     """Writes report.html; the plot of the success stands beside it."""
     plot = folder / "success.png"
-    plot_intervals(shares, "Success at the training pose", "share of episodes solved", plot)
+    bare = {_plain(title): share for title, share in shares.items()}
+    plot_intervals(bare, "Success at the training pose", "share of episodes solved", plot, (0.0, 1.0))
     of = f"n = {len(config.seeds)} training seeds, {config.episodes} episodes each"
     return design.report(
         folder,
         f"The thesis's experiment, {config.experiment}",
-        f"{what}; {of}",
+        f"{_plain(what)}; {of}",
         [
+            paragraph(ABOUT),
             section(
                 f"Results, {of}",
-                table(HEAD, rows),
+                table(HEAD, [(_plain(row[0]), *row[1:]) for row in rows], words=(0,)),
+                paragraph(COLUMNS, "caption"),
                 figure(
                     plot,
                     "Share of episodes solved at the training pose (0 to 1): mean over the seeds, 95 % interval; "
                     f"{of}.",
                 ),
             ),
-            section("Figures", *(figure(path, f"{_caption(path)}; {of}.") for path in pictures))
+            section("Figures", *(figure(path, f"{_caption(path, of)}.") for path in pictures))
             if pictures
             else "",
         ],
@@ -135,19 +150,25 @@ def _write_report(
     )
 
 
-def _caption(path: Path) -> str:
-    """What a figure of the thesis's counterparts shows, with units."""
+def _plain(title: str) -> str:
+    """A variant's title without Markdown."""
+    return title.replace("`", "")
+
+
+def _caption(path: Path, of: str) -> str:
+    """What a figure of the thesis's counterparts shows, with units; `of` says of how many."""
     kind, _, evaluation = path.stem.partition("_")
     where = evaluation.replace("-", " ")
     return {
         "training": "Training: loss and reward of episodes, reward and V_f (0 to 1) of steps, moving averages "
-        "(thesis Fig. 5-1 to 5-4)",
+        f"(thesis Fig. 5-1 to 5-4); {of}",
         "plants": "Where the plant stands in each evaluation, in metres, from the front and from above (thesis "
-        "Fig. 5-5)",
+        "Fig. 5-5). The black square is the robot's base; start views lie in the dashed box",
         "evaluation": f"Evaluation at {where}: steps and largest V_f (0 to 1) of the first episodes and of all, sorted "
-        "(thesis Fig. 5-6, 5-7)",
-        "trajectories": f"Ways of the camera at {where}, in metres (thesis Fig. 5-8)",
-        "views": f"First view, last view and the scene at the end, at {where} (thesis Fig. 5-9)",
+        f"(thesis Fig. 5-6, 5-7). An episode above the dashed V_f is solved; {of}",
+        "trajectories": f"Ways of the camera at {where}, in metres (thesis Fig. 5-8); the first episodes of one seed",
+        "views": f"First view, last view and the scene at the end, at {where} (thesis Fig. 5-9); one episode of one "
+        "seed",
     }[kind]
 
 
@@ -234,11 +255,11 @@ def _cells(title: str, summaries: Sequence[dict[str, Any]], untrained: dict[str,
 
     return (
         title,
-        f"{np.mean(rates):.0%} ({low:.0%} to {high:.0%})",
-        ", ".join(f"{100 * r:.0f}" for r in rates),
+        f"{100 * np.mean(rates):.0f} % ({100 * low:.0f} to {100 * high:.0f} %)",
+        f"{', '.join(f'{100 * r:.0f}' for r in rates)} %",
         f"{mean(results, 'mean_steps'):.1f}",
-        f"{mean(trained, 'unreachable_step_share'):.0%} / {mean(results, 'unreachable_step_share'):.0%}",
-        f"{mean(results, 'saturated_output_share'):.0%}",
+        " / ".join(f"{100 * mean(one, 'unreachable_step_share'):.0f} %" for one in (trained, results)),
+        f"{100 * mean(results, 'saturated_output_share'):.0f} %",
         f"{mean(trained, 'steps'):.0f}",
-        f"{untrained['unreachable_share']:.0%}",
+        f"{100 * untrained['unreachable_share']:.0f} %",
     )

@@ -40,6 +40,9 @@ def run_episodes(
 ) -> list[EpisodeRecord]:
     """Runs `episodes` episodes without exploration; episode i starts from the seed `seed + i`.
 
+    In a single environment a policy that draws random numbers draws them from that seed, too, so that an episode that
+    is run again by itself is the same.
+
     Args:
         env: One or several environments that do not reset themselves.
         policy: Chooses the actions.
@@ -65,7 +68,10 @@ def run_episodes(
     ) as bar:
         while len(done) < episodes:
             first = seed + len(done)
-            batch = run_batch(env, policy, range(first, first + num_envs))
+            if num_envs == 1:
+                batch = [run_episode(env, policy, first)]
+            else:
+                batch = run_batch(env, policy, range(first, first + num_envs))
             new = batch[: episodes - len(done)]
             done += new
             bar.set_postfix_str(f"success {sum(e.success for e in done) / len(done):.0%}", refresh=False)

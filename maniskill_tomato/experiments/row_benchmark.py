@@ -65,6 +65,7 @@ _BLOCK = 128
 HEAD = (
     "policy",
     "seen of the seeable",
+    "95 %, by row",
     "seen of all",
     "moves per tomato seen",
     "rows finished",
@@ -75,6 +76,28 @@ HEAD = (
     "refused moves",
     "moves with contact",
 )
+
+METHOD = (
+    "A tomato is seeable if the arm can take a place from which more than 80 % of it is visible; the truth says so. "
+    "The interval is a bootstrap's over the rows, each counting once. A row is finished when every tomato in reach was "
+    "seen; a robot with a camera ends the search itself, when nothing seems worth another move. Moves, the ways of "
+    "camera and joints, and transits are means over the rows. A transit is a move by way of the arm's ready posture. "
+    "Refused moves and moves with contact (the arm in the plants) are shares of the moves that the policy asked for."
+)
+
+INSPECTION = (
+    "The robot lists the tomatoes that it found, with place and radius. Recall is the share of the seeable tomatoes "
+    "that are listed as fully visible and truly were. Precision is the share of the tomatoes listed as ripe that are "
+    "ripe and listed once. Fully seen and ripe is the share of those listed as ripe and fully visible that are both. "
+    "Errors of place and radius are those of the tomatoes that are right."
+)
+
+PAIRED = (
+    "The first policy minus the second on the same rows, each counting once: the mean with its 95 % interval "
+    "(bootstrap) and the p-value of a sign-flip permutation test, not corrected for the number of pairs."
+)
+
+PAIRED_HEAD = ("policies", "share seen", "95 % interval", "p", "moves", "95 % interval", "p")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -124,7 +147,9 @@ def _run_benchmark(config: RowBenchmarkConfig) -> RowBenchmark:
     }
     path = config.out / f"rows-{name}.json"
     write_json(path, _content(results, seeable))
-    parts = [rows_table(results, seeable), "\n".join(compare_rows(results, seeable)) + "\n"]
+    parts = [rows_table(results, seeable)]
+    if len(results) > 1:
+        parts.append(markdown_table(PAIRED_HEAD, compare_rows(results, seeable)) + "\n")
     if config.perception != "ground_truth":
         parts.insert(1, inspection_table(results, seeable))
     sources = {spec.label: spec.source for spec in specs}
@@ -143,7 +168,7 @@ def _write_report(
         for name, episodes in results.items()
     }
     plot = config.out / "seen.png"
-    plot_intervals(shares, "Seen of the seeable tomatoes", "share of tomatoes", plot)
+    plot_intervals(shares, "Seen of the seeable tomatoes", "share of tomatoes", plot, (0.0, 1.0))
     threshold = GeneralTaskConfig().full_visibility
     count = f"n = {config.rows} rows"
 
@@ -153,7 +178,7 @@ def _write_report(
             words += ["--transits", config.transits, "--perception", config.perception]
             return shlex.join(["maniskill-tomato", "benchmark-rows", *words, "--out", f"runs/again-{seed}"])
 
-        return episode_list(list_episodes(episodes, threshold, None, replay), name)
+        return episode_list(list_episodes(episodes, threshold, None, replay), name, "row")
 
     best = max(shares, key=lambda name: shares[name][0])
     share, low, high = shares[best]
@@ -163,6 +188,7 @@ def _write_report(
         section(
             f"Inspection lists, {count} a policy",
             table(INSPECTION_HEAD, _inspection_cells(results, seeable)),
+            paragraph(INSPECTION, "caption"),
         )
         if config.perception != "ground_truth"
         else ""
@@ -193,20 +219,25 @@ def _write_report(
             section(
                 f"Policies, {count} each",
                 table(HEAD, _rows_cells(results, seeable)),
+                paragraph(METHOD, "caption"),
                 figure(
                     plot,
                     f"Share of the seeable tomatoes that each policy saw (0 to 1), with 95 % intervals over {count}.",
                 ),
             ),
             inspections,
-            section("Paired differences", *(paragraph(line) for line in compare_rows(results, seeable)))
+            section(
+                f"Paired differences, {count}",
+                table(PAIRED_HEAD, compare_rows(results, seeable)),
+                paragraph(PAIRED, "caption"),
+            )
             if len(results) > 1
             else "",
             section(
                 "Rows, failures first",
                 paragraph(
-                    "A row is solved when every tomato in reach was seen. V_f (0 to 1) is that of the tomato that was "
-                    "the target. The command searches the row again."
+                    "A row is solved when every tomato in reach was seen. V_f is the visible fraction (0 to 1) of the "
+                    "tomato that was the target. The command searches the row again."
                 ),
                 *(listed(name, episodes) for name, episodes in results.items()),
             ),
@@ -340,16 +371,17 @@ def _rows_cells(
         lines.append(
             (
                 name,
-                f"{_both_share(episodes, seeable):.1%} (rows: {low:.1%} to {high:.1%})",
-                f"{seen / max(wanted, 1):.1%}",
+                percent(_both_share(episodes, seeable)),
+                f"{100 * low:.1f} to {percent(high)}",
+                percent(seen / max(wanted, 1)),
                 f"{sum(r.moves for r in rows) / max(seen, 1):.2f}",
-                f"{sum(e.success for e in episodes) / count:.0%}",
+                percent(sum(e.success for e in episodes) / count, 0),
                 f"{sum(r.moves for r in rows) / count:.1f}",
                 f"{sum(r.path_m for r in rows) / count:.1f}",
                 f"{sum(r.joint_path_rad for r in rows) / count:.0f}",
                 f"{sum(r.transits for r in rows) / count:.1f}",
-                f"{sum(int(e.refused.sum()) for e in episodes) / asked:.0%}",
-                f"{touched / asked:.0%}",
+                percent(sum(int(e.refused.sum()) for e in episodes) / asked, 0),
+                percent(touched / asked, 0),
             )
         )
     return lines
@@ -382,7 +414,7 @@ def _inspection_cells(
         lines.append(
             (
                 name,
-                *("none" if share is None else f"{share:.1%}" for share in shares),
+                *("none" if share is None else percent(share) for share in shares),
                 *("none" if error is None else f"{1e3 * error:.1f}" for error in errors),
                 f"{figures['mean_moves']:.1f}",
             )
@@ -392,20 +424,20 @@ def _inspection_cells(
 
 def compare_rows(
     results: Mapping[str, Sequence[EpisodeRecord]], seeable: Mapping[int, set[int]]
-) -> list[str]:
-    """One line for every two policies: paired differences over the rows, each row counting once."""
-    lines = []
+) -> list[tuple[str, ...]]:
+    """One line with `PAIRED_HEAD` for every two policies."""
+    lines: list[tuple[str, ...]] = []
     for a, b in combinations(results, 2):
         pairs = list(zip(results[a], results[b], strict=True))
-        parts = []
-        for what, values in (
-            ("share seen", [_seen_share(x, seeable) - _seen_share(y, seeable) for x, y in pairs]),
-            ("moves", [float(searched(x).moves - searched(y).moves) for x, y in pairs]),
+        cells = []
+        for values in (
+            [_seen_share(x, seeable) - _seen_share(y, seeable) for x, y in pairs],
+            [float(searched(x).moves - searched(y).moves) for x, y in pairs],
         ):
             low, high = mean_interval(values)
             mean = sum(values) / len(values)
-            parts.append(f"{what} {mean:+.3f} ({low:+.3f} to {high:+.3f}, p = {sign_flip_p(values):.3f})")
-        lines.append(f"{a} less {b}: {', '.join(parts)}")
+            cells += [f"{mean:+.3f}", f"{low:+.3f} to {high:+.3f}", f"{sign_flip_p(values):.3f}"]
+        lines.append((f"{a} minus {b}", *cells))
     return lines
 
 

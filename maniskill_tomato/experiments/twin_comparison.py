@@ -5,7 +5,7 @@ import shlex
 import time
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any
+from typing import Any, Final
 
 import gymnasium as gym
 import numpy as np
@@ -27,9 +27,50 @@ from maniskill_tomato.folder_lock import only_writer
 from maniskill_tomato.learning.rl.envs import make_env
 from maniskill_tomato.plants.mesh_set import ALL
 from maniskill_tomato.policies.opening import open_policy
-from maniskill_tomato.report_design import figure, percent, report, section, table, tile, tiles
+from maniskill_tomato.report_design import figure, paragraph, percent, report, section, table, tile, tiles
 from maniskill_tomato.report_plots import plot_intervals
 from maniskill_tomato.run_facts import run_facts
+
+FIGURES: Final = {
+    "twin_success": "successes of the twin",
+    "twin_interval_95": "share of successes of the twin, 95 % interval (Wilson)",
+    "twin_success_and_truly_visible": "successes of the twin with the target truly visible",
+    "truly_visible_share_of_success": "their share of the twin's successes",
+    "truly_visible_share_interval_95": "its 95 % interval (Wilson)",
+    "simulation_success": "successes in the simulated task",
+    "simulation_interval_95": "share of successes in the simulated task, 95 % interval (Wilson)",
+    "only_twin": "episodes that only the twin solved",
+    "only_simulation": "episodes that only the simulated task solved",
+    "mcnemar_p": "p of McNemar's exact test",
+    "reasons": "how the twin's runs ended",
+    "failed": "episodes in which the twin failed",
+    "false_success": "episodes in which the twin's success was not truly visible",
+    "simulation_failed": "episodes in which the simulated task failed",
+    "twin_moves_of_successes": "moves of a success of the twin, mean",
+    "simulation_moves_of_successes": "moves of a success in the simulated task, mean",
+    "refused_share_of_moves": "share of the twin's moves that were refused",
+    "simulation_contact_share_of_episodes": "share of simulated episodes in which the arm touched the plant",
+    "stage_ms_mean": "wall time of each part of a look and its move, mean [ms]",
+    "stage_ms_p95": "the same, 95th percentile [ms]",
+    "looks": "looks of the twin",
+    "cpu_seconds_a_run": "processor time of a run, mean [s]",
+    "cpu_seconds_a_row": "processor time of a row, mean [s]",
+    "device_seconds_median": "time of a run by the twin's clock, median [s]",
+    "device_seconds_a_row": "time of a row by the twin's clock, mean [s]",
+    "seeable": "ripe fruits that the arm can see fully",
+    "seen": "of these, listed as fully seen and truly seen",
+    "listed_as_ripe": "fruits listed as ripe",
+    "right": "of these, ripe and listed once",
+    "recall": "recall: seen of the seeable",
+    "precision": "precision: right of those listed as ripe",
+    "full_precision": "share of those listed as ripe and fully seen that are both",
+    "position_error_median_m": "error of the place, median [m]",
+    "radius_error_median_m": "error of the radius, median [m]",
+    "recall_interval_95": "recall, 95 % interval over the rows",
+    "precision_interval_95": "precision, 95 % interval over the rows",
+    "mean_moves": "moves of a row, mean",
+}
+"""What the entries of a summary are."""
 
 
 def compare_twin(config: TwinConfig, tell: Callable[[str], None] = lambda line: None) -> dict[str, Any]:
@@ -93,7 +134,7 @@ def _write_report(
         for name in ("twin", "simulation")
     }
     plot = config.out / "success.png"
-    plot_intervals(rates, "Success on the same episodes", "share of episodes", plot)
+    plot_intervals(rates, "Success on the same episodes", "share of episodes", plot, (0.0, 1.0))
     low, high = summary["twin_interval_95"]
     report(
         config.out,
@@ -110,16 +151,31 @@ def _write_report(
                 ),
                 tile(percent(rates["simulation"][0]), "solved in the simulated task", of),
                 tile(
-                    f"p {summary['mcnemar_p']:.2g}",
-                    "that both are alike (McNemar)",
-                    f"{of}; only the twin: {summary['only_twin']}, only the task: {summary['only_simulation']}",
+                    f"p = {summary['mcnemar_p']:.2g}",
+                    "McNemar's test of the difference",
+                    f"{of}; solved by the twin only: {summary['only_twin']}, by the task only: "
+                    f"{summary['only_simulation']}",
                 ),
+            ),
+            paragraph(
+                "The twin is the program of the robot, with a simulated arm and a simulated depth camera; the "
+                "simulated task is what policies are trained and benchmarked on. Both run the same episodes with the "
+                "same policy. The difference is what perception, depth noise, the arm's dynamics and the safety "
+                "checks cost. An episode of the twin is a success when the robot believes that the target is fully "
+                "visible; truly visible is what rays to the target say."
             ),
             section(
                 "Success",
                 figure(plot, f"Share of episodes solved (0 to 1), with 95 % intervals (Wilson); {of} each."),
             ),
-            section("Episodes, failures first", episode_list([_listed(config, one) for one in episodes])),
+            section(
+                "Episodes of the twin, failures first",
+                paragraph(
+                    "A success in which the target was not truly visible is listed as failed. V_f (0 to 1) is what the "
+                    "robot measured. The command runs the episode again."
+                ),
+                episode_list([_listed(config, one) for one in episodes]),
+            ),
             figures_section(summary, of),
         ],
         run_facts(),
@@ -171,8 +227,12 @@ def figures_section(summary: Mapping[str, Any], of: str) -> str:
             return ", ".join(told(one) for one in value)
         return "none" if value is None else str(value)
 
-    rows = [(name.replace("_", " "), told(value)) for name, value in summary.items()]
-    return section(f"All figures, {of}", table(("figure", "value"), rows, words=(1,)))
+    rows = [
+        (FIGURES.get(name, name.replace("_", " ")), told(value))
+        for name, value in summary.items()
+        if value not in ([], {})
+    ]
+    return section(f"All figures, {of}", table(("figure", "value"), rows, words=(0, 1)))
 
 
 def twin_store(config: TwinConfig, profile: Profile) -> tuple[ResultStore, str]:

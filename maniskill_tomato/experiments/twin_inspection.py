@@ -99,6 +99,10 @@ def _write_report(
         "Rows inspected by the twin",
         f"{len(rows)} rows from {config.seed}, profile {profile.name}",
         [
+            paragraph(
+                "The twin is the program of the robot, with a simulated arm and a simulated depth camera. It looks at "
+                "every ripe fruit of a row and lists what it found; the truth judges the list."
+            ),
             tiles(
                 share(
                     "recall",
@@ -112,8 +116,11 @@ def _write_report(
             ),
             section(
                 "Rows, failures first",
-                paragraph("A row is solved when every seeable ripe fruit was truly seen fully."),
-                episode_list(listed),
+                paragraph(
+                    "A row is solved when every seeable ripe fruit was truly seen fully. A fruit is seeable if the "
+                    "arm can take a place from which it is fully visible. The command inspects the row again."
+                ),
+                episode_list(listed, noun="row"),
             ),
             figures_section(summary, of),
         ],

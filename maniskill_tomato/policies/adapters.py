@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from maniskill_tomato.errors import PolicyError
-from maniskill_tomato.policies.protocol import Planner, Policy, StatePolicy
+from maniskill_tomato.policies.protocol import Planner, Policy, StatePolicy, reseed
 from maniskill_tomato.sensing.belief import Belief
 
 if TYPE_CHECKING:
@@ -26,6 +26,9 @@ class ObservationPolicy(Planner):
         """
         self.policy = policy
         self.name = name
+
+    def reseed(self, seed: int) -> None:
+        reseed(self.policy, seed)
 
     def act(self, belief: Belief | Tensor) -> Tensor:
         """The actions for beliefs, or for observations of shape (B, D). Shape (B, A)."""

@@ -53,7 +53,10 @@ class RandomStep(RandomPlanner):
 
 
 class RandomIncrements:
-    """A state policy of the thesis's tasks: uniformly random actions from the ranges of Eq. 5-6."""
+    """A state policy of the thesis's tasks: uniformly random actions from the ranges of Eq. 5-6.
+
+    One stream of random numbers runs through all episodes, so that an episode depends on those before it.
+    """
 
     def __init__(self, seed: int, device: torch.device | str = "cpu") -> None:
         self._generator = torch.Generator(device=device).manual_seed(seed)

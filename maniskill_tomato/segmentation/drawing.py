@@ -2,9 +2,11 @@
 
 import colorsys
 from collections.abc import Sequence
+from typing import Any
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 
 from maniskill_tomato.segmentation.instances import Image, Instances
 
@@ -33,6 +35,24 @@ def draw_instances(image: Image, found: Instances, least_score: float = 0.0) -> 
         cv2.putText(
             drawn, label, place, cv2.FONT_HERSHEY_SIMPLEX, 0.35 * thickness, (255, 255, 255), thickness
         )
+    return drawn
+
+
+def mark_boxes(image: Image, boxes: NDArray[np.floating[Any]], word: str) -> Image:
+    """The image with a white frame and a word at each box.
+
+    Args:
+        image: Red, green, blue. Shape (H, W, 3).
+        boxes: Left, top, right, bottom, in [px]. Shape (N, 4).
+        word: What the boxes are.
+    """
+    drawn = image.copy()
+    thickness = max(1, round(max(image.shape[:2]) / 500))
+    for left, top, right, bottom in np.rint(boxes).astype(int).tolist():
+        for colour, width in (((0, 0, 0), 3 * thickness), ((255, 255, 255), thickness)):
+            cv2.rectangle(drawn, (left, top), (right - 1, bottom - 1), colour, width)
+            place = left, min(bottom + 9 * thickness, image.shape[0] - 2)
+            cv2.putText(drawn, word, place, cv2.FONT_HERSHEY_SIMPLEX, 0.35 * thickness, colour, width)
     return drawn
 
 

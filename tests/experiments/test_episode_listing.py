@@ -103,6 +103,14 @@ def test_the_reason_says_what_ended_the_episode_and_what_hindered_the_arm() -> N
     assert reason(replace(ran_out, row=row), 0.8, HORIZON) == "1 of 3 tomatoes seen when moves ran out"
 
 
+def test_a_robot_that_ends_the_search_of_a_row_too_early_has_failed() -> None:
+    row = RowSearch(targets=(1, 2, 4), seen=(2, 7), moves=40, transits=2, path_m=1.0, joint_path_rad=3.0)
+    early = list_episode(replace(record(0, [0.1, 0.9], True), row=row), 0.8, None, None)
+    assert (early.success, early.reason) == (False, "1 of 3 tomatoes seen when the robot ended its search")
+    whole = replace(row, seen=(1, 2, 4))
+    assert list_episode(replace(record(0, [0.1, 0.9], True), row=whole), 0.8, None, None).success
+
+
 def test_where_a_camera_decides_success_and_visible_fraction_are_the_true_ones() -> None:
     wrong = list_episode(with_camera(1, [0.1, 0.9], [0.1, 0.2], True, chosen=5), 0.8, HORIZON, None)
     assert (wrong.success, wrong.reason, wrong.best) == (False, "it looked at another fruit", 0.2)
@@ -148,21 +156,32 @@ def test_the_command_is_read_back_as_the_same_task(env_id: str, options: dict[st
 def test_options_without_a_flag_give_no_command() -> None:
     for options in (
         {},  # `eval` takes the held-out list.
-        {"episodes": "held_out", "plant": {"mesh": "folder"}},
+        {"episodes": "held_out", "plant": {"mesh": "folder", "units": "cm"}},
         {"episodes": "held_out", "sensor_noise": {"depth_noise": 1.0}},
     ):
         assert replay_with_eval("TomatoViewpoint-v1", "nbv", 0, options) is None
 
 
+def test_random_actions_of_the_thesis_s_tasks_have_no_such_command_and_the_page_says_why(
+    tmp_path: Path,
+) -> None:
+    words = ["--policy", "random", "--episodes", "1", "--no-video", "--no-baseline", "--out", str(tmp_path)]
+    main(["eval", "TomatoViewpointGuided-v1", *words])
+    page = (tmp_path / "report.html").read_text()
+    assert "one of them alone has other actions" in page and lines(page)[0][6] == ""
+    assert "runs/again" not in page
+
+
+@pytest.mark.parametrize("policy", ["nbv", "random_viewpoint"])
 def test_the_command_of_the_list_runs_the_same_episode_again(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, policy: str
 ) -> None:
     monkeypatch.chdir(tmp_path)
     first = [
         "eval",
         "TomatoViewpoint-v1",
         "--policy",
-        "nbv",
+        policy,
         "--episodes",
         "3",
         "--seed",

@@ -291,3 +291,26 @@ def test_without_vulkan_an_evaluation_still_reports_and_names_the_remedy(
     assert "make vulkan" in result.report.read_text()
     assert json.loads((tmp_path / "metrics.json").read_text())["success_rate"] == 1.0
     assert not list(tmp_path.glob("*.mp4"))
+
+
+@pytest.mark.parametrize("reseeds", [True, False])
+def test_an_episode_of_random_actions_is_the_same_by_itself_as_after_others(reseeds: bool) -> None:
+    class Draws:
+        """Random actions, seeded anew for every episode or not."""
+
+        def __init__(self) -> None:
+            self._random = np.random.default_rng(0)
+            if reseeds:
+                self.reseed = self._begin_anew
+
+        def _begin_anew(self, seed: int) -> None:
+            self._random = np.random.default_rng(seed)
+
+        def act(self, observations: Tensor) -> Tensor:
+            return torch.from_numpy(self._random.uniform(-0.05, 0.2, (len(observations), 6))).float()
+
+    def rewards(first: int, count: int) -> list[float]:
+        env = cast("gym.Env[Any, Any]", SeededTask(1))
+        return [float(e.rewards.sum()) for e in run_episodes(env, as_policy(Draws()), count, first)]
+
+    assert (rewards(3, 1)[0] == rewards(1, 3)[2]) == reseeds

@@ -1,11 +1,13 @@
 """Errors of occlusion models on annotated images, summed up."""
 
+import re
 from pathlib import Path
 
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from maniskill_tomato.experiments.occlusion_report import report_occlusion
 from maniskill_tomato.experiments.occlusion_scores import Judged, by_band, judge, markdown, score
 from maniskill_tomato.robot.d435 import color_intrinsics
 from maniskill_tomato.segmentation.datasets.annotations import AnnotatedImage, CameraView, Instance
@@ -94,3 +96,27 @@ def test_fruits_that_a_segmenter_misses_are_failures_and_the_others_are_measured
     found = [np.roll(masks[0], 25, axis=1), masks[1]]
     judged, _ = judge((image,), {"sphere": SphereModel()}, segmenter=segmenter, min_total=0)
     assert np.isnan(judged[0].estimate) and np.isfinite(judged[1].estimate)
+
+
+def test_the_page_lists_the_largest_errors_first_and_says_what_went_wrong(tmp_path: Path) -> None:
+    image, _ = discs(tmp_path)
+    models = ("thesis", "sphere")
+    report_occlusion(
+        [image],
+        tmp_path / "out",
+        models=models,
+        categories=("tomato_ripe",),
+        min_visible=100,
+        min_total=400,
+    )
+    page = (tmp_path / "out" / "report.html").read_text()
+    listed = page[page.index("Largest errors, 6 of n = 6 estimates") :]
+    rows = [
+        re.findall(r"<td[^>]*>(.*?)</td>", row)
+        for row in re.findall(r'<tr><th scope="row">a.png.*?</tr>', listed)
+    ]
+    # The thesis's model looks for red, of which the picture has none.
+    assert [(model, why) for model, _, why, *_ in rows[:3]] == [("thesis", "no estimate")] * 3
+    errors = [abs(float(row[4].replace("none", "0")) - float(row[3])) for row in rows]
+    assert len(rows) == 6 and errors == sorted(errors, reverse=True)
+    assert {row[0] for row in rows[3:]} == {"sphere"} and errors[3] < 0.2

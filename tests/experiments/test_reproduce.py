@@ -332,7 +332,7 @@ def test_an_ablation_writes_a_table_and_names_unknown_variants(tmp_path: Path) -
     variants = ("exact", "tau-0.01+gamma-0.9")
     run_reproduction(reproduction(tmp_path, ablate=True, variant=variants))
     page = (tmp_path / "guided" / "report.html").read_text()
-    rows = re.findall(r'<th scope="row">(.*?)</th>', page)
+    rows = re.findall(r'<th scope="row"[^>]*>(.*?)</th>', page)
     assert len(rows) == 2 and rows[1] == "tau 0.01, not 0.001; gamma 0.9, not 0.99"
     assert [path.name for path in tmp_path.rglob("*.png")] == ["success.png"]
     with pytest.raises(InvalidInputError, match="variant of guided must be one of 'exact'"):

@@ -283,7 +283,13 @@ def test_of_the_row_in_front_ap_over_all_overlaps_and_ar_are_told_too(tmp_path: 
             )
 
     images = [right_one_behind(image) for image in drawn_set(tmp_path / "set")]
-    metrics = evaluate_segmenter(FindsTheLeftHalf(), images, tmp_path / "out")
+    done: list[int] = []
+    evaluation = evaluate_segmenter(FindsTheLeftHalf(), images, tmp_path / "out", on_image=done.append)
+    metrics = evaluation.metrics
+    assert done == [1, 1, 1]
+    # The third image, of which nothing was found, comes first.
+    errors = [(judged.file_name, judged.fruits, judged.missed, judged.false) for judged in evaluation.worst]
+    assert errors == [(images[k].file_name, 2, missed, 0) for k, missed in ((2, 2), (0, 1), (1, 1))]
     # Two of the three in front, two of all six, each with an overlap of 1.
     assert metrics["front_fruits"] == 3
     assert metrics["coco_front_box_AR100"] == metrics["coco_front_mask_AR100"] == pytest.approx(2 / 3)

@@ -45,7 +45,7 @@ def plot_precision_recall(curves: Mapping[str, PrecisionRecall], path: Path) -> 
 
 
 def plot_overlaps(precision: Mapping[str, Mapping[str, NDArray[np.float64]]], path: Path) -> None:
-    """AP over the overlap that is asked for, one panel for boxes and one for masks, with a curve for each size.
+    """AP over the overlap that is asked for, a panel for boxes and one below for masks, with a curve for each size.
 
     Args:
         precision: Of boxes or masks, what `DetectionScore.precision_by_overlap` gives.
@@ -55,8 +55,8 @@ def plot_overlaps(precision: Mapping[str, Mapping[str, NDArray[np.float64]]], pa
         CheckpointError: The file cannot be written.
     """
     with mpl.rc_context(PLOT_STYLE):
-        figure = Figure(figsize=(PANEL[0] * len(precision), PANEL[1] + 0.2))
-        panels = figure.subplots(1, len(precision), squeeze=False)[0]
+        figure = Figure(figsize=(PANEL[0], PANEL[1] * len(precision)))
+        panels = figure.subplots(len(precision), 1, squeeze=False)[:, 0]
         for axes, (overlap, sizes) in zip(panels, precision.items(), strict=True):
             for index, (size, values) in enumerate(sizes.items()):
                 label = f"{size}, AP50-95 {values.mean():.3f}"

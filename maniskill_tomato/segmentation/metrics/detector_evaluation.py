@@ -1,19 +1,24 @@
 """Evaluation of a segmenter on annotated images: metrics, curves, pictures."""
 
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+import torch
+from numpy.typing import NDArray
 
 from maniskill_tomato.errors import InvalidInputError
 from maniskill_tomato.segmentation.datasets.annotations import BEHIND, SMALLEST_SHARE, AnnotatedImage
 from maniskill_tomato.segmentation.datasets.picture_files import write_picture
-from maniskill_tomato.segmentation.drawing import contact_sheet, draw_instances
-from maniskill_tomato.segmentation.instances import Image
+from maniskill_tomato.segmentation.drawing import contact_sheet, draw_instances, mark_boxes
+from maniskill_tomato.segmentation.instances import Image, Instances
 from maniskill_tomato.segmentation.metrics.detection_metrics import (
     COCO_SIZES,
     DetectionScore,
+    ImageTruth,
     Overlap,
     PrecisionRecall,
     image_truth,
@@ -28,14 +33,43 @@ PICTURES = 16
 WORKING_SCORE = 0.3
 """Score above which precision and recall are also given."""
 
+SAME_FRUIT = 0.5
+"""Intersection over union of two boxes from which on a detection is that fruit."""
+
+WORST = 6
+"""Pictures with the most errors that are kept."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class JudgedPicture:
+    """What went wrong in an image above `WORKING_SCORE`, by boxes."""
+
+    file_name: str
+    fruits: int
+    """That were to be found."""
+    missed: int
+    false: int
+    """Detections that are no fruit, or one that another detection has found."""
+    picture: Image
+    """With what was found, and a frame round what was missed."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class SegmenterEvaluation:
+    """What `evaluate_segmenter` found."""
+
+    metrics: dict[str, float]
+    worst: tuple[JudgedPicture, ...]
+    """Images with the most errors first; at most `WORST`."""
+
 
 def evaluate_segmenter(
     segmenter: Segmenter,
     images: Sequence[AnnotatedImage],
     out: Path,
-    limit: int | None = None,
     smallest_share: float = SMALLEST_SHARE,
-) -> dict[str, float]:
+    on_image: Callable[[int], object] | None = None,
+) -> SegmenterEvaluation:
     """Runs a segmenter over images and compares with their annotation; all fruits count, ripe or not.
 
     Writes `precision_recall.png` (Fig. 4-20, 4-24), `overlaps.png` (AP over the overlap, by size) and `pictures.jpg`
@@ -45,14 +79,15 @@ def evaluate_segmenter(
         segmenter: What to judge.
         images: Annotated images.
         out: Folder of the figures.
-        limit: Use this many images only, spread evenly.
         smallest_share: Rendered fruits narrower than this share of the image's longer side are set aside, and
             narrower detections where there is no other fruit.
+        on_image: Called with 1 after every image.
 
     Returns:
-        `box_AP50` and `mask_AP50` (Eq. 4-3 at an overlap of 0.5), precision and recall at `WORKING_SCORE`, COCO's
-        metrics as `coco_box_...` and `coco_mask_...` (`COCO_NAMES`), counts, seconds an image; in rendered images with
-        rows behind also `front_box_AP50`, `coco_front_box_...` and so on, of the fruits of the row in front alone.
+        The worst images, and as metrics `box_AP50` and `mask_AP50` (Eq. 4-3 at an overlap of 0.5), precision and recall
+        at `WORKING_SCORE`, COCO's metrics as `coco_box_...` and `coco_mask_...` (`COCO_NAMES`), counts, seconds an
+        image; in rendered images with rows behind also `front_box_AP50`, `coco_front_box_...` and so on, of the fruits
+        of the row in front alone.
 
     Raises:
         InvalidInputError: There is no image, or one cannot be read.
@@ -60,10 +95,9 @@ def evaluate_segmenter(
     """
     if not images:
         raise InvalidInputError("there must be annotated images to evaluate on")
-    if limit is not None:
-        images = [images[i] for i in np.linspace(0, len(images) - 1, min(limit, len(images))).astype(int)]
     sheet = set(np.linspace(0, len(images) - 1, min(PICTURES, len(images))).astype(int).tolist())
     drawn: list[Image] = []
+    worst: list[JudgedPicture] = []
     with_masks = all(f.visible_mask is not None for image in images for f in image.fruits)
     overlaps: tuple[Overlap, ...] = ("box", "mask") if with_masks else ("box",)
     scores: dict[Overlap, DetectionScore] = {overlap: DetectionScore(overlap) for overlap in overlaps}
@@ -83,8 +117,13 @@ def evaluate_segmenter(
         nearby = image_truth(image, smallest_share, rows_behind=False)
         for score in front.values():
             score.add(without_narrow(found, nearby), nearby)
+        shown = draw_instances(picture, found, WORKING_SCORE)
         if number in sheet:
-            drawn.append(draw_instances(picture, found, WORKING_SCORE))
+            drawn.append(shown)
+        worst.append(_judged(image.file_name, shown, counted, truth))
+        worst = sorted(worst, key=lambda judged: -(judged.missed + judged.false))[:WORST]
+        if on_image is not None:
+            on_image(1)
     metrics: dict[str, float] = {"images": len(images), "fruits": scores["box"].fruits}
     curves: dict[str, PrecisionRecall] = {}
     for overlap, score in scores.items():
@@ -107,7 +146,37 @@ def evaluate_segmenter(
     plot_precision_recall(curves, out / "precision_recall.png")
     plot_overlaps({k: score.precision_by_overlap() for k, score in scores.items()}, out / "overlaps.png")
     write_picture(out / "pictures.jpg", contact_sheet(drawn))
-    return metrics
+    return SegmenterEvaluation(metrics=metrics, worst=tuple(worst))
+
+
+def chosen_images(images: Sequence[AnnotatedImage], limit: int | None) -> Sequence[AnnotatedImage]:
+    """At most `limit` of the images, spread evenly."""
+    if limit is None:
+        return images
+    return [images[i] for i in np.linspace(0, len(images) - 1, min(limit, len(images))).astype(int)]
+
+
+def match_boxes(
+    found: NDArray[np.floating[Any]], fruits: NDArray[np.floating[Any]]
+) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+    """Which detections are a fruit each, and which fruits were found; each detection takes the one it overlaps most.
+
+    Args:
+        found: Boxes of detections, the surest first, as left, top, right, bottom in [px]. Shape (D, 4).
+        fruits: Boxes of fruits. Shape (N, 4).
+
+    Returns:
+        Shapes (D,) and (N,).
+    """
+    from torchvision.ops import box_iou
+
+    overlaps = box_iou(torch.as_tensor(found).double(), torch.as_tensor(fruits).double()).numpy()
+    true, seen = np.zeros(len(found), bool), np.zeros(len(fruits), bool)
+    for row, each in enumerate(overlaps):
+        free = np.where(seen, 0.0, each)
+        if len(free) and free.max() >= SAME_FRUIT:
+            true[row] = seen[free.argmax()] = True
+    return true, seen
 
 
 def coco_cells(metrics: Mapping[str, float]) -> tuple[list[str], list[list[str]]]:
@@ -129,4 +198,20 @@ def coco_table(metrics: Mapping[str, float]) -> str:
     head, rows = coco_cells(metrics)
     return "\n".join(
         f"{first:10}" + "".join(f"{text:>11}" for text in rest) for first, *rest in (head, *rows)
+    )
+
+
+def _judged(file_name: str, drawn: Image, found: Instances, truth: ImageTruth) -> JudgedPicture:
+    """The errors of an image; what lies on a fruit that is set aside is none."""
+    sure = found.scores >= WORKING_SCORE
+    order = np.flatnonzero(sure)[np.argsort(-found.scores[sure], kind="stable")]
+    boxes, fruits = found.boxes[order], truth.boxes[~truth.ignored]
+    true, seen = match_boxes(boxes, fruits)
+    aside, _ = match_boxes(boxes[~true], truth.boxes[truth.ignored])
+    return JudgedPicture(
+        file_name=file_name,
+        fruits=len(fruits),
+        missed=int((~seen).sum()),
+        false=int((~aside).sum()),
+        picture=mark_boxes(drawn, fruits[~seen], "missed"),
     )

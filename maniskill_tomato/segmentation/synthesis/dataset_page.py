@@ -9,6 +9,7 @@ import cv2
 import matplotlib as mpl
 import numpy as np
 from matplotlib.figure import Figure
+from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 
 from maniskill_tomato.report_design import (
@@ -17,7 +18,7 @@ from maniskill_tomato.report_design import (
     many_small,
     paragraph,
     percent,
-    photo,
+    pixels,
     report,
     section,
     side_by_side,
@@ -71,9 +72,10 @@ def write_statistics(images: AnnotatedImages, folder: Path) -> Path:
                 "Sample pictures",
                 many_small(*(_sample(image) for image in _spread(images.images, SAMPLES))),
                 paragraph(
-                    f"Visible fruits in colour (red ripe, yellow turning, green unripe), whole fruits thin and white; "
-                    f"{min(SAMPLES, len(images.images))} of n = {len(images.images)} images. contact_sheet.jpg beside "
-                    f"this page has {len(shown)}.",
+                    f"The visible part of each fruit has a thick outline (red: ripe, yellow: turning, green: unripe), "
+                    "the whole fruit, hidden parts included, a thin white one; "
+                    f"{min(SAMPLES, len(images.images))} of n = {len(images.images)} images. contact_sheet.jpg "
+                    f"beside this page has {len(shown)}.",
                     "caption",
                 ),
             ),
@@ -107,18 +109,14 @@ def _tiles(images: AnnotatedImages, fruits: Sequence[Instance], seen: Sequence[I
         tile(
             f"{len(fruits) - len(seen)} fruits",
             "of the front row wholly hidden",
-            f"n = {len(fruits)} fruits; in the amodal file only",
+            f"n = {len(fruits)} fruits; annotated in annotations_amodal.json only",
         ),
     )
 
 
 def _sample(image: AnnotatedImage) -> str:
     """An image with its outlines as a small figure."""
-    picture = outlined(image)
-    size = (SAMPLE_WIDTH, round(SAMPLE_WIDTH * picture.shape[0] / picture.shape[1]))
-    small = cv2.resize(picture, size, interpolation=cv2.INTER_AREA)
-    _, packed = cv2.imencode(".jpg", small[..., ::-1], (cv2.IMWRITE_JPEG_QUALITY, 85))
-    return photo(packed.tobytes(), f"{len(image.fruits)} visible fruits")
+    return pixels(outlined(image), f"{len(image.fruits)} visible fruits", SAMPLE_WIDTH)
 
 
 def _plots(
@@ -128,13 +126,28 @@ def _plots(
     fractions = [i.visible_fraction for i in fruits if i.visible_fraction is not None]
     sides = [_side(i.box_xywh) for i in seen]
     per_image = [len(image.fruits) for image in images.images]
-    wanted: list[tuple[str, list[Any], Any, str, str]] = [
-        ("visible_fraction", fractions, np.linspace(0, 1, 21), "visible fraction V_f", "fruits"),
-        ("size", sides, np.geomspace(4, 400, 24), "size of visible boxes [px]", "fruits"),
-        ("per_image", per_image, np.arange(max(per_image, default=1) + 2) - 0.5, "visible fruits", "images"),
+    counts = np.arange(max(per_image, default=1) + 2) - 0.5
+    wanted: list[tuple[str, list[Any], Any, str, str, str]] = [
+        (
+            "visible_fraction",
+            fractions,
+            np.linspace(0, 1, 21),
+            "visible fraction V_f (0 to 1)",
+            "fruits",
+            "Share of a fruit that the camera sees, from 0 (wholly hidden) to 1",
+        ),
+        (
+            "size",
+            sides,
+            np.geomspace(4, 400, 24),
+            "size of visible boxes [px]",
+            "fruits",
+            "Size of the box round what is visible of a fruit, the root of its area, in px",
+        ),
+        ("per_image", per_image, counts, "visible fruits", "images", "Fruits that are visible in an image"),
     ]
     shown = []
-    for name, values, bins, label, unit in wanted:
+    for name, values, bins, label, unit, caption in wanted:
         if not values:
             continue
         path = folder / f"histogram_{name}.png"
@@ -143,10 +156,11 @@ def _plots(
             axes = canvas.subplots()
             axes.hist(values, bins=bins, color=LEAF)
             axes.set(xlabel=label, ylabel=unit, title=label[0].upper() + label[1:])
+            axes.yaxis.set_major_locator(MaxNLocator(integer=True))
             if name == "size":
                 axes.set_xscale("log")
             save_figure(canvas, path)
-        shown.append(figure(path, f"{label[0].upper()}{label[1:]}; n = {len(values)} {unit}."))
+        shown.append(figure(path, f"{caption}; n = {len(values)} {unit}."))
     return shown
 
 
