@@ -45,15 +45,19 @@ class PlantOptions:
                 f"plant_seed must be a number or one of {', '.join(splits)}; got {self.plant_seed!r}"
                 f"{did_you_mean(self.plant_seed, splits)}"
             )
-        if self.mesh is not None and not self.mesh.exists():
-            raise InvalidInputError(f"--mesh: there is no file or folder {self.mesh}")
         if self.mesh is not None and self.plant is not None:
             raise InvalidInputError("--mesh goes without --plant: its plants are read, not grown")
         if self.plant_pool is not None and self.plant_pool < 1:
             raise InvalidInputError(f"plant_pool must be 1 or more, got {self.plant_pool}")
 
     def env_options(self) -> dict[str, Any]:
-        """The options for `gymnasium.make`."""
+        """The options for `gymnasium.make`.
+
+        Raises:
+            InvalidInputError: There is no such mesh.
+        """
+        if self.mesh is not None and not self.mesh.exists():
+            raise InvalidInputError(f"--mesh: there is no file or folder {self.mesh}")
         plant: dict[str, Any] = {}
         if self.plant is not None:
             plant["preset"] = self.plant
