@@ -147,7 +147,7 @@ def evaluation_note(groups: Sequence[Group]) -> str:
     if len(used) > 1:
         parts.append("These are different episodes, so that small differences mean nothing.")
     if used and missing:
-        parts.append(f"Not evaluated: {missing} of the runs.")
+        parts.append(f"Not evaluated: {missing} of the runs. --evaluate 100 judges them.")
     return " ".join(parts)
 
 
@@ -260,7 +260,7 @@ def _page(
             group.env_id,
             group.label,
             str(run.seed),
-            "not evaluated" if run.metrics is None else f"{run.metrics['success_rate']:.1%}",
+            "not evaluated" if run.metrics is None else percent(run.metrics["success_rate"]),
             "not evaluated" if run.metrics is None else f"{run.metrics['mean_steps']:.2f}",
             "not known" if run.training_steps is None else f"{run.training_steps:,}",
             "not logged" if run.training_seconds is None else f"{run.training_seconds:.0f} s",
