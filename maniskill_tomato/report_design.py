@@ -81,6 +81,7 @@ main { padding-bottom: 40px; }
 section { margin-top: 38px; }
 h2 { margin: 0 0 10px; font-size: 20px; }
 p { margin: 0 0 14px; max-width: 72ch; }
+main > p { margin-top: 26px; }
 a { color: var(--link); }
 code { font: 13px/1.5 ui-monospace, SFMono-Regular, Menlo, Consolas, monospace; user-select: all; }
 .tiles { display: grid; grid-template-columns: repeat(auto-fit, minmax(205px, 1fr)); gap: 14px; }

@@ -110,7 +110,9 @@ def _write_report(
                     f"n = {summary['seeable']} fruits in {len(rows)} rows",
                 ),
                 share(
-                    "precision", "of the fruits listed as ripe are", f"n = {summary['listed_as_ripe']} fruits"
+                    "precision",
+                    "of the fruits listed as ripe are ripe, each once",
+                    f"n = {summary['listed_as_ripe']} fruits",
                 ),
                 tile(f"{summary['mean_moves']:.1f} moves", "a row, mean", of),
             ),
