@@ -8,7 +8,7 @@ from typing import Any, get_args
 import torch
 
 from maniskill_tomato.errors import InvalidInputError
-from maniskill_tomato.plants.episode_list import Episode
+from maniskill_tomato.plants.episode_list import Episode, listed_plant
 from maniskill_tomato.plants.spec import PlantPose, PlantSpec
 from maniskill_tomato.robot.d435 import CameraIntrinsics, color_intrinsics
 from maniskill_tomato.robot.viewpoint_move import OutsideWorkspace
@@ -289,7 +289,10 @@ def _search_setup(options: SearchOptions) -> TaskSetup:
     if options.contact_penalty is not None:
         task = replace(task, contact_penalty=float(options.contact_penalty))
     episodes = EpisodeChoice(options.episodes)
-    plant = PlantSpec.parse(options.plant, task.plant)
+    chosen = options.plant
+    if chosen is None and isinstance(options.episodes, str):
+        chosen = listed_plant(options.episodes)
+    plant = PlantSpec.parse(chosen, task.plant)
     if episodes.episodes is not None:
         plant = plant.of_any_seed(episodes.split)
     layout = options.layout

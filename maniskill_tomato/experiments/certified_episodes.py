@@ -206,7 +206,7 @@ def certified_list(
             "fruits in the arm's reach, and hidden from somewhere?"
         )
     path = folder / f"episodes_{count}.json"
-    write_episodes(path, turns)
+    write_episodes(path, turns, place.plant)
     facts = {
         "plants": f"{len(used) - barren} of {len(used)} ({place.split})",
         "oracle": LatticeOracle.name,

@@ -1,10 +1,11 @@
 """Fixed lists of episodes: which plant, where it stands, which target, where the camera starts, and who solves it."""
 
 import json
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass, fields
 from functools import cache
 from pathlib import Path
+from typing import Any
 
 from maniskill_tomato.assets import asset_path
 from maniskill_tomato.errors import InvalidInputError
@@ -72,6 +73,23 @@ def load_episodes(name: str) -> tuple[Episode, ...]:
     return read_episodes(episode_path(name))
 
 
+def listed_plant(name: str) -> dict[str, Any] | None:
+    """The option `plant` of the plants that a list was drawn on; None for the task's own.
+
+    Args:
+        name: As for `load_episodes`.
+
+    Raises:
+        InvalidInputError: There is no such list, or it names plants in another form.
+    """
+    path = episode_path(name)
+    content = read_json(path)
+    plant = content.get("plant") if isinstance(content, dict) else None
+    if plant is not None and not isinstance(plant, dict):
+        raise InvalidInputError(f"`plant` of {path} must be a table as the task option is, got {plant!r}")
+    return plant
+
+
 def read_episodes(path: Path) -> tuple[Episode, ...]:
     """The episodes of a file that `write_episodes` wrote.
 
@@ -90,7 +108,14 @@ def read_episodes(path: Path) -> tuple[Episode, ...]:
         ) from error
 
 
-def write_episodes(path: Path, episodes: Iterable[Episode]) -> None:
-    """Writes a list, one episode a line."""
+def write_episodes(path: Path, episodes: Iterable[Episode], plant: Mapping[str, Any] | None = None) -> None:
+    """Writes a list, one episode a line.
+
+    Args:
+        path: The file.
+        episodes: In order.
+        plant: The option `plant` of the plants that they were drawn on, where these are not the task's own.
+    """
     lines = ",\n".join(json.dumps(asdict(episode)) for episode in episodes)
-    write_atomically(path, f'{{"episodes": [\n{lines}\n]}}\n'.encode())
+    on = "" if plant is None else f'"plant": {json.dumps(dict(plant))},\n'
+    write_atomically(path, f'{{{on}"episodes": [\n{lines}\n]}}\n'.encode())

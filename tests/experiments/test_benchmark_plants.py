@@ -13,7 +13,7 @@ from maniskill_tomato.experiments.certified_episodes import certified_list, pars
 from maniskill_tomato.experiments.configs import BenchmarkConfig
 from maniskill_tomato.experiments.result_store import ResultStore
 from maniskill_tomato.experiments.viewpoint_benchmark import run_benchmark
-from maniskill_tomato.plants.episode_list import read_episodes
+from maniskill_tomato.plants.episode_list import load_episodes, read_episodes, write_episodes
 from maniskill_tomato.tasks.making import make_world
 
 
@@ -85,11 +85,20 @@ def test_plants_of_other_kinds_of_ours_grow_until_there_are_enough_episodes(tmp_
     seeds = [e.plant_seed for e in three]
     # One plant after the other, with two episodes at most on each, of the validation split.
     assert seeds == sorted(seeds) and 1_000_000 <= seeds[0] and max(map(seeds.count, seeds)) <= 2
-    world = make_world("TomatoViewpoint-v1", episodes=str(lists[1].path), plant=lists[1].plant)
+    # The list says on which plants it was drawn.
+    world = make_world("TomatoViewpoint-v1", episodes=str(lists[1].path))
     for number, episode in enumerate(three):
         world.reset(options={"episode": number})
         assert float(world.state.visible_fraction[0]) == pytest.approx(episode.start_visibility, abs=1e-4)
         assert world.state.visible_fraction[0] < 0.3
+
+
+def test_a_list_that_names_its_plants_wrongly_is_refused(tmp_path: Path) -> None:
+    write_episodes(tmp_path / "list.json", load_episodes("validation")[:1], {"preset": "other_kind"})
+    text = (tmp_path / "list.json").read_text()
+    (tmp_path / "list.json").write_text(text.replace('{"preset": "other_kind"}', '"other_kind"'))
+    with pytest.raises(InvalidInputError, match="`plant` of .* must be a table"):
+        make_world("TomatoViewpoint-v1", episodes=str(tmp_path / "list.json"))
 
 
 def test_plants_out_of_reach_are_told(tmp_path: Path) -> None:
