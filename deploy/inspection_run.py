@@ -1,7 +1,7 @@
 """The inspection of a row from a profile to its list: `inspection.json`, a picture a fruit, `report.png` and
 `report.html`."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any, Final
 
@@ -25,7 +25,7 @@ from maniskill_tomato.deploy.policy_run import (
 )
 from maniskill_tomato.deploy.robot_perception import ImagePerception
 from maniskill_tomato.deploy.row_goal import WholeRow
-from maniskill_tomato.deploy.run_records import Proposal, RunResult
+from maniskill_tomato.deploy.run_records import Proposal, Recorder, RunResult
 from maniskill_tomato.deploy.workcell import Workcell
 from maniskill_tomato.errors import InvalidInputError
 from maniskill_tomato.folder_lock import only_writer
@@ -55,6 +55,7 @@ def inspect_row(
     confirm: Callable[[Proposal], bool] = lambda proposal: False,
     clock: Clock | None = None,
     keyboard: bool = False,
+    recorders: Sequence[Recorder] = (),
 ) -> InspectionResult:
     """Connects, inspects, disconnects, and writes the list and the report; a run that was stopped too has a list.
 
@@ -64,6 +65,7 @@ def inspect_row(
         confirm: Asked before every move in the mode `confirm`.
         clock: Another clock than the profile's.
         keyboard: Whether keys in a terminal stop the run.
+        recorders: Keep every step, beside the recording.
 
     Raises:
         StoppedError: A signal came before the first look, when nothing had moved.
@@ -80,7 +82,7 @@ def inspect_row(
     goal = whole_row(prepared.workcell, row_moves)
     steps = StepFacts()
     with only_writer(config.out, "runs"):
-        result, facts = run_goal(config, prepared, goal, [steps], confirm, keyboard)
+        result, facts = run_goal(config, prepared, goal, [steps, *recorders], confirm, keyboard)
         return _report(config, prepared, goal, steps, result, facts)
 
 

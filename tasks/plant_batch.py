@@ -63,6 +63,13 @@ class PlantBatch:
     def show(self, seeds: Mapping[int, int]) -> dict[int, Plant]:
         """Gives environments the plants of seeds, by the environment's index, and returns the plants."""
         shown = {env_index: grow(self.spec, seed) for env_index, seed in seeds.items()}
+        self.put(shown)
+        rows = torch.tensor(list(shown), dtype=torch.int64, device=self._device)
+        self._state.plant_seed[rows] = torch.tensor(list(seeds.values()), device=self._device)
+        return shown
+
+    def put(self, shown: Mapping[int, Plant]) -> None:
+        """Gives environments plants that are not those of their seeds, by the environment's index."""
         fruits = max((len(plant.fruits) for plant in shown.values()), default=0)
         missing = max(fruits - self._fruit_centre_p.shape[1], 0)
         self._fruit_centre_p = pad(self._fruit_centre_p, (0, 0, 0, missing))
@@ -77,8 +84,6 @@ class PlantBatch:
         rows = torch.tensor(list(shown), dtype=torch.int64, device=self._device)
         self._fruit_centre_p[rows] = torch.as_tensor(centres, device=self._device)
         self._fruit_organ[rows] = torch.as_tensor(organs, device=self._device)
-        self._state.plant_seed[rows] = torch.tensor(list(seeds.values()), device=self._device)
-        return shown
 
     def place(self, env_idx: Tensor, pose: Tensor) -> None:
         """Puts the plants of some environments somewhere else.

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from maniskill_tomato.errors import InvalidInputError
+from maniskill_tomato.plants.organs import Plant
 from maniskill_tomato.plants.spec import PlantPose, PlantSpec
 from maniskill_tomato.raycast.scene import RayScene
 from maniskill_tomato.robot.d435 import CameraIntrinsics, T_flange_camera_color_optical
@@ -259,6 +260,28 @@ class World:
         new = {i: seed for i, seed in seeds.items() if seed != shown[i]}
         if new:
             self.scene.replace_plants(self.plant_batch.show(new))
+
+    def exchange_plants(self, plants: Mapping[int, Plant]) -> None:
+        """Goes on with altered forms of the plants that are shown, by the index of the environment.
+
+        All that was seen of the targets is seen again, from where the arms looked. An episode that begins later has the
+        altered plant too, unless it has another seed.
+
+        Args:
+            plants: With as many fruits as before.
+
+        Raises:
+            InvalidInputError: A plant has other fruits.
+        """
+        for i, plant in plants.items():
+            before = len(self.plant_batch.plants[i].fruits)
+            if len(plant.fruits) != before:
+                raise InvalidInputError(
+                    f"the plant of environment {i} must have {before} fruits, got {len(plant.fruits)}"
+                )
+        self.plant_batch.put(plants)
+        self.scene.replace_plants(plants)
+        self._recall(torch.tensor(list(plants), dtype=torch.int64, device=self.device))
 
     def place_plants(self, env_idx: Tensor, poses: NDArray[np.float64]) -> None:
         """Puts plants at x, y [m] and yaw [rad]. Shape (b, 3)."""

@@ -3,6 +3,7 @@
 import contextlib
 import math
 import sys
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -22,7 +23,7 @@ from maniskill_tomato.view.page_address import check_port
 
 if TYPE_CHECKING:
     from maniskill_tomato.deploy.policy_run import RunConfig
-    from maniskill_tomato.deploy.run_records import Proposal, RunResult
+    from maniskill_tomato.deploy.run_records import Proposal, Recorder, RunResult
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -43,6 +44,28 @@ class _Moving:
     """Show the first move and end; the default on hardware."""
     record: bool = True
     """Write run.mcap."""
+    view: bool = False
+    """Show every look in a browser while the run goes on; afterwards `play --record` opens the recording."""
+    view_port: int = 8080
+    """Port of that page, which is for this machine alone; 0 takes a free one."""
+
+    def _check_view(self) -> None:
+        """Accepts a port at which nobody listens, before anything slow is imported."""
+        if self.view:
+            check_port("127.0.0.1", self.view_port)
+
+    @contextlib.contextmanager
+    def _watched(self, config: "RunConfig") -> Iterator[Sequence["Recorder"]]:
+        """The page, if one is wanted, as a recorder of the run."""
+        if not self.view:
+            yield ()
+            return
+
+        from maniskill_tomato.view.live_run import LiveView
+
+        with LiveView(config.profile, self.view_port) as live:
+            say(f"page    {live.url}")
+            yield (live,)
 
     def _config(self, out: Path) -> "RunConfig":
         """What to run, checked as far as that goes without a device."""
@@ -74,29 +97,16 @@ class DeployRun(_Moving):
 
     out: Path = Path("runs/deploy")
     """Folder of result.json, report.html, report.png and run.mcap."""
-    view: bool = False
-    """Show every look in a browser while the run goes on; afterwards `play` opens the recording."""
-    view_port: int = 8080
-    """Port of that page, which is for this machine alone; 0 takes a free one."""
 
     def run(self) -> None:
         """Runs, and says how it ended."""
-        if self.view:
-            check_port("127.0.0.1", self.view_port)
+        self._check_view()
         config = self._config(self.out)
 
         from maniskill_tomato.deploy.policy_run import run
 
-        with contextlib.ExitStack() as stack:
-            watching = []
-            if self.view:
-                from maniskill_tomato.view.live_run import LiveView
-
-                live = stack.enter_context(LiveView(config.profile, self.view_port))
-                say(f"page    {live.url}")
-                watching.append(live)
-            with stopped_early():
-                result = run(config, confirm=_ask, keyboard=not self.confirm, recorders=watching)
+        with self._watched(config) as watching, stopped_early():
+            result = run(config, confirm=_ask, keyboard=not self.confirm, recorders=watching)
         print(
             f"{result.reason}: {result.detail}; {result.moves} moves, V_f {result.visible_fraction:.2f}, "
             f"{result.seconds:.1f} s; {result.end_state}"
@@ -125,12 +135,15 @@ class DeployInspect(_Moving):
     def run(self) -> None:
         """Inspects, and says what was found."""
         check_counts(max_moves=self.max_moves)
+        self._check_view()
         config = self._config(self.out)
 
         from maniskill_tomato.deploy.inspection_run import inspect_row
 
-        with stopped_early():
-            done = inspect_row(config, self.max_moves, confirm=_ask, keyboard=not self.confirm)
+        with self._watched(config) as watching, stopped_early():
+            done = inspect_row(
+                config, self.max_moves, confirm=_ask, keyboard=not self.confirm, recorders=watching
+            )
         result, ripe = done.run, [fruit for fruit in done.fruits if fruit["ripeness"] == "ripe"]
         full = sum(fruit["fully_seen"] for fruit in ripe)
         print(

@@ -4,25 +4,21 @@ import signal
 import threading
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Final
-
-import tyro
+from typing import TYPE_CHECKING, Annotated
 
 from maniskill_tomato.cli.arguments import Flat
-from maniskill_tomato.cli.early_checks import check_choice, check_env_id, check_file, check_policy
-from maniskill_tomato.cli.shared_options import PlantOptions, camera_options, say
+from maniskill_tomato.cli.early_checks import check_choice, check_env_id, check_policy
+from maniskill_tomato.cli.shared_options import EnvId, PlantOptions, camera_options, say
 from maniskill_tomato.errors import InvalidInputError
 from maniskill_tomato.plants.episode_list import EPISODE_LISTS
 from maniskill_tomato.policies.opening import shipped_policy
 from maniskill_tomato.tasks import TASK_IDS
 from maniskill_tomato.view.page_address import check_port
 from maniskill_tomato.view.play_settings import LISTED_ID, PERCEPTIONS, SHIPPED, PlaySettings
+from maniskill_tomato.view.record_kinds import EpisodeFolder, RunFile, find_record
 
 if TYPE_CHECKING:
     from maniskill_tomato.view.player import Player
-
-RECORDING: Final = "run.mcap"
-"""What `deploy run` writes into its folder."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -32,19 +28,17 @@ class Play:
     The page is for this machine alone unless --host says otherwise; it has no password. Over SSH, forward the port:
     ssh -L 8080:localhost:8080 MACHINE."""
 
-    env_id: Annotated[
-        str,
-        tyro.conf.Positional,
-        tyro.conf.arg(
-            metavar="ENV_ID",
-            help=f"The task: {', '.join(TASK_IDS)}. Or a recording of `deploy run`: run.mcap or its folder.",
-        ),
-    ] = LISTED_ID
+    env_id: EnvId = LISTED_ID
+    """The task."""
+    record: Path | None = None
+    """What was recorded, in place of a task: the folder of a `benchmark`, an `eval` or a `deploy` run, or its run.mcap.
+    Of a benchmark the page shows what each policy made of the same episode, failures first."""
     policy: str | None = None
     """File of the policy (.pt, or .onnx from `export`), or `random`, or for the general tasks a planner's name; by
-    default the one that ships with the package."""
-    seed: int = 0
-    """Seed of the episode; its number in the list where the task has one."""
+    default the one that ships with the package. With --record its name there, by default the first that failed."""
+    seed: int | None = None
+    """Seed of the episode, 0 by default; its number in the list where the task has one. With --record the first failure
+    by default."""
     plants: Annotated[PlantOptions, Flat] = PlantOptions()
     """Another plant."""
     episode_list: str | None = None
@@ -65,22 +59,29 @@ class Play:
     def run(self) -> None:
         """Serves the page until it is stopped, or writes the file."""
         self._check_export()
-        run = _run_file(self.env_id)
-        settings = None if run is not None else self._settings()
+        settings = self._settings() if self.record is None else None
+        kind = None if self.record is None else self._kind_of_record(self.record)
         if self.export is None:
             check_port(self.host, self.port)
 
         from maniskill_tomato.view.player import Player
 
-        if run is not None:
-            from maniskill_tomato.view.run_recording import read_run
-
-            player = Player.of(read_run(run))
-        else:
+        record = None
+        if settings is not None:
             from maniskill_tomato.view.play_session import PlaySession
 
-            assert settings is not None
             player = Player(PlaySession, settings)
+        elif isinstance(kind, RunFile):
+            from maniskill_tomato.view.run_recording import read_run
+
+            player = Player.of(read_run(kind.path))
+        else:
+            from maniskill_tomato.view.record_session import RecordSession
+
+            assert kind is not None
+            record = RecordSession(kind.folder)
+            record.choose(policy=self.policy, seed=self.seed)
+            player = Player.over(record)
         if self.export is not None:
             _export(player, self.export)
             return
@@ -90,7 +91,7 @@ class Play:
         stop = threading.Event()
         for number in (signal.SIGINT, signal.SIGTERM):
             signal.signal(number, lambda *_: stop.set())
-        page = PlayPage(player, self.host, self.port)
+        page = PlayPage(player, self.host, self.port, record)
         try:
             say(f"page    {page.url} (Ctrl-C ends it)")
             stop.wait()
@@ -101,12 +102,37 @@ class Play:
         if self.export is not None and self.export.suffix.lower() not in (".html", ".htm"):
             raise InvalidInputError(f"--export must name an .html file, got {self.export}")
 
+    def _kind_of_record(self, record: Path) -> "RunFile | EpisodeFolder":
+        """What a record is, by what it holds.
+
+        Raises:
+            InvalidInputError: It is none, or an option is for what is played.
+        """
+        found = find_record(record)
+        given = {
+            "ENV_ID": self.env_id != LISTED_ID,
+            "--plant": bool(self.plants.env_options()),
+            "--mesh": self.mesh is not None,
+            "--episode-list": self.episode_list is not None,
+            "--perception": self.perception != "ground_truth",
+            "--target": self.target is not None,
+        }
+        if isinstance(found, RunFile):
+            given |= {"--policy": self.policy is not None, "--seed": self.seed is not None}
+        if wrong := [name for name, is_given in given.items() if is_given]:
+            raise InvalidInputError(f"--record shows what has happened; leave out {', '.join(wrong)}")
+        return found
+
     def _settings(self) -> PlaySettings:
         """What to play.
 
         Raises:
             InvalidInputError: An option cannot be used.
         """
+        if self.env_id not in TASK_IDS and Path(self.env_id).exists():
+            raise InvalidInputError(
+                f"{self.env_id} is no task; to see what it holds, give --record {self.env_id}"
+            )
         check_env_id(self.env_id)
         check_policy("--policy", self.policy or shipped_policy(self.env_id), self.env_id)
         if self.episode_list is not None:
@@ -121,26 +147,12 @@ class Play:
         return PlaySettings(
             env_id=self.env_id,
             policy=self.policy or SHIPPED,
-            seed=self.seed,
+            seed=self.seed or 0,
             perception=self.perception,
             target=self.target,
             plant_options=self.plants.env_options(),
             episode_list=self.episode_list,
         )
-
-
-def _run_file(what: str) -> Path | None:
-    """The recording of a run that the first argument names, if it names one.
-
-    Raises:
-        InvalidInputError: It looks like one and is not there.
-    """
-    path = Path(what)
-    if path.suffix.lower() == ".mcap":
-        check_file("RUN.mcap", path)
-        return path
-    inside = path / RECORDING
-    return inside if inside.is_file() else None
 
 
 def _export(player: "Player", path: Path) -> None:

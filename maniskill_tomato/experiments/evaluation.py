@@ -24,9 +24,11 @@ from maniskill_tomato.experiments.evaluation_report import (
     write_report,
 )
 from maniskill_tomato.experiments.metrics import make_metrics
+from maniskill_tomato.experiments.policy_runs import label_of
 from maniskill_tomato.experiments.rollout import open_widest, run_episodes
 from maniskill_tomato.experiments.row_benchmark import ENV_ID as ROW_ID
 from maniskill_tomato.experiments.row_benchmark import seeable_in_row, without_camera
+from maniskill_tomato.experiments.stored_episodes import store_episodes
 from maniskill_tomato.experiments.training_runs import Run
 from maniskill_tomato.files import write_atomically, write_json
 from maniskill_tomato.learning.rl.envs import make_env
@@ -82,7 +84,7 @@ class FilmedEpisodes:
 
 
 def evaluate(config: EvaluationConfig) -> EvaluationResult:
-    """Evaluates a policy and writes metrics.json, trajectories.npz, plots, pictures, a film and report.html.
+    """Evaluates a policy; writes metrics.json, trajectories.npz, the episodes, plots, pictures, a film and report.html.
 
     Raises:
         PolicyError: The policy cannot be used.
@@ -115,6 +117,9 @@ def evaluate(config: EvaluationConfig) -> EvaluationResult:
     )
     write_json(config.out / "metrics.json", metrics)
     write_trajectories(config.out / "trajectories.npz", episodes)
+    others = [(find_policy(name, _required_task(config)), beside[name]) for name in beside]
+    random = [] if baseline is None else [(RANDOM, baseline)]
+    _keep_episodes(config, [(found, episodes), *random, *others])
     shown = FilmedEpisodes()
     left_out = None
     if config.video:
@@ -208,6 +213,20 @@ def write_trajectories(path: Path, episodes: Sequence[EpisodeRecord]) -> None:
         visible_fraction=np.concatenate([e.visible_fraction for e in episodes]),
     )
     write_atomically(path, content.getvalue())
+
+
+def _keep_episodes(
+    config: EvaluationConfig, runs: Sequence[tuple[str | Path, Sequence[EpisodeRecord]]]
+) -> None:
+    """Keeps the episodes of each policy, as it was found, so that they can be shown again."""
+    policies: dict[str, str] = {}
+    episodes: dict[str, Sequence[EpisodeRecord]] = {}
+    for found, records in runs:
+        label = label_of(found)
+        if label in policies:
+            label = str(found)
+        policies[label], episodes[label] = str(found), records
+    store_episodes(config.out, config.env_id, config.env_options, policies, episodes)
 
 
 def _required_task(config: EvaluationConfig) -> str | None:

@@ -14,6 +14,7 @@ from maniskill_tomato.errors import InvalidInputError
 from maniskill_tomato.experiments.episode_record import EpisodeRecord
 from maniskill_tomato.experiments.result_store import ResultStore, fingerprint
 from maniskill_tomato.experiments.rollout import open_widest, run_listed
+from maniskill_tomato.experiments.stored_episodes import about_condition
 from maniskill_tomato.learning.rl.envs import make_env
 from maniskill_tomato.policies.opening import find_policy, open_policy
 from maniskill_tomato.policies.protocol import Policy
@@ -47,16 +48,21 @@ class PolicySpec:
         """
         label, _, source = text.rpartition("=")
         found = find_policy(source)
-        if isinstance(found, str):
-            return cls(label=label or found, source=found)
-        by_file = found.parent.name if found.stem == "policy" and found.parent.name else found.stem
-        return cls(label=label or by_file, source=str(found.resolve()))
+        where = found if isinstance(found, str) else str(found.resolve())
+        return cls(label=label or label_of(found), source=where)
 
     @property
     def fingerprint(self) -> str:
         """Says whether stored episodes are of this policy: its name, or the hash of its file."""
         path = Path(self.source)
         return f"file:{fingerprint(path)}" if path.is_file() else self.source
+
+
+def label_of(found: str | Path) -> str:
+    """What a policy is called that has no other label: its name, or its file's; `policy.pt` is called as its folder."""
+    if isinstance(found, str):
+        return found
+    return found.parent.name if found.stem == "policy" and found.parent.name else found.stem
 
 
 def parse_policies(text: str) -> list[PolicySpec]:
@@ -127,6 +133,8 @@ def run_policies(
         processes: How many at a time.
         num_envs: Environments that each steps at once.
     """
+    for condition, specs, _ in plan:
+        describe_condition(store, condition, specs)
     blocks = [block for part in plan for block in _missing_blocks(store, *part, num_envs)]
     total = sum(block.episodes for block in blocks)
     if not total:
@@ -144,6 +152,14 @@ def run_policies(
                 told = time.monotonic()
                 left = (told - started) / done * (total - done)
                 logger.info("%d of %d episodes, about %.0f minutes left", done, total, left / 60.0)
+
+
+def describe_condition(store: ResultStore, condition: Condition, specs: Sequence[PolicySpec]) -> None:
+    """Keeps with a condition's episodes what is needed to show them again; see `stored_episodes`."""
+    policies = dict(store.description(condition.name).get("policies", {}))
+    policies |= {spec.label: spec.source for spec in specs}
+    about = about_condition(condition.name, condition.env_id, condition.env_options, policies)
+    store.describe(condition.name, about)
 
 
 def run_block(block: EpisodeBlock) -> dict[str, list[EpisodeRecord]]:

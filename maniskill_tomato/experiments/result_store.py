@@ -1,7 +1,8 @@
 """Where experiments keep their results, so that one that was stopped at any moment goes on.
 
 `DIR/results/PART/NAME.jsonl` has a line of JSON for every result. Lines are only ever added; one that a crash cut
-short is left out when they are read again. `DIR/settings.json` says what the results depend on.
+short is left out when they are read again. `DIR/settings.json` says what the results depend on, and
+`DIR/results/PART/about.json` what a part is, where its results are to be understood without the code that made them.
 """
 
 import hashlib
@@ -15,12 +16,14 @@ from typing import Any
 
 from maniskill_tomato.errors import InvalidInputError
 from maniskill_tomato.experiments.episode_record import EpisodeRecord
-from maniskill_tomato.files import write_json
+from maniskill_tomato.files import write_atomically, write_json
 from maniskill_tomato.text_files import parse_json, read_json
 
 logger = logging.getLogger(__name__)
 
 SETTINGS = "settings.json"
+RESULTS = "results"
+ABOUT = "about.json"
 
 
 class ResultStore:
@@ -60,15 +63,7 @@ class ResultStore:
 
     def read(self, part: str, name: str) -> dict[int, dict[str, Any]]:
         """The results by their numbers, in order."""
-        path = self._path(part, name)
-        found: dict[int, dict[str, Any]] = {}
-        for line in path.read_bytes().splitlines() if path.is_file() else ():
-            try:
-                content = parse_json(line.decode())
-                found[int(content["number"])] = content["result"]
-            except (ValueError, KeyError, TypeError):
-                logger.warning("%s has a line that cannot be read; its result is made again", path)
-        return dict(sorted(found.items()))
+        return read_results(self._path(part, name))
 
     def missing(self, part: str, name: str, numbers: Iterable[int]) -> list[int]:
         """Which of these numbers have no result yet."""
@@ -79,8 +74,7 @@ class ResultStore:
         """Adds results; they are on the disk when this returns."""
         path = self._path(part, name)
         path.parent.mkdir(parents=True, exist_ok=True)
-        lines = [json.dumps({"number": n, "result": r}, allow_nan=False) + "\n" for n, r in results.items()]
-        text = "".join(lines).encode()
+        text = _lines(results)
         with path.open("ab+") as file:
             # A line that was cut short must not swallow the next one.
             if file.tell() and _last_byte(file) != b"\n":
@@ -98,8 +92,39 @@ class ResultStore:
         """Adds episodes under their seeds."""
         self.add(part, name, {episode.seed: episode.to_json() for episode in episodes})
 
+    def describe(self, part: str, about: Mapping[str, Any]) -> None:
+        """Says what a part is; plain JSON values."""
+        write_json(self._folder / RESULTS / _file_name(part) / ABOUT, about)
+
+    def description(self, part: str) -> dict[str, Any]:
+        """What `describe` said; empty if nothing was said."""
+        path = self._folder / RESULTS / _file_name(part) / ABOUT
+        return dict(read_json(path)) if path.is_file() else {}
+
     def _path(self, part: str, name: str) -> Path:
-        return self._folder / "results" / _file_name(part) / f"{_file_name(name)}.jsonl"
+        return results_path(self._folder, part, name)
+
+
+def results_path(folder: Path, part: str, name: str) -> Path:
+    """The file of the results of one part and name."""
+    return folder / RESULTS / _file_name(part) / f"{_file_name(name)}.jsonl"
+
+
+def read_results(path: Path) -> dict[int, dict[str, Any]]:
+    """The results of a file by their numbers, in order; none if it is not there."""
+    found: dict[int, dict[str, Any]] = {}
+    for line in path.read_bytes().splitlines() if path.is_file() else ():
+        try:
+            content = parse_json(line.decode())
+            found[int(content["number"])] = content["result"]
+        except (ValueError, KeyError, TypeError):
+            logger.warning("%s has a line that cannot be read; its result is made again", path)
+    return dict(sorted(found.items()))
+
+
+def write_results(path: Path, results: Mapping[int, Mapping[str, Any]]) -> None:
+    """Writes a file of results whole, in place of the one that is there."""
+    write_atomically(path, _lines(results))
 
 
 def fingerprint(*files: Path) -> str:
@@ -115,6 +140,11 @@ def _read_settings(path: Path) -> dict[str, Any]:
         raise InvalidInputError(
             f"{path} does not describe an experiment of this version ({error!r}); choose another --out"
         ) from error
+
+
+def _lines(results: Mapping[int, Mapping[str, Any]]) -> bytes:
+    lines = [json.dumps({"number": n, "result": r}, allow_nan=False) + "\n" for n, r in results.items()]
+    return "".join(lines).encode()
 
 
 def _last_byte(file: Any) -> bytes:

@@ -138,3 +138,21 @@ def placed(plant: Plant, rotation: Float32, place: Float32) -> Plant:
         organs=tuple(replace(o, parts=tuple(part(p) for p in o.parts)) for o in plant.organs),
         fruits=tuple(replace(f, centre=rotation @ f.centre + place) for f in plant.fruits),
     )
+
+
+def with_fruit_at(plant: Plant, fruit: int, centre: Float32) -> Plant:
+    """The plant with one fruit elsewhere; its stalk stays where it was.
+
+    Args:
+        plant: The plant.
+        fruit: Index in `Plant.fruits`.
+        centre: Where its centre goes, in the plant frame, in [m]. Shape (3,).
+    """
+    moved = plant.fruits[fruit]
+    way = np.asarray(centre, dtype=np.float32) - moved.centre
+    organs, fruits = list(plant.organs), list(plant.fruits)
+    organ = organs[moved.organ_index]
+    parts = tuple(replace(part, vertices=part.vertices + way) for part in organ.parts)
+    organs[moved.organ_index] = replace(organ, parts=parts)
+    fruits[fruit] = replace(moved, centre=moved.centre + way)
+    return replace(plant, organs=tuple(organs), fruits=tuple(fruits))

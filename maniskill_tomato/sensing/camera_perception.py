@@ -300,6 +300,11 @@ class CameraPerception:
             [max(s.fraction.value - self.config.stop_errors * s.fraction.error, 0.0) for s in self._searches]
         )
 
+    @property
+    def fraction_error(self) -> Tensor:
+        """Standard error of `visible_fraction`. Shape (N,), float32."""
+        return self._fractions([search.fraction.error for search in self._searches])
+
     def rays(self) -> ViewRays:
         """The pattern about the believed positions, read from the last views; OUTSIDE where there is none yet."""
         return self._rays([self.last_view(k) for k in range(self.num_envs)])

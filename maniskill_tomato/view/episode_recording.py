@@ -1,6 +1,7 @@
 """What a viewer needs of an episode, step by step: plain arrays that any page or file can draw."""
 
-from dataclasses import dataclass, field
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
 from enum import IntEnum
 
 import numpy as np
@@ -85,6 +86,31 @@ class SeenPoints:
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
+class TargetRays:
+    """Rays from the camera that meet the target if nothing hides it."""
+
+    ends: Float32
+    """Where each ends, in the world frame, in [m]. Shape (n, 3)."""
+    is_seen: NDArray[np.bool_]
+    """Whether that is on the target; what hides it otherwise. Shape (n,)."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class MeasuredFraction:
+    """V_f as a camera measures it."""
+
+    value: float
+    """The estimate."""
+    margin: float
+    """How far off it may be, by the perception's own account; a task goes by the value less this."""
+
+    @property
+    def band(self) -> tuple[float, float, float]:
+        """The lower bound, the estimate, and as much above it, within 0 and 1."""
+        return max(self.value - self.margin, 0.0), self.value, min(self.value + self.margin, 1.0)
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
 class Snapshot:
     """One view of an episode, and what the policy decides on it."""
 
@@ -96,10 +122,14 @@ class Snapshot:
     """Where the target is believed to be, in the world frame, in [m]. Shape (3,)."""
     visible_fraction: float
     """V_f of the target, as the task goes by it."""
-    picture: UInt8
-    """What the wrist camera sees. Shape (H, W, 3)."""
+    picture: UInt8 | None = None
+    """What the wrist camera sees; None where `EpisodeRecording.retake` takes it when it is shown. Shape (H, W, 3)."""
     true_visible_fraction: float | None = None
     """V_f as it is, where a camera measures the other."""
+    measured: MeasuredFraction | None = None
+    """V_f with its error, where a camera measures it; the task goes by its lower bound."""
+    rays: TargetRays | None = None
+    """The truth behind V_f, where it is known."""
     target_organ: int | None = None
     """The true target, as an index in `Plant.organs`."""
     event: str = ""
@@ -132,6 +162,20 @@ class HandView:
     """What it sees. Shape (H, W, 3)."""
 
 
+@dataclass(frozen=True, eq=False, kw_only=True)
+class PolicyWay:
+    """What one of several policies did in the same episode."""
+
+    label: str
+    """Name of the policy."""
+    colour: tuple[int, int, int]
+    """In which it is drawn."""
+    is_solved: bool
+    """Whether it solved the episode."""
+    recording: "EpisodeRecording"
+    """Its episode."""
+
+
 @dataclass(eq=False, kw_only=True)
 class EpisodeRecording:
     """An episode so far: the first view, and one more for every move."""
@@ -152,11 +196,35 @@ class EpisodeRecording:
     """In order."""
     outcome: str = ""
     """How it ended; empty while it goes on."""
+    retake: Callable[[Snapshot], UInt8] | None = None
+    """Takes the picture of a snapshot that has none."""
+    ways: tuple[PolicyWay, ...] = ()
+    """Where several policies were judged by this episode: what each did, this one among them."""
 
     @property
     def moves(self) -> int:
         """Moves so far."""
         return len(self.snapshots) - 1
+
+    @property
+    def length(self) -> int:
+        """Moves of the longest of its ways."""
+        return max((way.recording.moves for way in self.ways), default=self.moves)
+
+    def at(self, shown: int) -> Snapshot:
+        """The snapshot after a number of moves, the last one where there were fewer."""
+        return self.snapshots[min(shown, self.moves)]
+
+    def picture(self, shown: int) -> UInt8:
+        """What the wrist camera sees there. Shape (H, W, 3)."""
+        snapshot = self.at(shown)
+        if snapshot.picture is not None:
+            return snapshot.picture
+        if self.retake is None:
+            return np.full((3, 4, 3), 128, dtype=np.uint8)
+        index = min(shown, self.moves)
+        self.snapshots[index] = replace(snapshot, picture=self.retake(snapshot))
+        return self.picture(shown)
 
     @property
     def visible_fractions(self) -> Float64:

@@ -6,20 +6,24 @@ import threading
 import time
 from collections.abc import Callable
 from concurrent.futures import Future
-from typing import Any, Final
+from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
-from viser import uplot
 
-from maniskill_tomato import report_design as design
 from maniskill_tomato.errors import TomatoError
 from maniskill_tomato.view.episode_recording import EpisodeRecording, Float64
 from maniskill_tomato.view.page_choices import EpisodeChoices, by_hand
 from maniskill_tomato.view.page_hand import HandCamera
 from maniskill_tomato.view.page_head import head, last_moves
-from maniskill_tomato.view.page_scene import LAYERS, LAYERS_OF_RUNS, EpisodeScene
+from maniskill_tomato.view.page_plot import FractionPlot
+from maniskill_tomato.view.page_record import RecordChoices
+from maniskill_tomato.view.page_scene import LAYERS_OF_PLAY, LAYERS_OF_RECORDS, LAYERS_OF_RUNS, EpisodeScene
 from maniskill_tomato.view.page_server import close_server, open_server, stand_before, step_back
+from maniskill_tomato.view.page_target import TargetDrag
 from maniskill_tomato.view.player import Player
+
+if TYPE_CHECKING:
+    from maniskill_tomato.view.record_session import RecordSession
 
 logger = logging.getLogger(__name__)
 
@@ -39,13 +43,20 @@ STEERING: Final = ("Play", "Step", "Reset")
 class PlayPage:
     """A server with the page of one player; all browsers that open it see and steer the same episode."""
 
-    def __init__(self, player: Player, host: str = "127.0.0.1", port: int = 8080) -> None:
+    def __init__(
+        self,
+        player: Player,
+        host: str = "127.0.0.1",
+        port: int = 8080,
+        record: "RecordSession | None" = None,
+    ) -> None:
         """Serves the page; `close` ends it.
 
         Args:
             player: What is shown.
             host: Address to listen at; only this machine by default.
             port: 0 takes a free one.
+            record: Where the player's episodes come from, if they are stored ones that can be chosen.
 
         Raises:
             InvalidInputError: The port is taken, or the address is not this machine's.
@@ -57,6 +68,7 @@ class PlayPage:
         self._drawn: tuple[EpisodeRecording, int] | None = None
         self.scene = EpisodeScene(self.server.scene, player.recording.model)
         """What is drawn."""
+        self._record = record
         self._build_controls()
         self.draw()
         self.server.on_client_connect(lambda client: step_back(self.server, client))
@@ -133,36 +145,29 @@ class PlayPage:
         self._move: Any = gui.add_slider("Move", min=0, max=1, step=1, initial_value=0)
         self._move.on_update(by_hand(self.ask, lambda value: player.show(int(value))))
         tabs = gui.add_panel()
+        if self._record is not None:
+            with tabs.add_tab("Record"):
+                self._records = RecordChoices(gui, self._record, player, self.ask)
         with tabs.add_tab("Moves"):
-            self._build_moves()
+            self._plot = FractionPlot(gui)
+            self._moves = gui.add_markdown("")
         if not player.is_stored:
             with tabs.add_tab("Episode"):
                 self._choices = EpisodeChoices(gui, player, self.ask)
             with tabs.add_tab("Hand"):
+                self.target = TargetDrag(self.server, player, self.ask)
                 self.hand = HandCamera(self.server, player, self.ask)
         with tabs.add_tab("Show"):
-            for name, visible in self.scene.visible.items():
-                if name not in (LAYERS_OF_RUNS if player.is_stored else LAYERS):
-                    continue
-                box = gui.add_checkbox(name, visible)
+            for name in self._layers():
+                box = gui.add_checkbox(name, self.scene.visible[name])
                 box.on_update(self._layer(name))
         tabs.dock_below(gui.main_panel)
 
-    def _build_moves(self) -> None:
-        self._plot = self.server.gui.add_uplot(
-            (np.zeros(1), np.zeros(1), np.zeros(1)),
-            (
-                uplot.Series(label="move"),
-                uplot.Series(
-                    label="V_f", stroke=design.TOMATO, width=2, points=uplot.Series_Points(show=True)
-                ),
-                uplot.Series(label="full", stroke=design.MUTED, width=1, dash=(4.0, 4.0)),
-            ),
-            title="V_f over the moves",
-            scales={"x": uplot.Scale(time=False), "y": uplot.Scale(auto=False, range=(0.0, 1.0))},
-            height=170,
-        )
-        self._moves = self.server.gui.add_markdown("")
+    def _layers(self) -> tuple[str, ...]:
+        """What there is to show or hide."""
+        if self._record is not None:
+            return LAYERS_OF_RECORDS
+        return LAYERS_OF_RUNS if self.player.is_stored else LAYERS_OF_PLAY
 
     def _steered(self, what: str) -> None:
         """Does what one of `STEERING` says."""
@@ -186,8 +191,8 @@ class PlayPage:
             self._head.content = head(recording, shown)
             return
         if self._drawn == (recording, shown - 1):
-            before = recording.snapshots[shown - 1].joint_positions
-            self._animate(recording, shown - 1, before, recording.snapshots[shown].joint_positions)
+            before, after = recording.at(shown - 1).joint_positions, recording.at(shown).joint_positions
+            self._animate(recording, shown - 1, before, after)
         if self._drawn is None or self._drawn[0] is not recording:
             stand_before(self.server, recording)
         with self.server.atomic():
@@ -206,17 +211,15 @@ class PlayPage:
         """Brings the controls up to date."""
         self._head.content = head(recording, shown)
         self._steer.options = ("Pause" if self.player.is_playing else "Play", *STEERING[1:])
-        self._move.max = max(recording.moves, 1)
+        self._move.max = max(recording.length, 1)
         self._move.value = shown
-        fractions = recording.visible_fractions
-        self._plot.data = (
-            np.arange(len(fractions), dtype=np.float64),
-            fractions,
-            np.full(len(fractions), recording.threshold),
-        )
+        self._plot.tell(recording)
         self._moves.content = last_moves(recording, shown)
-        if not self.player.is_stored:
+        if self._record is not None:
+            self._records.tell(recording, shown)
+        elif not self.player.is_stored:
             self._choices.tell()
+            self.target.tell()
 
 
 def way_of_joints(before: Float64, after: Float64) -> list[Float64]:

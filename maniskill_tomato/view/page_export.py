@@ -43,8 +43,8 @@ def page_of(recording: EpisodeRecording) -> str:
         scene.draw(recording, 0)
         film = server.get_scene_serializer()
         film.insert_sleep(HOLD_SECONDS)
-        for k in range(1, len(recording.snapshots)):
-            before, after = (recording.snapshots[i].joint_positions for i in (k - 1, k))
+        for k in range(1, recording.length + 1):
+            before, after = (recording.at(i).joint_positions for i in (k - 1, k))
             for joints in way_of_joints(before, after):
                 scene.draw(recording, k - 1, joints)
                 film.insert_sleep(MOVE_SECONDS / MOVE_FRAMES)

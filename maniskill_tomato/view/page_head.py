@@ -33,7 +33,7 @@ def head(recording: EpisodeRecording, shown: int) -> str:
         words, picture = f"{html.escape(recording.title)}<br>There was no look yet.", ""
     else:
         words = headline(recording, shown)
-        picture = picture_tag(recording.snapshots[shown].picture, "What the wrist camera sees")
+        picture = picture_tag(recording.picture(shown), "What the wrist camera sees")
     return (
         f'{STYLE}<div class="tomato-head"><div>{words}</div><div class="tomato-picture">{picture}</div></div>'
     )
@@ -41,12 +41,15 @@ def head(recording: EpisodeRecording, shown: int) -> str:
 
 def headline(recording: EpisodeRecording, shown: int) -> str:
     """Which episode it is, V_f, and how it ended."""
-    snapshot = recording.snapshots[shown]
-    fraction = f"V_f <b>{snapshot.visible_fraction:.2f}</b> at move {shown}"
+    snapshot, move = recording.at(shown), min(shown, recording.moves)
+    fraction = f"V_f <b>{snapshot.visible_fraction:.2f}</b> at move {move}"
+    if snapshot.measured is not None:
+        low, value, high = snapshot.measured.band
+        fraction = f"V_f <b>{value:.2f}</b>, from {low:.2f} to {high:.2f}, at move {move}"
     if snapshot.true_visible_fraction is not None:
         fraction += f" (truly {snapshot.true_visible_fraction:.2f})"
     lines = [html.escape(recording.title), fraction]
-    if shown == recording.moves and recording.outcome:
+    if move == recording.moves and recording.outcome:
         lines.append(f"<b>{html.escape(recording.outcome)}</b>")
     return "<br>".join(lines)
 
@@ -54,7 +57,8 @@ def headline(recording: EpisodeRecording, shown: int) -> str:
 def last_moves(recording: EpisodeRecording, shown: int) -> str:
     """The last moves in words, the latest first, as a Markdown list."""
     lines = []
-    for k in range(shown, max(shown - LAST_MOVES, 0), -1):
+    last = min(shown, recording.moves)
+    for k in range(last, max(last - LAST_MOVES, 0), -1):
         snapshot = recording.snapshots[k]
         event = f"**{snapshot.event}**" if snapshot.was_refused else snapshot.event
         lines.append(f"{k}. {event}, V_f {snapshot.visible_fraction:.2f}")

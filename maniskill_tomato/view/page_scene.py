@@ -13,6 +13,7 @@ from trimesh.visual import TextureVisuals
 from trimesh.visual.material import PBRMaterial
 
 from maniskill_tomato.assets import asset_path
+from maniskill_tomato.plants.organs import Organ, Plant
 from maniskill_tomato.robot.arm_model import ArmModel
 from maniskill_tomato.robot.d435 import CAMERA_LINK_NAME, T_flange_camera
 from maniskill_tomato.robot.iiwa14 import IIWA14
@@ -26,15 +27,17 @@ from maniskill_tomato.view.episode_recording import (
     Snapshot,
     Voxel,
 )
-from maniskill_tomato.view.plant_meshes import ColouredMesh, plant_layers
+from maniskill_tomato.view.plant_meshes import ColouredMesh, organ_meshes, plant_organs
 
 LAYERS: Final[dict[str, bool]] = {
     "leaves": True,
     "neighbours": True,
     "arm": True,
     "picture": True,
+    "rays": True,
     "candidates": True,
     "way": True,
+    "other policies": True,
     "fruit map": True,
     "points": True,
     "blocked": False,
@@ -46,12 +49,20 @@ LAYERS: Final[dict[str, bool]] = {
 LAYERS_OF_RUNS: Final = ("arm", "picture", "way", "points")
 """Those that the recording of a run has something of."""
 
+LAYERS_OF_RECORDS: Final = ("leaves", "neighbours", "arm", "picture", "way", "other policies")
+"""Those that stored episodes of several policies have something of."""
+
+LAYERS_OF_PLAY: Final = tuple(name for name in LAYERS if name not in ("other policies", "points"))
+"""Those that an episode has something of which is played."""
+
 Rgb = tuple[int, int, int]
 
 TARGET_COLOUR: Final[Rgb] = (255, 190, 40)
 CAMERA_COLOUR: Final[Rgb] = (30, 40, 60)
 NEXT_COLOUR: Final[Rgb] = (40, 110, 220)
 WAY_COLOUR: Final[Rgb] = (60, 70, 80)
+SEEN_COLOUR: Final[Rgb] = (50, 160, 80)
+HIDDEN_COLOUR: Final[Rgb] = (200, 50, 40)
 VOXEL_COLOURS: Final[dict[Voxel, Rgb]] = {
     Voxel.BLOCKED: (176, 58, 46),
     Voxel.FREE: (90, 170, 235),
@@ -67,6 +78,12 @@ FRUSTUM_SCALE: Final = 0.12
 
 FRUSTUM_LINE: Final = 0.004
 """Thickness of its edges, in [m]."""
+
+RAY_LINE: Final = 0.0015
+"""Thickness of a ray, in [m]."""
+
+WAY_LINE: Final = 0.006
+"""Thickness of a camera's way, in [m]."""
 
 FIELD_OF_VIEW: Final = math.radians(38.0)
 """Vertical, of the viewer's camera at first, in [rad]."""
@@ -101,7 +118,10 @@ class EpisodeScene:
         """Which of `LAYERS` are shown."""
         self._small = small
         self._recording: EpisodeRecording | None = None
-        self._shown: Snapshot | None = None
+        self._shown: tuple[int, Snapshot] | None = None
+        self._drawn_plant: Plant | None = None
+        self._drawn_organs: dict[str, tuple[Organ, ...]] = {}
+        self._plant = scene.add_frame("/plant", show_axes=False)
         self._handles: dict[str, list[Any]] = {name: [] for name in LAYERS}
         scene.set_up_direction("+z")
         scene.world_axes.visible = False
@@ -133,43 +153,50 @@ class EpisodeScene:
 
     # ----------------------------------------------------------------- drawing
 
-    def draw(self, recording: EpisodeRecording, index: int, joints: Float64 | None = None) -> None:
+    def draw(self, recording: EpisodeRecording, shown: int, joints: Float64 | None = None) -> None:
         """Draws a snapshot.
 
         Args:
             recording: Which episode.
-            index: Which of its snapshots.
+            shown: After how many moves; where there were fewer, the last snapshot is drawn.
             joints: Where the arm is shown, in [rad], if it is on its way there. Shape (7,).
         """
-        snapshot = recording.snapshots[index]
+        snapshot = recording.at(shown)
         if recording is not self._recording:
-            if self._recording is None or recording.plant is not self._recording.plant:
-                self._draw_plant(recording)
+            self._draw_plant(recording.plant)
             self._place_plant(recording)
             self._recording, self._shown = recording, None
-        if snapshot is not self._shown:
-            self._shown = snapshot
+        elif recording.plant is not self._drawn_plant:
+            self._draw_plant(recording.plant)
+        if self._shown != (shown, snapshot):
+            self._shown = shown, snapshot
             self._draw_target(snapshot)
             self._draw_fruits(snapshot)
             self._draw_points(snapshot.points)
             self._draw_candidates(snapshot)
             self._draw_foliage(snapshot.foliage)
-            self._draw_camera(recording, snapshot)
-            self._draw_way(recording, index)
+            self._draw_camera(recording, shown)
+            self._draw_way(recording, shown)
+            self._draw_other_ways(recording, shown)
+            self._draw_rays(snapshot)
         self._move_arm(snapshot.joint_positions if joints is None else joints)
 
-    def _draw_plant(self, recording: EpisodeRecording) -> None:
-        self._scene.remove_by_name("/plant")
-        self._plant = self._scene.add_frame("/plant", show_axes=False)
-        for name in ("leaves", "neighbours"):
+    def _draw_plant(self, plant: Plant | None) -> None:
+        """Draws a plant in the place of the one before; parts of which no organ differs stay."""
+        if plant is self._drawn_plant:
+            return
+        self._drawn_plant = plant
+        organs = {} if plant is None else plant_organs(plant)
+        for name in self._drawn_organs.keys() - organs.keys():
+            self._scene.remove_by_name(f"/plant/{name}")
             self._handles[name] = []
+        changed = {name: some for name, some in organs.items() if some != self._drawn_organs.get(name)}
         share = NEIGHBOURS_IN_SMALL if self._small else 1.0
-        layers = {} if recording.plant is None else plant_layers(recording.plant, share)
-        for name, mesh in layers.items():
-            shown = self.visible.get(name, True)
-            handle = self._scene.add_glb(f"/plant/{name}", glb(mesh), visible=shown)
-            if name in self._handles:
-                self._handles[name].append(handle)
+        for name, mesh in organ_meshes(changed, share).items():
+            handle = self._scene.add_glb(f"/plant/{name}", glb(mesh), visible=self.visible.get(name, True))
+            if name in LAYERS:
+                self._handles[name] = [handle]
+        self._drawn_organs = organs
 
     def _place_plant(self, recording: EpisodeRecording) -> None:
         self._plant.wxyz, self._plant.position = pose(recording.T_w_plant)
@@ -297,8 +324,9 @@ class EpisodeScene:
                 )
             self._handles[name] = [handle]
 
-    def _draw_camera(self, recording: EpisodeRecording, snapshot: Snapshot) -> None:
-        height, width = snapshot.picture.shape[:2]
+    def _draw_camera(self, recording: EpisodeRecording, shown: int) -> None:
+        snapshot, picture = recording.at(shown), recording.picture(shown)
+        height, width = picture.shape[:2]
         wxyz, position = pose(snapshot.T_w_camera)
         self._handles["picture"] = [
             self._scene.add_camera_frustum(
@@ -307,8 +335,8 @@ class EpisodeScene:
                 aspect=width / height,
                 scale=FRUSTUM_SCALE,
                 thickness=FRUSTUM_LINE,
-                color=CAMERA_COLOUR,
-                image=snapshot.picture,
+                color=colour_of(recording, CAMERA_COLOUR),
+                image=picture,
                 format="jpeg",
                 jpeg_quality=85,
                 cast_shadow=False,
@@ -336,19 +364,71 @@ class EpisodeScene:
                 )
             )
 
-    def _draw_way(self, recording: EpisodeRecording, index: int) -> None:
+    def _draw_way(self, recording: EpisodeRecording, shown: int) -> None:
         self._scene.remove_by_name("/way")
-        way = np.array([s.T_w_camera[:3, 3] for s in recording.snapshots[: index + 1]], dtype=np.float32)
-        if len(way) > 1:
+        steps = _steps(recording, shown)
+        if len(steps):
             self._handles["way"].append(
                 self._scene.add_line_segments(
                     "/way",
-                    np.stack([way[:-1], way[1:]], axis=1),
-                    WAY_COLOUR,
-                    thickness=FRUSTUM_LINE,
+                    steps,
+                    colour_of(recording, WAY_COLOUR),
+                    thickness=WAY_LINE,
                     visible=self.visible["way"],
                 )
             )
+
+    def _draw_other_ways(self, recording: EpisodeRecording, shown: int) -> None:
+        """The ways of the other policies, each with a frustum where its camera stands after as many moves."""
+        self._scene.remove_by_name("/others")
+        self._handles["other policies"] = []
+        for index, way in enumerate(recording.ways):
+            if way.recording is recording:
+                continue
+            wxyz, position = pose(way.recording.at(shown).T_w_camera)
+            height, width = way.recording.picture(shown).shape[:2]
+            frustum = self._scene.add_camera_frustum(
+                f"/others/{index}/camera",
+                fov=recording.fov_y,
+                aspect=width / height,
+                scale=0.7 * FRUSTUM_SCALE,
+                thickness=FRUSTUM_LINE,
+                color=way.colour,
+                cast_shadow=False,
+                wxyz=wxyz,
+                position=position,
+                visible=self.visible["other policies"],
+            )
+            self._handles["other policies"].append(frustum)
+            steps = _steps(way.recording, shown)
+            if len(steps):
+                line = self._scene.add_line_segments(
+                    f"/others/{index}/way",
+                    steps,
+                    way.colour,
+                    thickness=WAY_LINE,
+                    visible=self.visible["other policies"],
+                )
+                self._handles["other policies"].append(line)
+
+    def _draw_rays(self, snapshot: Snapshot) -> None:
+        """Rays to the target: those that reach it, and those that something stops."""
+        self._scene.remove_by_name("/rays")
+        self._handles["rays"] = []
+        rays = snapshot.rays
+        if rays is None or not len(rays.ends):
+            return
+        start = np.broadcast_to(snapshot.T_w_camera[:3, 3].astype(np.float32), rays.ends.shape)
+        colours = np.where(rays.is_seen[:, None], SEEN_COLOUR, HIDDEN_COLOUR).astype(np.uint8)
+        self._handles["rays"].append(
+            self._scene.add_line_segments(
+                "/rays",
+                np.stack([start, rays.ends], axis=1),
+                np.repeat(colours[:, None], 2, axis=1),
+                thickness=RAY_LINE,
+                visible=self.visible["rays"],
+            )
+        )
 
     def _move_arm(self, joints: Float64) -> None:
         links = link_transforms(torch.as_tensor(np.array(joints))[None], self._model)[0].numpy()
@@ -366,6 +446,17 @@ class EpisodeScene:
             housing = asset_path(f"iiwa14/meshes/{CAMERA_LINK_NAME}.glb").read_bytes()
             self._scene.add_glb(f"/arm/{name}/camera", housing, wxyz=wxyz, position=position)
         return handle
+
+
+def colour_of(recording: EpisodeRecording, alone: Rgb) -> Rgb:
+    """The colour of a policy that is drawn beside others; `alone` if there are none."""
+    return next((way.colour for way in recording.ways if way.recording is recording), alone)
+
+
+def _steps(recording: EpisodeRecording, shown: int) -> NDArray[np.float32]:
+    """The camera's way as segments, in the world frame, in [m]. Shape (moves, 2, 3)."""
+    way = np.array([s.T_w_camera[:3, 3] for s in recording.snapshots[: shown + 1]], dtype=np.float32)
+    return np.stack([way[:-1], way[1:]], axis=1)
 
 
 def first_view(recording: EpisodeRecording) -> tuple[Float64, Float64]:

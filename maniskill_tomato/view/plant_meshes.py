@@ -1,6 +1,6 @@
 """Plants in the colours of their materials: meshes with a colour at every vertex, and one colour for every organ."""
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -32,25 +32,37 @@ class ColouredMesh:
     """Vertex indices. Shape (F, 3)."""
 
 
-def plant_layers(plant: Plant, neighbour_share: float = 1.0) -> dict[str, ColouredMesh]:
-    """The plant in parts that a viewer shows or hides: `leaves`, `stems`, `fruits`, and `neighbours` of a row.
-
-    Args:
-        plant: A plant or a row.
-        neighbour_share: Share of the neighbours' triangles that is kept; fewer make smaller files.
-    """
+def plant_organs(plant: Plant) -> dict[str, tuple[Organ, ...]]:
+    """The organs in parts that a viewer shows or hides: `leaves`, `stems`, `fruits`, and `neighbours` of a row."""
     count = plant.middle_organs if isinstance(plant, Row) else len(plant.organs)
     own, others = plant.organs[:count], plant.organs[count:]
-    layers = {
-        "leaves": [o for o in own if o.semantic_class is SemanticClass.LEAF],
-        "fruits": [o for o in own if o.semantic_class in FRUITS],
-        "stems": [o for o in own if o.semantic_class not in (SemanticClass.LEAF, *FRUITS)],
-        "neighbours": list(others),
+    parts = {
+        "leaves": tuple(o for o in own if o.semantic_class is SemanticClass.LEAF),
+        "fruits": tuple(o for o in own if o.semantic_class in FRUITS),
+        "stems": tuple(o for o in own if o.semantic_class not in (SemanticClass.LEAF, *FRUITS)),
+        "neighbours": tuple(others),
     }
-    meshes = {name: _joined(organs) for name, organs in layers.items() if organs}
+    return {name: organs for name, organs in parts.items() if organs}
+
+
+def organ_meshes(
+    parts: Mapping[str, Sequence[Organ]], neighbour_share: float = 1.0
+) -> dict[str, ColouredMesh]:
+    """Each part as one mesh.
+
+    Args:
+        parts: As of `plant_organs`.
+        neighbour_share: Share of the neighbours' triangles that is kept; fewer make smaller files.
+    """
+    meshes = {name: _joined(organs) for name, organs in parts.items()}
     if neighbour_share < 1.0 and "neighbours" in meshes:
         meshes["neighbours"] = _thinned(meshes["neighbours"], neighbour_share)
     return meshes
+
+
+def plant_layers(plant: Plant, neighbour_share: float = 1.0) -> dict[str, ColouredMesh]:
+    """The parts of a plant as meshes; see `plant_organs` and `organ_meshes`."""
+    return organ_meshes(plant_organs(plant), neighbour_share)
 
 
 def organ_colours(plant: Plant) -> NDArray[np.float64]:

@@ -1,19 +1,20 @@
 """An episode that is stepped move by move, with a snapshot of every view; it knows nothing of any page."""
 
+from dataclasses import replace
 from typing import Any, Final
 
 import numpy as np
 import torch
 from torch import Tensor
 
+from maniskill_tomato.errors import InvalidInputError
+from maniskill_tomato.plants.organs import Plant, with_fruit_at
 from maniskill_tomato.policies.adapters import as_state_policy
 from maniskill_tomato.policies.lattice_planner import LatticePlanner
 from maniskill_tomato.policies.opening import RANDOM, open_policy, shipped_policy
 from maniskill_tomato.policies.protocol import Policy, reseed
-from maniskill_tomato.policies.reach import CameraReach
 from maniskill_tomato.robot.inverse_kinematics import Reach
 from maniskill_tomato.robot.kinematics import link_transforms
-from maniskill_tomato.robot.look_at import look_at_pose
 from maniskill_tomato.sensing.camera_perception import CameraPerception
 from maniskill_tomato.sensing.occlusion_memory import CELL_SIZE, OcclusionMemory
 from maniskill_tomato.tasks.vector_env import make_vector_env
@@ -24,21 +25,13 @@ from maniskill_tomato.view.episode_recording import (
     Foliage,
     HandView,
     MappedFruit,
+    MeasuredFraction,
     Snapshot,
-    UInt8,
     Voxel,
 )
-from maniskill_tomato.view.plant_meshes import organ_colours
 from maniskill_tomato.view.play_settings import SHIPPED, PlaySettings
-
-PICTURE_SIZE: Final = (320, 240)
-"""Width and height of the wrist camera's picture as it is shown, in [px]."""
-
-SKY: Final = (178.0, 196.0, 204.0)
-"""Colour of what stands behind the row, sRGB."""
-
-ARM: Final = (206.0, 206.0, 208.0)
-"""Colour of the arm in the picture, sRGB."""
+from maniskill_tomato.view.player import NO_DRAG
+from maniskill_tomato.view.world_camera import WorldCamera, as_double
 
 STANDS_STILL: Final = 1e-4
 """A camera that moved less has not moved, in [m]."""
@@ -61,9 +54,9 @@ class PlaySession:
         self.settings = settings
         self._env = make_vector_env(settings.env_id, auto_reset=False, **settings.world_options())
         self._world = self._env.world
-        self._palette: tuple[Any, Float64] | None = None
+        self._camera = WorldCamera(self._world)
         self._action: Tensor | None = None
-        self._reach: CameraReach | None = None
+        self._own_plant: Plant | None = None
         self.recording: EpisodeRecording
         """The episode so far."""
         self.begin(settings.seed)
@@ -74,6 +67,7 @@ class PlaySession:
         Raises:
             PolicyError: The policy cannot be used.
         """
+        self._put_back()
         self._policy = self._open_policy(seed)
         self._acting = as_state_policy(self._policy, self._env)
         observations, info = self._env.reset(seed=seed)
@@ -82,7 +76,7 @@ class PlaySession:
         self.recording = EpisodeRecording(
             title=f"{settings.env_id}, seed {seed}, {self._policy.name}{seen}",
             plant=world.plant_batch.plants[0],
-            T_w_plant=_double(world.plant_batch.T_world_plant[0]),
+            T_w_plant=as_double(world.plant_batch.T_world_plant[0]),
             threshold=float(world.task.full_visibility),
             fov_y=float(world.intrinsics.fov_y),
         )
@@ -104,7 +98,7 @@ class PlaySession:
             return False
         before = self._world.T_w_camera[0, :3, 3].clone()
         observations, _, terminated, truncated, info = self._env.step(self._action)
-        event = _event(info, float((self._world.T_w_camera[0, :3, 3] - before).norm()))
+        event = move_in_words(info, float((self._world.T_w_camera[0, :3, 3] - before).norm()))
         if bool(terminated[0]) or bool(truncated[0]):
             self._action = None
             self.recording.outcome = _outcome(info, self.recording.moves + 1)
@@ -112,6 +106,55 @@ class PlaySession:
             self._decide(observations)
         self.recording.snapshots.append(self._snapshot(info, event))
         return True
+
+    def move_target(self, position: Float64) -> None:
+        """Hangs the target elsewhere: the last view is seen again as it is now, and the episode goes on from there.
+
+        The policy decides anew with `decide_again`. Another episode has its own plant again.
+
+        Args:
+            position: Of its centre, in the world frame, in [m]. Shape (3,).
+
+        Raises:
+            InvalidInputError: A camera says which fruit the target is.
+        """
+        if self.target_place() is None:
+            raise InvalidInputError(NO_DRAG)
+        world = self._world
+        plant = world.plant_batch.plants[0]
+        if self._own_plant is None:
+            self._own_plant = plant
+        T = as_double(world.plant_batch.T_world_plant[0])
+        centre = (np.asarray(position) - T[:3, 3]) @ T[:3, :3]
+        moved = with_fruit_at(plant, int(world.state.target[0]), centre.astype(np.float32))
+        world.exchange_plants({0: moved})
+        self.recording.plant = moved
+        self.recording.snapshots[-1] = self._seen_again()
+
+    def decide_again(self) -> None:
+        """Lets the policy decide on the last view as it is now, unless the episode has ended."""
+        if self._action is not None:
+            self._decide(self._world.observation())
+        self.recording.snapshots[-1] = self._seen_again()
+
+    def target_place(self) -> Float64 | None:
+        """Where the target is, in the world frame, in [m]; None where a camera says which it is. Shape (3,)."""
+        if self.settings.perception != "ground_truth":
+            return None
+        return as_double(self._world.target_position_w[0])
+
+    def _seen_again(self) -> Snapshot:
+        """The last view on a plant that was altered."""
+        world, last = self._world, self.recording.snapshots[-1]
+        truth = world.ground_truth.visible_fraction(world.T_w_camera, qpos=world.state.qpos)
+        info = {**world.info(), "visible_fraction": truth}
+        return replace(self._snapshot(info, last.event), was_refused=last.was_refused)
+
+    def _put_back(self) -> None:
+        """Shows the plant as it grew."""
+        if self._own_plant is not None:
+            self._world.exchange_plants({0: self._own_plant})
+            self._own_plant = None
 
     def _open_policy(self, seed: int) -> Policy:
         settings = self.settings
@@ -135,12 +178,14 @@ class PlaySession:
         perception: CameraPerception | None = getattr(world.game, "perception", None)
         moved = "reachability" in info and bool(event)
         return Snapshot(
-            joint_positions=_double(world.state.qpos[0]),
-            T_w_camera=_double(world.T_w_camera[0]),
-            target_position=_double(world.game.known_target()[0]),
+            joint_positions=as_double(world.state.qpos[0]),
+            T_w_camera=as_double(world.T_w_camera[0]),
+            target_position=as_double(world.game.known_target()[0]),
             visible_fraction=float(info["visible_fraction"][0]),
             true_visible_fraction=None if true is None else float(true[0]),
-            picture=self._picture(world.T_w_camera[0], world.T_w_links[0]),
+            measured=None if perception is None else _measured(perception),
+            rays=self._camera.target_rays(),
+            picture=self._camera.picture(world.T_w_camera[0], world.T_w_links[0]),
             target_organ=int(world.plant_batch.fruit_organ(world.state.target)[0]),
             event=event,
             was_refused=moved and int(info["reachability"][0]) == int(Reach.UNREACHABLE),
@@ -156,32 +201,7 @@ class PlaySession:
         Args:
             position: Of the camera, in the world frame, in [m]. Shape (3,).
         """
-        world = self._world
-        target = world.game.known_target()[0].double()
-        place = torch.as_tensor(position, dtype=torch.float64)[None]
-        T = look_at_pose(place, target[None])
-        if self._reach is None:
-            self._reach = CameraReach(world.device)
-        return HandView(
-            T_w_camera=_double(T[0]),
-            visible_fraction=float(world.ground_truth.visible_fraction(T)[0]),
-            is_reachable=bool(self._reach.reachable(place, target)[0]),
-            picture=self._picture(T[0].float(), None),
-        )
-
-    def _picture(self, T_w_camera: Tensor, T_w_links: Tensor | None) -> UInt8:
-        """What a camera sees, each organ in its mean colour. Shape (H, W, 3)."""
-        world = self._world
-        plant = world.plant_batch.plants[0]
-        if self._palette is None or self._palette[0] is not plant:
-            self._palette = plant, np.concatenate([[SKY, ARM], organ_colours(plant)])
-        picture = world.scene.picture(
-            world.intrinsics.scaled(*PICTURE_SIZE),
-            T_w_camera,
-            world.plant_batch.T_world_plant[0],
-            T_w_links,
-        )
-        return picture.coloured(self._palette[1])
+        return self._camera.look_from(position, self._world.game.known_target()[0])
 
     def _candidates(self) -> Candidates | None:
         policy = self._policy
@@ -202,11 +222,16 @@ class PlaySession:
         plan = world.moves.plan(
             state.qpos, state.viewpoint, world.game.known_target(), world.check_action(self._action)
         )
-        return _double(world.camera_poses(link_transforms(plan.target_qpos))[0])
+        return as_double(world.camera_poses(link_transforms(plan.target_qpos))[0])
 
 
-def _event(info: dict[str, Any], way_m: float) -> str:
-    """What came of a move, in words."""
+def move_in_words(info: dict[str, Any], way_m: float) -> str:
+    """What came of a move, in words.
+
+    Args:
+        info: Of the step, one environment.
+        way_m: How far the camera went, in [m].
+    """
     reach = int(info["reachability"][0])
     moved = f"{100.0 * way_m:.0f} cm"
     if int(info.get("transits", [0])[0]):
@@ -240,7 +265,14 @@ def _foliage(memory: OcclusionMemory) -> Foliage:
     passes = torch.exp(-memory.density[0] * CELL_SIZE).cpu().numpy()
     voxels = np.where(known, np.where(passes < 0.5, int(Voxel.BLOCKED), int(Voxel.FREE)), int(Voxel.UNKNOWN))
     return Foliage(
-        centre=_double(memory.target_position[0]), cell_size=CELL_SIZE, voxels=voxels.astype(np.uint8)
+        centre=as_double(memory.target_position[0]), cell_size=CELL_SIZE, voxels=voxels.astype(np.uint8)
+    )
+
+
+def _measured(perception: CameraPerception) -> MeasuredFraction:
+    return MeasuredFraction(
+        value=float(perception.visible_fraction[0]),
+        margin=float(perception.config.stop_errors * perception.fraction_error[0]),
     )
 
 
@@ -258,8 +290,3 @@ def _fruits(perception: CameraPerception) -> tuple[MappedFruit, ...]:
         for track in perception.map(0).tracks.values()
         if track.existence > 0.5
     )
-
-
-def _double(values: Tensor) -> Float64:
-    """A copy in double precision."""
-    return np.array(values.detach().double().cpu().numpy())

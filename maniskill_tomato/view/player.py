@@ -2,10 +2,16 @@
 
 from collections.abc import Callable
 from dataclasses import replace
-from typing import Any, Protocol
+from typing import Any, Final, Protocol, cast
 
 from maniskill_tomato.view.episode_recording import EpisodeRecording, Float64, HandView
 from maniskill_tomato.view.play_settings import SHIPPED, PlaySettings
+
+NO_DRAG: Final = (
+    "the target can be dragged where exact labels name it; a camera chooses its target among what it sees: take the "
+    "senses ground_truth"
+)
+"""Why a target stays where it is."""
 
 
 class Session(Protocol):
@@ -34,6 +40,22 @@ class Session(Protocol):
 
     def look_from(self, position: Float64) -> HandView | None:
         """What a camera at a place would see of the target; None if that is not known. Shape (3,), in [m]."""
+        ...
+
+
+class PlayedSession(Session, Protocol):
+    """One that makes the moves itself, on a plant that can be altered."""
+
+    def target_place(self) -> Float64 | None:
+        """Where the target is, in the world frame, in [m]; None where it cannot be moved. Shape (3,)."""
+        ...
+
+    def move_target(self, position: Float64) -> None:
+        """Hangs the target elsewhere and sees the last view again. Shape (3,), in [m]."""
+        ...
+
+    def decide_again(self) -> None:
+        """Lets the policy decide on the last view as it is now."""
         ...
 
 
@@ -83,7 +105,12 @@ class Player:
     @classmethod
     def of(cls, recording: EpisodeRecording) -> "Player":
         """Shows an episode that happened elsewhere."""
-        player = cls(lambda _: StoredSession(recording), PlaySettings())
+        return cls.over(StoredSession(recording))
+
+    @classmethod
+    def over(cls, session: Session) -> "Player":
+        """Shows the episodes of a session that makes no moves."""
+        player = cls(lambda _: session, PlaySettings())
         player.is_stored = True
         return player
 
@@ -96,14 +123,30 @@ class Player:
         """What a camera elsewhere would see of the present target; see `HandView`. Shape (3,), in [m]."""
         return self._session.look_from(position)
 
+    def target_place(self) -> Float64 | None:
+        """Where the target is; None where it cannot be moved. Shape (3,), in [m]."""
+        session = self._session
+        return None if self.is_stored else cast(PlayedSession, session).target_place()
+
+    def move_target(self, position: Float64) -> None:
+        """Hangs the target elsewhere and shows the last view as it is now. Shape (3,), in [m]."""
+        if not self.is_stored:
+            self.show(self.recording.moves)
+            cast(PlayedSession, self._session).move_target(position)
+
+    def drop_target(self) -> None:
+        """Lets the policy decide on where the target was left."""
+        if not self.is_stored:
+            cast(PlayedSession, self._session).decide_again()
+
     @property
     def is_at_end(self) -> bool:
         """Whether no move is left to show or to make."""
-        return self.shown >= self.recording.moves and self._session.is_over
+        return self.shown >= self.recording.length and self._session.is_over
 
     def step(self) -> None:
         """Shows the next snapshot, and makes a move where there is none yet."""
-        if self.shown < self.recording.moves or self._session.step():
+        if self.shown < self.recording.length or self._session.step():
             self.shown += 1
         if self.is_at_end:
             self.is_playing = False
@@ -121,7 +164,7 @@ class Player:
     def show(self, index: int) -> None:
         """Shows a snapshot that was recorded; the nearest where there is none of this number."""
         self.is_playing = False
-        self.shown = min(max(index, 0), self.recording.moves)
+        self.shown = min(max(index, 0), self.recording.length)
 
     def follow(self) -> None:
         """Shows the last snapshot if the one before it, or a later one, was shown: whoever went back stays there."""

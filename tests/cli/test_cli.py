@@ -18,6 +18,7 @@ from maniskill_tomato.cli import main, parse
 from maniskill_tomato.cli.eval_command import Eval
 from maniskill_tomato.cli.shared_options import PlantOptions
 from maniskill_tomato.cli.train_command import Train
+from maniskill_tomato.experiments.stored_episodes import read_stored_episodes
 from maniskill_tomato.files import write_tensors
 from maniskill_tomato.learning.rl.agent import make_agent
 from maniskill_tomato.learning.rl.checkpoint import make_checkpoint
@@ -222,6 +223,9 @@ def test_an_evaluation_runs_the_episodes_of_a_file(tmp_path: Path) -> None:
     with np.load(tmp_path / "out" / "trajectories.npz") as data:
         first = data["visible_fraction"][data["first_view"]]
     assert first == pytest.approx([e.start_visibility for e in episodes], abs=1e-4)
+    (kept,) = read_stored_episodes(tmp_path / "out")
+    assert kept.env_options == {"episodes": str(tmp_path / "mine.json")}
+    assert [e.visible_fraction[0] for e in kept.episodes["stay"].values()] == pytest.approx(first, abs=1e-4)
 
 
 def test_evaluation_writes_metrics_that_follow_from_its_trajectories(

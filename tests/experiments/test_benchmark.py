@@ -22,6 +22,7 @@ from maniskill_tomato.experiments.metrics import compare_policies, summarise_pol
 from maniskill_tomato.experiments.policy_runs import Condition, parse_policies, run_policies
 from maniskill_tomato.experiments.result_store import ResultStore
 from maniskill_tomato.experiments.rollout import run_batch, run_episode
+from maniskill_tomato.experiments.stored_episodes import read_stored_episodes
 from maniskill_tomato.experiments.viewpoint_benchmark import (
     SWEEPS,
     main_condition,
@@ -348,6 +349,11 @@ def test_a_benchmark_runs_what_is_missing_and_nothing_twice(
     for label in ("stay", "nbv"):
         assert [e.seed for e in store.episodes("line", label, range(30))] == list(range(10, 22))
     assert store.episodes("line", "nbv", [10])[0].steps < store.episodes("line", "stay", [10])[0].steps
+    (kept,) = read_stored_episodes(tmp_path)
+    assert (kept.name, kept.env_id, kept.env_options) == ("line", line.env_id, {})
+    assert {label: list(found) for label, found in kept.episodes.items()} == {
+        label: list(range(10, 22)) for label in ("stay", "nbv")
+    }
 
 
 def test_the_results_are_written(tmp_path: Path) -> None:

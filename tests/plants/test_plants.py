@@ -17,7 +17,7 @@ from maniskill_tomato.plants.fruit import classify
 from maniskill_tomato.plants.generator import generate_plant
 from maniskill_tomato.plants.kinds import config_of
 from maniskill_tomato.plants.materials import MATERIALS
-from maniskill_tomato.plants.organs import Organ, Plant, SemanticClass
+from maniskill_tomato.plants.organs import Organ, Plant, SemanticClass, with_fruit_at
 from maniskill_tomato.plants.plant_config import (
     PRESETS,
     FlowerConfig,
@@ -477,3 +477,15 @@ def test_base_colour_textures_are_opaque_and_made_the_same_each_time(name: str) 
         ("leaf_upper", "leaf_under", "petiole", "stem", "truss", "calyx", "fruit_green")
     )
     assert (green > red) == is_green
+
+
+def test_a_fruit_that_is_hung_elsewhere_leaves_all_other_organs_where_they_were() -> None:
+    plant = generate_plant("three_tomatoes")
+    way = np.array([0.01, -0.02, 0.05], np.float32)
+    moved = with_fruit_at(plant, 1, plant.fruits[1].centre + way)
+    for index, (before, after) in enumerate(zip(plant.organs, moved.organs, strict=True)):
+        shift = way if index == plant.fruits[1].organ_index else 0.0
+        np.testing.assert_allclose(after.vertices, before.vertices + shift, atol=1e-6)
+    for index, (old, new) in enumerate(zip(plant.fruits, moved.fruits, strict=True)):
+        np.testing.assert_allclose(new.centre, old.centre + (way if index == 1 else 0.0), atol=1e-6)
+    assert len(moved.faces) == len(plant.faces)

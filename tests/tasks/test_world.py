@@ -13,6 +13,7 @@ from torch import Tensor
 
 from maniskill_tomato.errors import InvalidInputError
 from maniskill_tomato.plants.episode_list import load_episodes
+from maniskill_tomato.plants.organs import with_fruit_at
 from maniskill_tomato.tasks.making import make_world
 from maniskill_tomato.tasks.vector_env import VectorEnv, make_vector_env
 from maniskill_tomato.tasks.world import World
@@ -276,3 +277,29 @@ def test_a_world_and_its_vector_shell_load_no_simulator() -> None:
     )
     assert result.returncode == 0, result.stderr
     assert result.stdout.strip() == "[]"
+
+
+def test_an_altered_plant_is_seen_again_and_so_is_the_one_before() -> None:
+    world = make_world("TomatoViewpoint-v1", episodes="validation")
+    world.reset(0)
+    own, before = world.plant_batch.plants[0], world.observation()
+    target = int(world.target_fruit[0])
+    T = world.plant_batch.T_world_plant[0]
+    between = 0.5 * (world.target_position_w[0] + world.T_w_camera[0, :3, 3])
+    centre = T[:3, :3].T @ (between - T[:3, 3])
+    world.exchange_plants({0: with_fruit_at(own, target, centre.numpy())})
+    torch.testing.assert_close(world.target_position_w[0], between, atol=1e-5, rtol=0.0)
+    torch.testing.assert_close(world.belief.target_position[0].float(), between, atol=1e-5, rtol=0.0)
+    seen = world.ground_truth.visible_fraction(world.T_w_camera, qpos=world.qpos)
+    assert float(seen) > 0.9 > float(world.info()["visible_fraction"])
+    assert not torch.allclose(world.observation(), before)
+    world.exchange_plants({0: own})
+    torch.testing.assert_close(world.observation(), before)
+
+
+def test_an_altered_plant_with_other_fruits_is_refused() -> None:
+    world = make_world("TomatoViewpointGuided-v1")
+    world.reset(0)
+    plant = world.plant_batch.plants[0]
+    with pytest.raises(InvalidInputError, match=f"must have {len(plant.fruits)} fruits, got 0"):
+        world.exchange_plants({0: replace(plant, fruits=())})

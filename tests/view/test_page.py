@@ -23,6 +23,7 @@ from maniskill_tomato.view.plant_meshes import organ_colours, plant_layers
 from maniskill_tomato.view.play_session import PlaySession
 from maniskill_tomato.view.play_settings import PlaySettings
 from maniskill_tomato.view.player import Player
+from maniskill_tomato.view.record_session import RecordSession
 
 PATIENCE_S = 60.0
 
@@ -104,6 +105,44 @@ def test_the_camera_in_the_hand_stands_in_the_scene_while_it_is_taken(page: Play
     np.testing.assert_allclose(node(page, "/hand_view").position, camera, atol=1e-6)
     page.ask(lambda: page.hand.take(False)).result(PATIENCE_S)
     assert page.server.scene.get_handle_by_name("/hand") is None
+
+
+def test_a_target_that_is_dragged_moves_its_fruit_and_nothing_else(page: PlayPage) -> None:
+    page.ask(lambda: page.target.take(True)).result(PATIENCE_S)
+    place = page.player.target_place()
+    assert place is not None
+    handle = node(page, "/target_handle")
+    np.testing.assert_allclose(handle.position, place, atol=1e-5)
+    before = {name: node(page, f"/plant/{name}") for name in ("leaves", "fruits", "stems", "neighbours")}
+    handle.position = tuple(place + [0.0, 0.0, 0.1])
+    page.ask(page.target.move).result(PATIENCE_S)
+    np.testing.assert_allclose(node(page, "/target").position, place + [0.0, 0.0, 0.1], atol=1e-5)
+    changed = [name for name, drawn in before.items() if node(page, f"/plant/{name}") is not drawn]
+    assert changed == ["fruits"]
+    page.ask(page.player.reset).result(PATIENCE_S)
+    np.testing.assert_allclose(node(page, "/target_handle").position, place, atol=1e-5)
+    page.ask(lambda: page.target.take(False)).result(PATIENCE_S)
+    assert page.server.scene.get_handle_by_name("/target_handle") is None
+
+
+def test_a_record_shows_the_other_policies_ways_in_their_colours(record_folder: Path) -> None:
+    session = RecordSession(record_folder)
+    opened = PlayPage(Player.over(session), port=0, record=session)
+    try:
+        opened.ask(lambda: opened.player.show(1)).result(PATIENCE_S)
+        nbv = session.recording.ways[0]
+        assert session.policy == "random_step" and nbv.label == "nbv"
+        camera = node(opened, "/others/0/camera")
+        np.testing.assert_allclose(camera.position, nbv.recording.snapshots[1].T_w_camera[:3, 3], atol=1e-6)
+        assert tuple(camera.color) == nbv.colour
+        assert tuple(node(opened, "/camera").color) == session.recording.ways[1].colour
+        opened.scene.show_layer("other policies", False)
+        assert not node(opened, "/others/0/camera").visible
+        opened.ask(lambda: session.choose(policy="nbv")).result(PATIENCE_S)
+        assert opened.server.scene.get_handle_by_name("/others/0/camera") is None
+        assert not node(opened, "/others/1/camera").visible
+    finally:
+        opened.close()
 
 
 def test_a_port_that_is_taken_is_refused_in_words() -> None:

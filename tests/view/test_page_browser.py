@@ -2,6 +2,7 @@
 
 import time
 from collections.abc import Callable, Iterator
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -14,6 +15,7 @@ from maniskill_tomato.view.page_scene import first_view
 from maniskill_tomato.view.play_session import PlaySession
 from maniskill_tomato.view.play_settings import PlaySettings
 from maniskill_tomato.view.player import Player
+from maniskill_tomato.view.record_session import RecordSession
 
 pytestmark = pytest.mark.browser
 
@@ -108,6 +110,22 @@ def test_on_a_phone_most_of_the_page_is_scene_and_the_panel_can_be_worked(browse
         (client,) = served.server.get_clients().values()
         place, at = first_view(player.recording)
         wait_for(browser_page, lambda: distance(client.camera.position, at) > 1.2 * distance(place, at))
+    finally:
+        served.close()
+
+
+def test_a_click_on_next_shows_the_next_failure_of_a_record(browser_page: Page, record_folder: Path) -> None:
+    session = RecordSession(record_folder)
+    first, second = session.failures("random_step")
+    served = PlayPage(Player.over(session), port=0, record=session)
+    try:
+        browser_page.set_viewport_size({"width": 800, "height": 700})
+        browser_page.goto(served.url)
+        browser_page.get_by_text(f"episode {first}, random_step").wait_for()
+        assert browser_page.get_by_role("img", name="What the camera of nbv sees").is_visible()
+        browser_page.get_by_role("button", name="next").click()
+        browser_page.get_by_text(f"episode {second}, random_step").wait_for()
+        assert session.seed == second
     finally:
         served.close()
 

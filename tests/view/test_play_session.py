@@ -14,6 +14,8 @@ from maniskill_tomato.policies.opening import open_policy
 from maniskill_tomato.sensing.occlusion_memory import CELL_SIZE
 from maniskill_tomato.tasks.vector_env import make_vector_env
 from maniskill_tomato.view.episode_recording import EpisodeRecording, Voxel
+from maniskill_tomato.view.page_head import headline
+from maniskill_tomato.view.page_plot import curves
 from maniskill_tomato.view.plant_meshes import organ_colours
 from maniskill_tomato.view.play_session import PlaySession
 from maniskill_tomato.view.play_settings import PlaySettings
@@ -117,6 +119,22 @@ def test_a_camera_tells_its_map_of_fruits_and_the_truth_stands_beside_what_it_me
     assert np.median(errors) < 0.01
 
 
+def test_a_camera_tells_how_far_off_its_fraction_may_be_and_goes_by_the_lower_edge() -> None:
+    session = PlaySession(PlaySettings(perception="occlusion_model", policy="nbv", target="any"))
+    session.step()
+    for snapshot in session.recording.snapshots:
+        assert snapshot.measured is not None
+        low, value, high = snapshot.measured.band
+        assert 0.0 <= low <= value <= high <= 1.0
+        assert low == pytest.approx(snapshot.visible_fraction, abs=1e-6)
+    assert snapshot.measured is not None and snapshot.measured.margin > 0.0
+    lines = {str(series.get("label")): values for series, values in curves(session.recording)}
+    bands = [s.measured.band for s in session.recording.snapshots if s.measured is not None]
+    for name, edge in (("at least", 0), ("V_f", 1), ("at most", 2)):
+        np.testing.assert_allclose(lines[name], [band[edge] for band in bands])
+    assert f"from {bands[1][0]:.2f} to {bands[1][2]:.2f}" in headline(session.recording, 1)
+
+
 def test_a_refused_move_is_told_with_its_reason() -> None:
     recording = played(PlaySettings(policy="random_step", seed=1))
     refused = [s for s in recording.snapshots if s.was_refused]
@@ -134,7 +152,7 @@ def test_a_row_counts_the_tomatoes_that_were_seen() -> None:
 
 def test_the_wrist_picture_shows_a_red_target_where_it_is_expected() -> None:
     recording = played(PlaySettings(policy="nbv"))
-    picture = recording.snapshots[-1].picture.astype(int)
+    picture = recording.picture(recording.moves).astype(int)
     height, width = picture.shape[:2]
     # The camera looks at its target.
     red, green, _ = picture[height // 2 - 5 : height // 2 + 5, width // 2 - 5 : width // 2 + 5].mean((0, 1))
@@ -169,6 +187,75 @@ def test_a_camera_taken_by_hand_sees_what_the_arm_would_see_from_there() -> None
     first = session.look_from(session.recording.snapshots[0].T_w_camera[:3, 3])
     assert first.visible_fraction == pytest.approx(recording.snapshots[0].visible_fraction, abs=0.03)
     assert not session.look_from(last.target_position + [-3.0, 0.0, 0.0]).is_reachable
+
+
+@pytest.mark.parametrize(
+    ("env_id", "policy"), [("TomatoViewpoint-v1", "nbv"), ("TomatoViewpointGuided-v1", "random")]
+)
+def test_a_target_that_is_hung_before_the_leaves_is_seen_from_where_the_camera_is(
+    env_id: str, policy: str
+) -> None:
+    session = PlaySession(PlaySettings(env_id=env_id, policy=policy))
+    if policy == "nbv":
+        session.step()
+    before = session.recording.snapshots[-1]
+    views = len(session.recording.snapshots)
+    own, place = session.recording.plant, session.target_place()
+    assert place is not None
+    assert before.rays is not None and not before.rays.is_seen.all() and before.visible_fraction < 0.8
+    nearer = place + 0.5 * (before.T_w_camera[:3, 3] - place)
+    session.move_target(nearer)
+    after = session.recording.snapshots[-1]
+    hung = session.target_place()
+    assert hung is not None
+    np.testing.assert_allclose(hung, nearer, atol=1e-5)
+    np.testing.assert_allclose(after.target_position, nearer, atol=1e-5)
+    assert after.rays is not None and after.rays.is_seen.all() and after.visible_fraction > 0.95
+    assert after.event == before.event and len(session.recording.snapshots) == views
+    np.testing.assert_array_equal(after.joint_positions, before.joint_positions)
+    session.begin(session.settings.seed)
+    assert session.recording.plant is own
+    again = PlaySession(PlaySettings(env_id=env_id, policy=policy)).recording.snapshots[0]
+    first = session.recording.snapshots[0]
+    assert first.visible_fraction == again.visible_fraction
+    np.testing.assert_array_equal(first.picture, again.picture)
+
+
+def test_the_policy_goes_for_where_the_target_was_left() -> None:
+    session = PlaySession(PlaySettings(policy="nbv"))
+    hung = session.target_place()
+    assert hung is not None
+    place = hung + [0.0, 0.1, 0.05]
+    session.move_target(place)
+    session.decide_again()
+    decided = session.recording.snapshots[-1]
+    assert decided.foliage is not None and decided.T_w_camera_next is not None
+    np.testing.assert_allclose(decided.foliage.centre, place, atol=1e-5)
+    ahead, way = decided.T_w_camera_next[:3, 2], place - decided.T_w_camera_next[:3, 3]
+    np.testing.assert_allclose(ahead, way / np.linalg.norm(way), atol=1e-3)
+    assert session.step()
+    np.testing.assert_allclose(session.recording.snapshots[-1].target_position, place, atol=1e-5)
+
+
+def test_a_target_that_a_camera_chooses_cannot_be_dragged() -> None:
+    session = PlaySession(PlaySettings(perception="occlusion_model", policy="nbv", target="any"))
+    assert session.target_place() is None
+    with pytest.raises(InvalidInputError, match="take the senses ground_truth"):
+        session.move_target(np.zeros(3))
+
+
+def test_rays_to_the_target_end_on_it_or_on_what_hides_it() -> None:
+    recording = played(PlaySettings(policy="nbv"))
+    assert recording.plant is not None
+    for snapshot in (recording.snapshots[0], recording.snapshots[-1]):
+        rays = snapshot.rays
+        assert rays is not None and len(rays.ends) > 8
+        away = np.linalg.norm(rays.ends - snapshot.target_position, axis=1)
+        assert np.all(away[rays.is_seen] < 0.05)
+        camera = np.linalg.norm(snapshot.T_w_camera[:3, 3] - snapshot.target_position)
+        to_end = np.linalg.norm(rays.ends - snapshot.T_w_camera[:3, 3], axis=1)
+        assert np.all(to_end[~rays.is_seen] < camera)
+        assert rays.is_seen.mean() == pytest.approx(snapshot.visible_fraction, abs=0.25)
 
 
 def test_plants_from_a_mesh_file_are_played_in_their_own_colours(tmp_path: Path) -> None:

@@ -87,7 +87,7 @@ def test_the_folder_of_a_run_is_exported(
     folder: Path, result: RunResult, capsys: pytest.CaptureFixture[str]
 ) -> None:
     page = folder / "page.html"
-    main(["play", str(folder), "--export", str(page)])
+    main(["play", "--record", str(folder), "--export", str(page)])
     assert result.reason in capsys.readouterr().out
     assert page.stat().st_size < 2_500_000
 
@@ -95,8 +95,38 @@ def test_the_folder_of_a_run_is_exported(
 def test_what_is_no_recording_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     path = tmp_path / "run.mcap"
     with pytest.raises(SystemExit) as ended:
-        main(["play", str(path)])
-    assert ended.value.code == 2 and "there is no file" in capsys.readouterr().err
+        main(["play", "--record", str(path)])
+    assert ended.value.code == 2 and "there is no file or folder" in capsys.readouterr().err
     path.write_bytes(b"no recording")
     with pytest.raises(RecordingError, match="run.mcap"):
         read_run(path)
+
+
+def test_an_inspection_is_shown_while_it_goes_on(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    shown: list[Step] = []
+    show = LiveView.step
+
+    def step(view: LiveView, look: Step) -> None:
+        shown.append(look)
+        show(view, look)
+
+    monkeypatch.setattr(LiveView, "step", step)
+    arguments = [
+        "--profile",
+        "mock",
+        "--max-moves",
+        "2",
+        "--out",
+        str(tmp_path),
+        "--view",
+        "--view-port",
+        "0",
+    ]
+    main(["deploy", "inspect", *arguments])
+    assert "page    http://127.0.0.1:" in "".join(capsys.readouterr())
+    stored = read_run(tmp_path / "run.mcap")
+    assert len(shown) == stored.moves + 1 > 1
+    for look, snapshot in zip(shown, stored.snapshots, strict=True):
+        np.testing.assert_allclose(look.joint_positions, snapshot.joint_positions)
