@@ -138,12 +138,12 @@ class PlayPage:
         gui, player = self.server.gui, self.player
         gui.configure_theme(control_width="medium", show_logo=False, show_share_button=False)
         gui.main_panel.dock_right()
-        self._head = gui.add_html("")
         self._problem = gui.add_markdown("", visible=False)
         self._steer: Any = gui.add_button_group("", STEERING)
         self._steer.on_click(by_hand(self.ask, self._steered))
         self._move: Any = gui.add_slider("Move", min=0, max=1, step=1, initial_value=0)
         self._move.on_update(by_hand(self.ask, lambda value: player.show(int(value))))
+        self._head = gui.add_html("")
         tabs = gui.add_panel()
         if self._record is not None:
             with tabs.add_tab("Record"):

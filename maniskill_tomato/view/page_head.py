@@ -61,7 +61,8 @@ def last_moves(recording: EpisodeRecording, shown: int) -> str:
     for k in range(last, max(last - LAST_MOVES, 0), -1):
         snapshot = recording.snapshots[k]
         event = f"**{snapshot.event}**" if snapshot.was_refused else snapshot.event
-        lines.append(f"{k}. {event}, V_f {snapshot.visible_fraction:.2f}")
+        fraction = snapshot.visible_fraction if snapshot.measured is None else snapshot.measured.value
+        lines.append(f"{k}. {event}, V_f {fraction:.2f}")
     return "\n".join(f"- move {line}" for line in lines)
 
 

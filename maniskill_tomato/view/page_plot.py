@@ -31,7 +31,7 @@ class FractionPlot:
 
     def tell(self, recording: EpisodeRecording) -> None:
         """Draws a recording."""
-        moves = recording.length + 1
+        moves = max(recording.length, 1) + 1
         lines = curves(recording)
         names = ("move", *(str(series.get("label")) for series, _ in lines))
         if names != self._names:
@@ -65,10 +65,9 @@ def curves(recording: EpisodeRecording) -> list[Line]:
     elif any(s.measured is not None for s in snapshots):
         bands = [(s.visible_fraction,) * 3 if s.measured is None else s.measured.band for s in snapshots]
         low, middle, high = (np.array(values) for values in zip(*bands, strict=True))
-        edge = uplot.Series(width=0, stroke="transparent", points=uplot.Series_Points(show=False))
         lines += [
-            (uplot.Series(label="at most", **edge), high),
-            (uplot.Series(label="at least", **edge), low),
+            (_edge("at most"), high),
+            (_edge("at least"), low),
             (_line("V_f", design.TOMATO), middle),
         ]
     else:
@@ -79,8 +78,13 @@ def curves(recording: EpisodeRecording) -> list[Line]:
     full = uplot.Series(
         label="full", stroke=design.MUTED, width=1, dash=(4.0, 4.0), points=uplot.Series_Points(show=False)
     )
-    return [*lines, (full, np.full(recording.length + 1, recording.threshold))]
+    return [*lines, (full, np.full(max(recording.length, 1) + 1, recording.threshold))]
 
 
 def _line(label: str, colour: str, width: float = 2) -> uplot.Series:
     return uplot.Series(label=label, stroke=colour, width=width, points=uplot.Series_Points(show=True))
+
+
+def _edge(label: str) -> uplot.Series:
+    """A line that only bounds a band."""
+    return uplot.Series(label=label, width=0, stroke="transparent", points=uplot.Series_Points(show=False))

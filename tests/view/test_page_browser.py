@@ -8,6 +8,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 from playwright.sync_api import ConsoleMessage, Page, sync_playwright
+from scipy.spatial.transform import Rotation
+from viser import ClientHandle
 
 from maniskill_tomato.view.page import PlayPage
 from maniskill_tomato.view.page_export import page_of
@@ -23,6 +25,9 @@ FLAGS = ("--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader
 """Without a graphics card Chromium draws WebGL only if it is told to."""
 
 PATIENCE_MS = 120_000
+
+ATTEMPTS = 6
+"""Times that a handle is grasped for."""
 
 
 @pytest.fixture
@@ -112,6 +117,58 @@ def test_on_a_phone_most_of_the_page_is_scene_and_the_panel_can_be_worked(browse
         wait_for(browser_page, lambda: distance(client.camera.position, at) > 1.2 * distance(place, at))
     finally:
         served.close()
+
+
+def test_dragging_the_target_by_its_handle_changes_the_fraction(browser_page: Page) -> None:
+    player = Player(PlaySession, PlaySettings(env_id="TomatoViewpointGuided-v1", policy="random", seed=2))
+    served = PlayPage(player, port=0)
+    try:
+        browser_page.set_viewport_size({"width": 900, "height": 700})
+        browser_page.goto(served.url)
+        browser_page.get_by_text("at move 0").wait_for()
+        browser_page.get_by_role("tab", name="Hand").click()
+        browser_page.get_by_text("Drag the target").click()
+        wait_for(browser_page, lambda: served.server.scene.get_handle_by_name("/target_handle") is not None)
+        before, fraction = player.target_place(), player.recording.snapshots[0].visible_fraction
+        assert before is not None
+        (client,) = served.server.get_clients().values()
+        # A browser tells of its own place before it takes that of the page, and of its width before it has the panel.
+        stand, _ = first_view(player.recording)
+        wait_for(browser_page, lambda: distance(client.camera.position, stand) < 0.01)
+        wait_for(browser_page, lambda: client.camera.image_width < 900)
+        for _ in range(ATTEMPTS):
+            # A slow browser draws the handle late, and who misses it turns the scene.
+            browser_page.wait_for_timeout(5000)
+            grip, further = (on_screen(client, before + [0.0, 0.0, up]) for up in (0.06, 0.21))
+            browser_page.mouse.move(grip[0] - 3, grip[1])
+            browser_page.wait_for_timeout(500)
+            browser_page.mouse.move(*grip)
+            browser_page.wait_for_timeout(1500)
+            browser_page.mouse.down()
+            browser_page.wait_for_timeout(500)
+            browser_page.mouse.move(*further, steps=5)
+            browser_page.wait_for_timeout(1500)
+            browser_page.mouse.up()
+            browser_page.wait_for_timeout(1500)
+            place = player.target_place()
+            assert place is not None
+            if place[2] > before[2] + 0.05:
+                break
+        place = player.target_place()
+        assert place is not None and place[2] > before[2] + 0.05
+        assert abs(player.recording.snapshots[0].visible_fraction - fraction) > 0.02
+        np.testing.assert_allclose(place[:2], before[:2], atol=1e-3)
+    finally:
+        served.close()
+
+
+def on_screen(client: ClientHandle, place: NDArray[np.float64]) -> tuple[float, float]:
+    """Where a place of the world is seen in a browser, in [px]."""
+    camera = client.camera
+    rotation = Rotation.from_quat(camera.wxyz, scalar_first=True).as_matrix()
+    x, y, z = rotation.T @ (place - camera.position)
+    focal = 0.5 * camera.image_height / np.tan(0.5 * camera.fov)
+    return float(0.5 * camera.image_width + focal * x / z), float(0.5 * camera.image_height + focal * y / z)
 
 
 def test_a_click_on_next_shows_the_next_failure_of_a_record(browser_page: Page, record_folder: Path) -> None:
