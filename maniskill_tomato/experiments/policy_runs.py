@@ -155,11 +155,12 @@ def run_policies(
 
 
 def describe_condition(store: ResultStore, condition: Condition, specs: Sequence[PolicySpec]) -> None:
-    """Keeps with a condition's episodes what is needed to show them again; see `stored_episodes`."""
+    """Keeps with a condition's episodes what is needed to show them again, where that can be written down."""
     policies = dict(store.description(condition.name).get("policies", {}))
     policies |= {spec.label: spec.source for spec in specs}
     about = about_condition(condition.name, condition.env_id, condition.env_options, policies)
-    store.describe(condition.name, about)
+    if about is not None:
+        store.describe(condition.name, about)
 
 
 def run_block(block: EpisodeBlock) -> dict[str, list[EpisodeRecord]]:

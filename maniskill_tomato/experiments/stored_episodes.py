@@ -38,16 +38,21 @@ class StoredEpisodes:
 
 def about_condition(
     name: str, env_id: str, env_options: Mapping[str, Any], policies: Mapping[str, str]
-) -> dict[str, Any]:
-    """What is written about episodes.
+) -> dict[str, Any] | None:
+    """What is written about episodes; None where an option is an object that JSON has no form for.
 
     Args:
         name: Of the condition.
         env_id: The task.
-        env_options: Its options; plain JSON values.
+        env_options: Its options.
         policies: What was opened, a name or a file, by the label.
     """
-    return {"name": name, "env_id": env_id, "env_options": dict(env_options), "policies": dict(policies)}
+    about = {"name": name, "env_id": env_id, "env_options": dict(env_options), "policies": dict(policies)}
+    try:
+        plain: dict[str, Any] = json.loads(json.dumps(about))
+    except TypeError:
+        return None
+    return plain
 
 
 def store_episodes(
@@ -69,13 +74,11 @@ def store_episodes(
         policies: What was opened, a name or a file, by the label.
         episodes: Of each policy, by the label.
     """
-    try:
-        options = json.loads(json.dumps(dict(env_options)))
-    except TypeError:
+    about = about_condition(env_id, env_id, env_options, policies)
+    if about is None:
         return
     for label, records in episodes.items():
         write_results(results_path(folder, env_id, label), {r.seed: r.to_json() for r in records})
-    about = about_condition(env_id, env_id, options, policies)
     write_json(results_path(folder, env_id, "").with_name(ABOUT), about)
 
 
