@@ -111,8 +111,7 @@ class Play:
         found = find_record(record)
         given = {
             "ENV_ID": self.env_id != LISTED_ID,
-            "--plant": bool(self.plants.env_options()),
-            "--mesh": self.mesh is not None,
+            "the options of plants": bool(self.plants.env_options()),
             "--episode-list": self.episode_list is not None,
             "--perception": self.perception != "ground_truth",
             "--target": self.target is not None,
