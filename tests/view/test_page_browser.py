@@ -98,9 +98,9 @@ def test_on_a_phone_most_of_the_page_is_scene_and_the_panel_can_be_worked(browse
         browser_page.set_viewport_size({"width": width, "height": height})
         browser_page.goto(served.url)
         browser_page.get_by_text("at move 0").wait_for()
-        # The sheet's own title is its upper end.
-        box = browser_page.get_by_text("maniskill-tomato", exact=True).bounding_box()
-        assert box is not None and box["y"] > 0.65 * height
+        # The sheet's own title is its upper end; the sheet slides down to it.
+        title = browser_page.get_by_text("maniskill-tomato", exact=True)
+        wait_for(browser_page, lambda: (box := title.bounding_box()) is not None and box["y"] > 0.65 * height)
         for name in ("Play", "Step", "Reset"):
             button = browser_page.get_by_role("button", name=name, exact=True).bounding_box()
             assert button is not None and button["y"] + button["height"] < height
