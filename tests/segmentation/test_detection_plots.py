@@ -58,7 +58,7 @@ def test_boxes_and_masks_have_a_panel_each_with_a_curve_for_every_size(tmp_path:
     falling = np.linspace(0.9, 0.1, 10)
     boxes = {"all": falling, "small": falling / 2}
     plot_overlaps({"box": boxes, "mask": {"all": falling}}, tmp_path / "overlaps.png")
-    ((box, mask),) = panels(tmp_path / "overlaps.png", 1, 2)
+    (box,), (mask,) = panels(tmp_path / "overlaps.png", 2, 1)
     assert coloured(box, COLOURS[0]) > 50 and coloured(box, COLOURS[1]) > 50
     assert coloured(mask, COLOURS[0]) > 50 and coloured(mask, COLOURS[1]) == 0
 
