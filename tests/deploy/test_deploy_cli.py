@@ -266,7 +266,7 @@ def test_a_fault_has_its_own_exit_status(tmp_path: Path, capsys: pytest.CaptureF
         (["run", "--seed", "-1"], "the seed must be 0 or more"),
         (
             ["run", "--out", "/dev/null/x"],
-            "cannot write to /dev/null/x: Not a directory; choose another --out",
+            "/dev/null is a file, so that /dev/null/x cannot be made; choose another --out",
         ),
         (["inspect", "--profile", "nothing"], "give the path of a TOML file or one of"),
         (["inspect", "--policy", "oracle"], "in simulation only"),
@@ -274,9 +274,9 @@ def test_a_fault_has_its_own_exit_status(tmp_path: Path, capsys: pytest.CaptureF
         (["inspect", "--max-moves", "0"], "--max-moves must be 1 or more, got 0"),
         (
             ["inspect", "--out", "/dev/null/x"],
-            "cannot write to /dev/null/x: Not a directory; choose another --out",
+            "/dev/null is a file, so that /dev/null/x cannot be made; choose another --out",
         ),
-        (["calibrate", "--profile", "mock", "--out", "/dev/null/x"], "cannot write to /dev/null/x"),
+        (["calibrate", "--profile", "mock", "--out", "/dev/null/x"], "so that /dev/null/x cannot be made"),
         (["calibrate", "--views", "missing"], "--views: there is no folder missing"),
         (["profiles", "--show", "missing"], "no profile 'missing'"),
         (["replay", "/dev/null"], "RECORDING: there is no file /dev/null"),
