@@ -7,7 +7,7 @@ import pytest
 from documentation.api_pages import PUBLIC, write_api_pages
 from documentation.llms import write_llms_files
 from documentation.pages import HOME, NAVIGATION, ROOT, headings, sources, title_and_summary
-from documentation.staging import rewritten, stage
+from documentation.staging import EPISODE_PAGE, rewritten, stage
 from draw_diagrams import DIAGRAMS, FOLDER
 
 NAMED = [name for names in NAVIGATION.values() for name in names]
@@ -49,6 +49,11 @@ def test_links_lead_to_pages_by_their_titles_to_files_beside_them_and_never_to_f
         "[elsewhere](https://example.org/a.md), [here](#below), ![picture](../files/LICENSE)"
     )
     assert copied == [ROOT / "LICENSE"] * 2
+
+
+def test_the_viewers_page_links_to_the_episode_that_the_build_exports(staged: Path) -> None:
+    assert f'<a href="{EPISODE_PAGE}">' in (staged / "viewer.md").read_text(encoding="utf-8")
+    assert EPISODE_PAGE not in (ROOT / "docs" / "viewer.md").read_text(encoding="utf-8")
 
 
 def test_every_link_of_a_staged_page_leads_to_a_file_on_the_site(staged: Path) -> None:

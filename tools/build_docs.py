@@ -8,10 +8,15 @@ from pathlib import Path
 from documentation.api_pages import write_api_pages
 from documentation.llms import write_llms_files
 from documentation.pages import ROOT
-from documentation.staging import stage
+from documentation.staging import EPISODE_PAGE, stage
 from sphinx.cmd.build import build_main
 
+from maniskill_tomato.cli import run
+
 CONFIGURATION = Path(__file__).resolve().parent / "documentation"
+
+EPISODE_SEED = "3"
+"""Of the exported episode; the policy that ships needs several moves in it."""
 
 
 def build(out: Path) -> int:
@@ -29,6 +34,7 @@ def build(out: Path) -> int:
     status = build_main([*options, "-c", str(CONFIGURATION), str(staged), str(out)])
     if status == 0:
         write_llms_files(staged, out)
+        run(["play", "TomatoViewpoint-v1", "--seed", EPISODE_SEED, "--export", str(out / EPISODE_PAGE)])
     return status
 
 

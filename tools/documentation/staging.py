@@ -18,6 +18,20 @@ LINK = re.compile(
 """A Markdown link or image with a target outside its own page."""
 
 
+EPISODE_PAGE = "episode.html"
+"""What `play --export` makes of an episode. It holds viser's program, so that it is built and not kept."""
+
+ADDED = {
+    "viewer": f"""
+## An episode to turn
+
+<a href="{EPISODE_PAGE}">An episode in one file</a>, made by `maniskill-tomato play --export`: the policy that ships
+looks for a hidden tomato on plants that it has never seen. Play it, go back, turn and zoom.
+"""
+}
+"""What pages have on the site only, by their names there."""
+
+
 def stage(folder: Path) -> None:
     """Writes every page of the repository and the files that they show into an empty folder.
 
@@ -30,7 +44,9 @@ def stage(folder: Path) -> None:
         place = folder / f"{name}.md"
         place.parent.mkdir(parents=True, exist_ok=True)
         text = rewritten(path.read_text(encoding="utf-8"), path, name, names, _copier(folder))
-        place.write_text(text + (navigation() if name == HOME else ""), encoding="utf-8")
+        place.write_text(
+            text + ADDED.get(name, "") + (navigation() if name == HOME else ""), encoding="utf-8"
+        )
 
 
 def rewritten(
