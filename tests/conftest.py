@@ -13,8 +13,12 @@ import subprocess
 import sys
 from collections.abc import Generator
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import pytest
+
+if TYPE_CHECKING:
+    from maniskill_tomato.experiments.episode_record import EpisodeRecord
 
 ROOT = Path(__file__).resolve().parent.parent
 PROBE_SECONDS = 300
@@ -22,6 +26,9 @@ PROBE_SECONDS = 300
 
 BROWSERS = ("chromium", "chromium-browser", "google-chrome")
 """Programs that can be Chromium."""
+
+STORED_ID = "TomatoViewpoint-v1"
+STORED_OPTIONS: dict[str, Any] = {"episodes": "held_out"}
 
 NO_BROWSER = "no Chromium on PATH; `make browser` installs one"
 
@@ -76,6 +83,30 @@ def chromium() -> str:
     path = browser_path()
     assert path is not None
     return path
+
+
+@pytest.fixture(scope="session")
+def stored() -> "dict[str, list[EpisodeRecord]]":
+    """What two policies did in the same two episodes, for tests of the viewer."""
+    from maniskill_tomato.experiments.rollout import run_episode
+    from maniskill_tomato.policies.opening import open_policy
+    from maniskill_tomato.tasks.vector_env import make_vector_env
+
+    env = make_vector_env(STORED_ID, auto_reset=False, **STORED_OPTIONS)
+    return {
+        name: [run_episode(env, open_policy(name, env_id=STORED_ID), seed) for seed in (0, 1)]
+        for name in ("nbv", "random_step")
+    }
+
+
+@pytest.fixture(scope="session")
+def record_folder(tmp_path_factory: pytest.TempPathFactory, stored: "dict[str, list[EpisodeRecord]]") -> Path:
+    """The folder of these episodes."""
+    from maniskill_tomato.experiments.stored_episodes import store_episodes
+
+    folder = tmp_path_factory.mktemp("record") / "benchmark"
+    store_episodes(folder, STORED_ID, STORED_OPTIONS, {name: name for name in stored}, stored)
+    return folder
 
 
 def unlisted_skip(report: pytest.TestReport | pytest.CollectReport) -> str | None:

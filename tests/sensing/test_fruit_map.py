@@ -23,7 +23,7 @@ from maniskill_tomato.sensing.fruit_map import (
 )
 from maniskill_tomato.sensing.measurement import DetectedFruit, Measurement
 from maniskill_tomato.sensing.posed_frame import PosedFrame
-from maniskill_tomato.sensing.visible_fraction.sphere import FLATNESS
+from maniskill_tomato.sensing.visible_fraction.crop import FLATNESS
 
 Place = NDArray[np.float64]
 

@@ -14,7 +14,7 @@ from maniskill_tomato.sensing.inspection import LOST_AFTER, Aim, Inspection
 from maniskill_tomato.sensing.measurement import Measurement
 from maniskill_tomato.sensing.posed_frame import PosedFrame
 from maniskill_tomato.sensing.view_lattice import ViewLattice
-from maniskill_tomato.sensing.visible_fraction.sphere import FLATNESS
+from maniskill_tomato.sensing.visible_fraction.crop import FLATNESS
 
 Place = NDArray[np.float64]
 

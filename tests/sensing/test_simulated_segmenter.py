@@ -17,7 +17,7 @@ from maniskill_tomato.sensing.simulated_segmenter import (
     silhouette_of,
     simulated_masks,
 )
-from maniskill_tomato.sensing.visible_fraction.sphere import FLATNESS
+from maniskill_tomato.sensing.visible_fraction.crop import FLATNESS
 
 WIDTH, HEIGHT = 320, 240
 INTRINSICS = color_intrinsics(WIDTH, HEIGHT)
