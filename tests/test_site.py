@@ -53,7 +53,8 @@ def test_links_lead_to_pages_by_their_titles_to_files_beside_them_and_never_to_f
 
 def test_the_viewers_page_links_to_the_episode_that_the_build_exports(staged: Path) -> None:
     assert f'<a href="{EPISODE_PAGE}">' in (staged / "viewer.md").read_text(encoding="utf-8")
-    assert EPISODE_PAGE not in (ROOT / "docs" / "viewer.md").read_text(encoding="utf-8")
+    # A Git host has no such file to lead to.
+    assert f'href="{EPISODE_PAGE}"' not in (ROOT / "docs" / "viewer.md").read_text(encoding="utf-8")
 
 
 def test_every_link_of_a_staged_page_leads_to_a_file_on_the_site(staged: Path) -> None:
