@@ -19,6 +19,7 @@ from maniskill_tomato.sensing.fruit_map import (
     NO_TRACK,
     FruitMap,
     MapConfig,
+    Track,
     outline,
 )
 from maniskill_tomato.sensing.measurement import DetectedFruit, Measurement
@@ -409,3 +410,30 @@ def test_v_f_of_a_flat_fruit_behind_a_leaf_counts_its_own_outline(camera: tuple[
     # A pixel is 3 mm there. By a circle `single` is 0.07 too small.
     assert fraction.fused == pytest.approx(truth, abs=0.045)
     assert fraction.single == pytest.approx(truth, abs=0.045)
+
+
+@pytest.mark.parametrize(("apart", "left"), [(0.025, [0.0]), (0.055, [0.0, 0.055])])
+def test_of_two_well_known_tracks_in_one_place_the_better_known_stays(
+    apart: float, left: list[float]
+) -> None:
+    fruits = FruitMap()
+    for number, (y, deviation) in enumerate(((apart, 0.005), (0.0, 0.002))):
+        fruits.tracks[number] = Track(
+            number=number,
+            mean=np.array([0.5, y, 0.6, 0.032]),
+            covariance=deviation**2 * np.eye(4),
+            existence_log_odds=8.0,
+            apart_from={1 - number},
+        )
+    fruits.update(DETECTOR.measure(cast(CAMERAS[0], [])))
+    assert sorted(round(float(track.position_w[1]), 6) for track in fruits.tracks.values()) == left
+    assert fruits.current(1) == (0 if len(left) == 1 else 1)
+
+
+def test_the_map_learns_the_size_of_a_crop_from_fruits_that_it_sees_whole() -> None:
+    fruits = FruitMap()
+    before = fruits.crop
+    near = 0.5 * (np.array(CAMERAS[0]) + FRUIT)
+    fruits.update(DETECTOR.measure(cast((near[0], near[1], near[2]), [FRUIT])))
+    assert fruits.crop.radius_error < 0.5 * before.radius_error
+    assert abs(np.log(fruits.crop.radius_m / RADIUS)) < 0.1
