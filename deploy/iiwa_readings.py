@@ -206,7 +206,9 @@ class ReadingLog:
     def state(self) -> ArmState | None:
         """Positions and velocities; None where the readings are too near or too far apart to tell these."""
         last, before = self._last, self._previous
-        if last is None or before is None or not 0.005 < last.asked - before.asked < 1.0:
+        if last is None or before is None or last.asked - before.asked <= 0.005:
+            return None
+        if last.answered - before.asked >= 1.0:
             return None
         velocities = (last.positions - before.positions) / (last.asked - before.asked)
         return ArmState(
