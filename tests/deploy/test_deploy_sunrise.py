@@ -244,7 +244,9 @@ def test_a_controller_whose_answers_are_too_slow_to_tell_a_velocity_holds_nobody
             return line()
 
         controller._joint_line = slowly  # type: ignore[method-assign]
-        time.sleep(0.05)  # So that the reading at the start, answered at once, is far enough away to tell a velocity.
+        time.sleep(
+            0.05
+        )  # So that the reading at the start, answered at once, is far enough away to tell a velocity.
         began = time.monotonic()
         with pytest.raises(DeviceTimeoutError, match="answers too slowly"):
             arm.read()
