@@ -321,6 +321,7 @@ class Loop:
             self._last.view,
             visible_fraction=0.0,
             sure_fraction=0.0,
+            fraction_margin=None,
             mask=np.zeros(frame.depth.shape, np.bool_),
             fruits_seen=0,
             recall=None,

@@ -257,6 +257,7 @@ def _step(step: Step) -> dict[str, Any]:
         "T_world_camera": step.T_world_camera.tolist(),
         "target_position": step.target_position.tolist(),
         "visible_fraction": step.view.visible_fraction,
+        "fraction_margin": step.view.fraction_margin,
         "fruits_seen": step.view.fruits_seen,
         "moves_left": step.moves_left,
         "action": step.action,

@@ -91,6 +91,10 @@ STEP: Final = _object(
         "T_world_camera": {**_POSE, "description": "the colour camera's optical frame"},
         "target_position": {**_POINT, "description": "base frame, in [m]"},
         "visible_fraction": {**_NUMBER, "description": "V_f"},
+        "fraction_margin": {
+            **_optional(_NUMBER),
+            "description": "how far off V_f may be; the run goes by V_f less this; null where V_f is exact",
+        },
         "fruits_seen": _INTEGER,
         "moves_left": _INTEGER,
         "action": {**_optional(_POINT), "description": "right, up, forward in [-1, 1]"},
@@ -98,7 +102,8 @@ STEP: Final = _object(
         "outcome": _TEXT,
         "detail": {**_TEXT, "description": "why a move was refused or the run ended"},
         "timing_ms": {"type": "object", "additionalProperties": _NUMBER},
-    }
+    },
+    "fraction_margin",
 )
 """Of `/step`."""
 

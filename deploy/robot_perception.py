@@ -58,6 +58,9 @@ class Sighting:
     """V_f, 0 if the target is not seen."""
     sure_fraction: float
     """Lower bound of V_f, by which a run ends."""
+    fraction_margin: float | None = None
+    """How far off V_f may be, by the perception's own account; `sure_fraction` is V_f less this, and at least 0. None
+    where V_f is exact, or nothing was measured."""
     mask: BinaryMask
     """Visible pixels of the target. Shape (H, W)."""
     fruits_seen: int
@@ -194,6 +197,7 @@ class ImagePerception:
             rays=perception.rays(),
             visible_fraction=float(perception.visible_fraction[0]),
             sure_fraction=float(perception.sure_fraction[0]),
+            fraction_margin=float(perception.fraction_margin[0]),
             mask=perception.mask(0),
             fruits_seen=sum(fruit.is_ripe for fruit in perception.views(0)[-1].fruits),
             target_position=perception.position_w(0),

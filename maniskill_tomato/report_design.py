@@ -6,6 +6,7 @@ import html
 import os
 import re
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
@@ -128,7 +129,11 @@ thead th:first-child, .words { text-align: left; }
 .dense thead th { font-size: 13px; min-width: 4em; }
 .tall thead th { position: sticky; top: 0; background: var(--card); }
 td.words, tbody th.words { white-space: normal; min-width: 15em; }
-td.command { text-align: left; }
+.listed th, .listed td { min-width: 0; }
+.listed tr.above > * { border-bottom: 0; padding-bottom: 2px; }
+tr.below td { padding-top: 0; text-align: left; white-space: normal; overflow-wrap: anywhere; }
+tr.below span { display: inline-block; max-width: 100%; }
+tr.below p { margin: 2px 0; max-width: none; }
 tbody tr:last-child > * { border-bottom: 0; }
 .bad { color: var(--tomato); font-weight: 600; }
 .good { color: var(--leaf); font-weight: 600; }
@@ -168,6 +173,16 @@ _PAGE: Final = """<!DOCTYPE html>
 </body>
 </html>
 """
+
+
+@dataclass(frozen=True, kw_only=True)
+class RowNotes:
+    """What stands under a row of a table."""
+
+    text: str = ""
+    """A sentence."""
+    command: str = ""
+    """A command to copy."""
 
 
 def rgb(colour: str) -> tuple[int, int, int]:
@@ -305,7 +320,7 @@ def table(
     head: Sequence[str],
     rows: Sequence[Sequence[str]],
     words: Sequence[int] = (),
-    commands: Sequence[int] = (),
+    below: Sequence[RowNotes] = (),
     tall: bool = False,
 ) -> str:
     """A table of texts whose first column names the rows; it is scrolled within its card where it is wide.
@@ -314,27 +329,44 @@ def table(
         head: Names of the columns.
         rows: As many texts each.
         words: Columns with sentences, which may take several lines.
-        commands: Columns with commands to copy.
+        below: What stands under each row, as wide as the table, in lines that wrap; empty if nothing does.
         tall: Whether a long table is scrolled within its card, too.
     """
-    kinds = {**dict.fromkeys(words, "words"), **dict.fromkeys(commands, "command")}
-
-    def cell(column: int, text: str) -> str:
-        kind = f' class="{kinds[column]}"' if column in kinds and text else ""
-        escaped = html.escape(text)
-        return f"<td{kind}>{f'<code>{escaped}</code>' if column in commands and text else escaped}</td>"
-
     cells = "".join(
-        f'<th scope="col"{" class=words" if column in kinds else ""}>{html.escape(text)}</th>'
+        f'<th scope="col"{" class=words" if column in words else ""}>{html.escape(text)}</th>'
         for column, text in enumerate(head)
     )
-    body = "".join(
-        f'<tr><th scope="row"{" class=words" if 0 in words else ""}>{html.escape(row[0])}</th>'
-        f"{''.join(cell(column, text) for column, text in enumerate(row[1:], start=1))}</tr>"
-        for row in rows
-    )
-    kind = "card scroll" + " tall" * tall + " dense" * (len(head) >= 8)
+    notes = below or (RowNotes(),) * len(rows)
+    body = "".join(_row(row, words, note) for row, note in zip(rows, notes, strict=True))
+    kind = "card scroll" + " tall" * tall + " dense" * (len(head) >= 8) + " listed" * bool(below)
     return f'<div class="{kind}"><table><thead><tr>{cells}</tr></thead><tbody>{body}</tbody></table></div>'
+
+
+def _row(row: Sequence[str], words: Sequence[int], note: RowNotes) -> str:
+    """A row of a table, and a second one where something stands under it."""
+
+    def kind(column: int) -> str:
+        return ' class="words"' if column in words else ""
+
+    cells = "".join(
+        f"<td{kind(column) if text else ''}>{html.escape(text)}</td>"
+        for column, text in enumerate(row[1:], start=1)
+    )
+    text = f"<p>{html.escape(note.text)}</p>" if note.text else ""
+    command = f"<p>{_wrapped_code(note.command)}</p>" if note.command else ""
+    under = text + command
+    more = f'<tr class="below"><td colspan="{len(row)}">{under}</td></tr>' if under else ""
+    above = ' class="above"' if under else ""
+    return f'<tr{above}><th scope="row"{kind(0)}>{html.escape(row[0])}</th>{cells}</tr>{more}'
+
+
+def _wrapped_code(command: str) -> str:
+    """A command whose lines end between words: browsers would also end them at the hyphens of options."""
+    words = (
+        f"<span>{html.escape(word)}</span>" if "-" in word else html.escape(word)
+        for word in command.split(" ")
+    )
+    return f"<code>{' '.join(words)}</code>"
 
 
 def folded(title: str, *parts: str, is_open: bool = False) -> str:

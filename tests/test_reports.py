@@ -12,9 +12,11 @@ import numpy as np
 import pytest
 from matplotlib.figure import Figure
 from matplotlib.text import Text
+from playwright.sync_api import sync_playwright
 
 import maniskill_tomato
 from maniskill_tomato import report_design
+from maniskill_tomato.experiments.episode_listing import ListedEpisode, episode_list
 from maniskill_tomato.report_design import figure, film, page, photo, section, table, tile, tiles
 from maniskill_tomato.report_plots import (
     MOST_LINES,
@@ -160,6 +162,48 @@ def test_nothing_is_wider_than_a_phone_unless_it_scrolls_by_itself(whole_page: s
         assert least / (PANEL[0] * 72.0) * 8.5 >= 9.0 and least <= 340
         # Titles of 10.5 pt; the page's own headings have 20 px.
         assert most / (PANEL[0] * 72.0) * 10.5 <= 20.0
+
+
+@pytest.mark.browser
+@pytest.mark.parametrize("width", [390, 1400])
+def test_a_list_of_episodes_is_whole_on_a_phone_and_its_commands_can_be_copied(
+    chromium: str, width: int, tmp_path: Path
+) -> None:
+    command = (
+        "maniskill-tomato eval TomatoViewpoint-v1 --policy runs/a-long-name-of-a-folder/training/policy.pt --seed 1 "
+        "--episodes 1 --no-baseline --out 'runs/again & again-1' --plant-pose 0.8 0.1 0.5"
+    )
+    listed = [
+        ListedEpisode(
+            seed=k,
+            success=bool(k),
+            reason="" if k else "the camera never detected the target, 11 moves with the arm in the plant",
+            moves=20,
+            start=0.25,
+            best=0.75,
+            command=command,
+        )
+        for k in range(3)
+    ]
+    (tmp_path / "report.html").write_text(page("A list", "", [episode_list(listed)], {}))
+    with sync_playwright() as playwright:
+        browser = playwright.chromium.launch(executable_path=chromium, args=("--no-sandbox",))
+        view = browser.new_page(viewport={"width": width, "height": 900})
+        view.goto((tmp_path / "report.html").as_uri())
+        assert view.evaluate("document.documentElement.scrollWidth") == width
+        card = view.locator(".card")
+        assert card.evaluate("card => card.scrollWidth - card.clientWidth") == 0
+        box = card.bounding_box()
+        assert box is not None
+        for cell in view.locator(".card th, .card td, .card p, .card code").all():
+            part = cell.bounding_box()
+            assert part is not None and part["width"] > 0.0
+            assert box["x"] <= part["x"] and part["x"] + part["width"] <= box["x"] + box["width"]
+        copied = view.locator("code").first.evaluate(
+            "code => { const s = getSelection(); s.selectAllChildren(code); return s.toString(); }"
+        )
+        browser.close()
+    assert copied == command
 
 
 def test_texts_are_shown_as_they_are(whole_page: str) -> None:

@@ -7,13 +7,13 @@ from typing import Any, Final, Literal
 
 from maniskill_tomato.experiments.camera_metrics import Cause, failure_cause
 from maniskill_tomato.experiments.episode_record import EpisodeRecord
-from maniskill_tomato.report_design import folded, paragraph, table
+from maniskill_tomato.report_design import RowNotes, folded, paragraph, table
 from maniskill_tomato.tasks import GENERAL_IDS
 
 LISTED: Final = 200
 """Episodes of a list; failures come first, and what is left out is counted."""
 
-HEAD: Final = ("episode", "outcome", "why", "moves", "V_f at the start", "best V_f", "run it again")
+HEAD: Final = ("episode", "outcome", "moves", "V_f at the start", "best V_f")
 
 CAUSES: Final[dict[Cause, str]] = {
     "never_detected": "the camera never detected the target",
@@ -128,17 +128,16 @@ def episode_list(
         (
             str(e.seed),
             "solved" if e.success else "failed",
-            e.reason,
             str(e.moves),
             "" if e.start is None else f"{e.start:.2f}",
             "" if e.best is None else f"{e.best:.2f}",
-            e.command,
         )
         for e in shown
     ]
+    below = [RowNotes(text=e.reason, command=e.command) for e in shown]
     parts = (
         paragraph(counted, "caption"),
-        table((noun, *HEAD[1:]), rows, words=(2,), commands=(6,), tall=True),
+        table((noun, *HEAD[1:]), rows, below=below, tall=True),
     )
     return "".join(parts) if title is None else folded(f"{title}: {counted}", parts[1])
 

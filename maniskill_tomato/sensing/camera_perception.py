@@ -295,15 +295,15 @@ class CameraPerception:
 
     @property
     def sure_fraction(self) -> Tensor:
-        """Lower bound of V_f: `MapConfig.stop_errors` standard errors less. Shape (N,), float32."""
+        """Lower bound of V_f: `visible_fraction` less `fraction_margin`, and at least 0. Shape (N,), float32."""
         return self._fractions(
             [max(s.fraction.value - self.config.stop_errors * s.fraction.error, 0.0) for s in self._searches]
         )
 
     @property
-    def fraction_error(self) -> Tensor:
-        """Standard error of `visible_fraction`. Shape (N,), float32."""
-        return self._fractions([search.fraction.error for search in self._searches])
+    def fraction_margin(self) -> Tensor:
+        """How far off `visible_fraction` may be: `MapConfig.stop_errors` standard errors. Shape (N,), float32."""
+        return self._fractions([self.config.stop_errors * s.fraction.error for s in self._searches])
 
     def rays(self) -> ViewRays:
         """The pattern about the believed positions, read from the last views; OUTSIDE where there is none yet."""

@@ -57,6 +57,21 @@ class Candidates:
     """The one that the camera moves towards."""
 
 
+@dataclass(frozen=True, kw_only=True)
+class MeasuredFraction:
+    """V_f as a camera measures it."""
+
+    value: float
+    """The estimate."""
+    margin: float
+    """How far off it may be, by the perception's own account; a task goes by the value less this."""
+
+    @property
+    def band(self) -> tuple[float, float, float]:
+        """The lower bound, the estimate, and as much above it, within 0 and 1."""
+        return max(self.value - self.margin, 0.0), self.value, min(self.value + self.margin, 1.0)
+
+
 @dataclass(frozen=True, eq=False, kw_only=True)
 class MappedFruit:
     """A fruit as a camera's map has it."""
@@ -73,6 +88,8 @@ class MappedFruit:
     """Whether it is more likely ripe than not."""
     is_target: bool
     """Whether the robot takes it for its target."""
+    fraction: MeasuredFraction | None = None
+    """V_f in the view that was just taken, with its error; None where the view does not show the fruit."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -93,21 +110,6 @@ class TargetRays:
     """Where each ends, in the world frame, in [m]. Shape (n, 3)."""
     is_seen: NDArray[np.bool_]
     """Whether that is on the target; what hides it otherwise. Shape (n,)."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class MeasuredFraction:
-    """V_f as a camera measures it."""
-
-    value: float
-    """The estimate."""
-    margin: float
-    """How far off it may be, by the perception's own account; a task goes by the value less this."""
-
-    @property
-    def band(self) -> tuple[float, float, float]:
-        """The lower bound, the estimate, and as much above it, within 0 and 1."""
-        return max(self.value - self.margin, 0.0), self.value, min(self.value + self.margin, 1.0)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

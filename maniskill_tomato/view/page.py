@@ -13,6 +13,7 @@ import numpy as np
 from maniskill_tomato.errors import TomatoError
 from maniskill_tomato.view.episode_recording import EpisodeRecording, Float64
 from maniskill_tomato.view.page_choices import EpisodeChoices, by_hand
+from maniskill_tomato.view.page_fruits import fruit_list
 from maniskill_tomato.view.page_hand import HandCamera
 from maniskill_tomato.view.page_head import head, last_moves
 from maniskill_tomato.view.page_plot import FractionPlot
@@ -154,6 +155,8 @@ class PlayPage:
         if not player.is_stored:
             with tabs.add_tab("Episode"):
                 self._choices = EpisodeChoices(gui, player, self.ask)
+            with tabs.add_tab("Fruits"):
+                self._fruits = gui.add_html("")
             with tabs.add_tab("Hand"):
                 self.target = TargetDrag(self.server, player, self.ask)
                 self.hand = HandCamera(self.server, player, self.ask)
@@ -220,6 +223,8 @@ class PlayPage:
         elif not self.player.is_stored:
             self._choices.tell()
             self.target.tell()
+            snapshot = recording.at(shown)
+            self._fruits.content = fruit_list(snapshot, has_map=snapshot.measured is not None)
 
 
 def way_of_joints(before: Float64, after: Float64) -> list[Float64]:

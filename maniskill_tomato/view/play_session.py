@@ -272,12 +272,20 @@ def _foliage(memory: OcclusionMemory) -> Foliage:
 def _measured(perception: CameraPerception) -> MeasuredFraction:
     return MeasuredFraction(
         value=float(perception.visible_fraction[0]),
-        margin=float(perception.config.stop_errors * perception.fraction_error[0]),
+        margin=float(perception.fraction_margin[0]),
     )
 
 
 def _fruits(perception: CameraPerception) -> tuple[MappedFruit, ...]:
-    target = perception.target(0)
+    target, fruits, view = perception.target(0), perception.map(0), perception.last_view(0)
+
+    def fraction(number: int) -> MeasuredFraction | None:
+        index = None if view is None else view.detection(number)
+        if view is None or index is None:
+            return None
+        seen = fruits.fraction(view.measurement, index, number)
+        return MeasuredFraction(value=seen.value, margin=fruits.config.stop_errors * seen.error)
+
     return tuple(
         MappedFruit(
             number=track.number,
@@ -286,7 +294,8 @@ def _fruits(perception: CameraPerception) -> tuple[MappedFruit, ...]:
             spread=float(np.sqrt(np.linalg.eigvalsh(track.covariance[:3, :3])[-1])),
             is_ripe=track.is_ripe,
             is_target=track is target,
+            fraction=fraction(track.number),
         )
-        for track in perception.map(0).tracks.values()
+        for track in fruits.tracks.values()
         if track.existence > 0.5
     )

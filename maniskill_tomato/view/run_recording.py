@@ -11,7 +11,13 @@ from maniskill_tomato.deploy.run_records import Step
 from maniskill_tomato.deploy.run_replay import load_recording
 from maniskill_tomato.robot.arm_model import ArmModel
 from maniskill_tomato.robot.d435 import CameraIntrinsics
-from maniskill_tomato.view.episode_recording import EpisodeRecording, Float64, SeenPoints, Snapshot
+from maniskill_tomato.view.episode_recording import (
+    EpisodeRecording,
+    Float64,
+    MeasuredFraction,
+    SeenPoints,
+    Snapshot,
+)
 
 MOST_POINTS: Final = 20_000
 """Of a larger picture every second, third ... pixel in each direction becomes a point."""
@@ -49,6 +55,8 @@ def read_run(path: Path) -> EpisodeRecording:
             T_w_camera=np.array(facts["T_world_camera"], dtype=np.float64),
             target_position=np.array(facts["target_position"], dtype=np.float64),
             visible_fraction=float(facts["visible_fraction"]),
+            # Recordings of earlier versions do not say how sure V_f was.
+            fraction_margin=facts.get("fraction_margin"),
             outcome=str(facts["outcome"]),
             detail=str(facts["detail"]),
         )
@@ -88,6 +96,7 @@ class RunRecorder:
             T_w_camera=step.T_world_camera,
             target_position=step.target_position,
             visible_fraction=float(step.view.visible_fraction),
+            fraction_margin=step.view.fraction_margin,
             outcome=step.outcome,
             detail=step.detail,
         )
@@ -103,6 +112,7 @@ class RunRecorder:
         T_w_camera: Float64,
         target_position: Float64,
         visible_fraction: float,
+        fraction_margin: float | None,
         outcome: str,
         detail: str,
     ) -> None:
@@ -114,10 +124,14 @@ class RunRecorder:
             T_w_camera: Pose of the colour camera. Shape (4, 4).
             target_position: In [m]. Shape (3,).
             visible_fraction: V_f as it was measured.
+            fraction_margin: How far off it may be; None where it is exact, or nobody knows.
             outcome: As in `deploy.run_records.Step`.
             detail: Likewise.
         """
         truth = frame.truth
+        measured = None
+        if fraction_margin is not None:
+            measured = MeasuredFraction(value=visible_fraction, margin=float(fraction_margin))
         recording = self.recording
         recording.fov_y = float(frame.intrinsics.fov_y)
         recording.snapshots.append(
@@ -125,7 +139,8 @@ class RunRecorder:
                 joint_positions=joint_positions,
                 T_w_camera=T_w_camera,
                 target_position=target_position,
-                visible_fraction=visible_fraction,
+                visible_fraction=visible_fraction if measured is None else measured.band[0],
+                measured=measured,
                 true_visible_fraction=None if truth is None else truth.visible_fraction,
                 picture=_thinned(frame.color),
                 points=_points(frame, T_w_camera),

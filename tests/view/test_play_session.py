@@ -1,5 +1,6 @@
 """Episodes stepped for a viewer: they are those of an evaluation, and snapshots tell what was known and decided."""
 
+import re
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +15,7 @@ from maniskill_tomato.policies.opening import open_policy
 from maniskill_tomato.sensing.occlusion_memory import CELL_SIZE
 from maniskill_tomato.tasks.vector_env import make_vector_env
 from maniskill_tomato.view.episode_recording import EpisodeRecording, Voxel
+from maniskill_tomato.view.page_fruits import fruit_list
 from maniskill_tomato.view.page_head import headline
 from maniskill_tomato.view.page_plot import curves
 from maniskill_tomato.view.plant_meshes import organ_colours
@@ -134,6 +136,31 @@ def test_a_camera_tells_how_far_off_its_fraction_may_be_and_goes_by_the_lower_ed
     for name, edge in (("at least", 0), ("V_f", 1), ("at most", 2)):
         np.testing.assert_allclose(lines[name], [band[edge] for band in bands])
     assert f"from {bands[1][0]:.2f} to {bands[1][2]:.2f}" in headline(session.recording, 1)
+
+
+def test_the_list_of_fruits_tells_how_far_off_the_fraction_of_each_may_be() -> None:
+    session = PlaySession(PlaySettings(perception="occlusion_model", policy="nbv", target="any"))
+    session.step()
+    snapshot = session.recording.snapshots[-1]
+    target = next(fruit for fruit in snapshot.fruits if fruit.is_target)
+    assert target.fraction is not None and snapshot.measured is not None
+    np.testing.assert_allclose(target.fraction.band, snapshot.measured.band, atol=1e-6)
+    seen = [fruit for fruit in snapshot.fruits if fruit.fraction is not None]
+    assert 1 < len(seen) and all(f.fraction.margin > 0.0 for f in seen if f.fraction is not None)
+    rows = re.findall(r"<tr.*?</tr>", fruit_list(snapshot, has_map=True))[1:]
+    texts = [re.sub(r"<[^>]+>", "|", row) for row in rows]
+    assert len(texts) == len(snapshot.fruits) and f"{target.number}, " in texts[0] and ", target" in texts[0]
+    for fruit in snapshot.fruits:
+        (text,) = (t for t in texts if t.strip("|").startswith(f"{fruit.number}, "))
+        if fruit.fraction is None:
+            assert "|-||-|" in text
+        else:
+            low, value, high = fruit.fraction.band
+            assert f"|{value:.2f}||{low:.2f} to {high:.2f}|" in text
+        assert text.rstrip("|").endswith(f"{1000.0 * fruit.spread:.0f} mm")
+        assert ("unripe" not in text) == fruit.is_ripe
+    session = PlaySession(PlaySettings(policy="nbv"))
+    assert "The exact senses need no map" in fruit_list(session.recording.snapshots[0], has_map=False)
 
 
 def test_a_refused_move_is_told_with_its_reason() -> None:

@@ -12,6 +12,8 @@ from maniskill_tomato.deploy.profile import load_profile
 from maniskill_tomato.deploy.run_records import KeptSteps, RunResult, Step
 from maniskill_tomato.view.episode_recording import EpisodeRecording
 from maniskill_tomato.view.live_run import LiveView
+from maniskill_tomato.view.page_head import headline
+from maniskill_tomato.view.page_plot import curves
 from maniskill_tomato.view.run_recording import read_run
 
 
@@ -46,13 +48,39 @@ def test_a_recording_is_read_as_the_looks_of_its_run(
 ) -> None:
     recording = read_run(folder / "run.mcap")
     assert recording.plant is None and recording.moves == len(kept.steps) - 1 > 0
+    measured = [s.measured.value for s in recording.snapshots if s.measured is not None]
     # The result is rounded to four decimals.
-    np.testing.assert_allclose(recording.visible_fractions, result.visible_fractions, atol=5.1e-5)
+    np.testing.assert_allclose(measured, result.visible_fractions, atol=5.1e-5)
     for snapshot, step in zip(recording.snapshots, kept.steps, strict=True):
         np.testing.assert_allclose(snapshot.joint_positions, step.joint_positions)
         np.testing.assert_allclose(snapshot.T_w_camera, step.T_world_camera)
     assert recording.outcome.startswith(f"{result.reason}: {result.detail}")
     assert [s.event.split(":")[0] for s in recording.snapshots[1:]] == [s.outcome for s in kept.steps[:-1]]
+
+
+def test_a_recording_tells_how_far_off_a_fraction_may_be_and_goes_by_the_lower_edge(
+    folder: Path, kept: KeptSteps, result: RunResult, live: EpisodeRecording
+) -> None:
+    for recording in (read_run(folder / "run.mcap"), live):
+        lines = {str(series.get("label")): values for series, values in curves(recording)}
+        sure = [step.view.sure_fraction for step in kept.steps]
+        np.testing.assert_allclose(recording.visible_fractions, sure, atol=1e-6)
+        np.testing.assert_allclose(lines["at least"], sure, atol=1e-6)
+        np.testing.assert_allclose(
+            lines["V_f"], [step.view.visible_fraction for step in kept.steps], atol=1e-6
+        )
+        assert (lines["at most"] > lines["V_f"]).all() and lines["at most"].max() <= 1.0
+        low, high = lines["at least"][0], lines["at most"][0]
+        assert f"from {low:.2f} to {high:.2f}" in headline(recording, 0)
+
+
+def test_recordings_that_do_not_say_how_sure_a_fraction_was_are_shown_without_a_band() -> None:
+    """`deploy run` wrote it before it stored that."""
+    recording = read_run(Path(__file__).parents[1] / "deploy" / "data" / "json_recording.mcap")
+    assert [s.measured for s in recording.snapshots] == [None] * 3
+    np.testing.assert_allclose(recording.visible_fractions, [0.1668, 0.2963, 0.5049], atol=5.1e-5)
+    labels = [series.get("label") for series, _ in curves(recording)]
+    assert labels == ["V_f", "truly", "full"]
 
 
 def test_points_lie_where_the_camera_measured_depth(folder: Path, kept: KeptSteps, result: RunResult) -> None:
