@@ -24,7 +24,7 @@ class Berry:
     oblateness: float
     """Height over width."""
     ribs: int
-    """Number of ribs (locules that show)."""
+    """Number of ribs."""
     rib_depth: float
     """Depth of the ribs at the shoulder over the radius."""
     rib_phase: float

@@ -1,4 +1,4 @@
-"""Compound leaves: a drooping rachis with uneven pairs of leaflets and small ones between them."""
+"""Leaves: a drooping stalk (rachis) with uneven pairs of leaflets and small ones between them."""
 
 from dataclasses import dataclass, replace
 from math import atan2, cos, pi, radians, sin, sqrt

@@ -26,7 +26,7 @@ class Leaflet:
     lobes: float
     """Lobes per side."""
     depth: float
-    """Depth of the sinuses over the half width."""
+    """Depth of the notches between lobes over the half width."""
     curl: float
     """Downward turn of the midrib over its length, in [rad]."""
     fold: float
@@ -53,7 +53,7 @@ def _half_width(leaflet: Leaflet, t: Float64, side: Float64, *, serrate: bool) -
     t = np.minimum(np.maximum(t, 0.0), 1.0)
     envelope = 2.585 * t**0.45 * (1.0 - t) ** 1.15
     lobe_phase = 2 * pi * leaflet.lobes * t**0.9 + np.where(side > 0, leaflet.phases[0], leaflet.phases[1])
-    # A raised cosine to a power: round lobes and narrow sinuses.
+    # A raised cosine to a power: round lobes and narrow notches.
     sinus = (0.5 + 0.5 * np.cos(lobe_phase)) ** 1.7
     depth = leaflet.depth * (1.0 - 0.75 * t)
     outline = envelope * (1.0 - depth * sinus)
@@ -101,7 +101,7 @@ def _rows(leaflet: Leaflet, *, picture: bool) -> Float64:
         return np.linspace(0.0, 1.0, 9 if leaflet.small else 33)
     if leaflet.small:
         return np.array([0.0, 0.3, 0.68, 1.0])
-    # Cuts at the lobes' tips and sinuses keep the outline with few triangles.
+    # Cuts at the tips of lobes and in notches keep the outline with few triangles.
     phase = 0.5 * (leaflet.phases[0] + leaflet.phases[1])
     turns = (np.arange(-2, 2 * leaflet.lobes + 2) * pi - phase) / (2 * pi * leaflet.lobes)
     inner = turns[(turns > 0.06) & (turns < 0.90)] ** (1 / 0.9)

@@ -37,37 +37,39 @@ def check_ranges(config: object) -> None:
 
 @dataclass(frozen=True, kw_only=True)
 class StemConfig:
-    """The main shoot, trained up a string."""
+    """The main stem, tied up a string."""
 
     height: float = 1.5
-    """Height of the apex above the ground, in [m]; [blender] 1.25 +- 0.1, raised to the robot's working
+    """Height of the stem's tip above the ground, in [m]; [blender] 1.25 +- 0.1, raised to the robot's working
     height."""
     base_radius: float = 0.0085
-    """Radius at the ground, in [m]; [blender] 9 mm."""
+    """Radius of the stem at the ground, in [m]; [blender] 9 mm."""
     tip_radius_ratio: float = 0.42
-    """Radius at the apex over the radius at the ground; [blender] 42 %."""
+    """Radius at the stem's tip as a share of that at the ground; [blender] 42 %."""
     internode_length: float = 0.071
-    """Mean distance between nodes above the first truss, in [m]; [practice] 7-8 cm in a high-wire crop."""
+    """Mean distance between nodes above the first truss, in [m]; [practice] 7-8 cm on vines tied up a string.
+    """
     lower_internode_length: float = 0.053
     """Mean distance between nodes below the first truss, in [m]; [WUR] 5.3 cm on young plants."""
     internode_spread: float = 0.09
-    """Standard deviation of an internode's length over its mean; [WUR] order of its error, 6-12 %."""
+    """Standard deviation of the distance between nodes as a share of its mean; [WUR] order of its error, 6-12
+    %."""
     divergence_mean_deg: float = 135.3
-    """Mean angle between successive leaves, in [deg]; [phyllotaxis]."""
+    """Mean angle about the stem from one leaf to the next, in [deg]; [phyllotaxis]."""
     divergence_spread_deg: float = 7.0
     """Standard deviation of that angle, in [deg]; fits the observed range of [phyllotaxis]."""
     divergence_range_deg: tuple[float, float] = (119.3, 154.7)
-    """Smallest and largest divergence angle, in [deg]; [phyllotaxis]."""
+    """Smallest and largest of these angles, in [deg]; [phyllotaxis]."""
     nodes_below_first_truss: int = 8
-    """Leaves that the shoot makes before its first truss; [Helios] first floral node at 8 or later."""
+    """Leaves that the stem makes before its first truss; [Helios] first flowers at node 8 or later."""
     leaves_per_truss: int = 3
-    """Leaves of one sympodial unit; 3 in indeterminate cultivars, [yjmpc] and [practice]."""
+    """Leaves from one truss to the next; 3 in cultivars that keep growing, [yjmpc] and [practice]."""
     wander: float = 0.008
-    """Amplitude of the stem's slow sideways wander on its string, in [m]; [looks]."""
+    """How far the stem wanders to the side of its string, in slow waves, in [m]; [looks]."""
     zigzag: float = 0.0022
-    """Sideways step of the axis at each node, away from the leaf, in [m]; [looks]."""
+    """Sideways step of the stem at each node, away from the leaf, in [m]; [looks]."""
     node_swelling: float = 0.26
-    """Thickening of the stem at a node over its radius; [looks]."""
+    """How much thicker the stem is at a node, as a share of its radius; [looks]."""
 
     def __post_init__(self) -> None:
         check_positive(self, "height", "base_radius", "internode_length", "lower_internode_length")
@@ -86,65 +88,66 @@ class StemConfig:
 
 @dataclass(frozen=True, kw_only=True)
 class LeafConfig:
-    """Compound, odd-pinnate leaves."""
+    """Leaves of several leaflets: pairs along the rachis and one leaflet at its tip."""
 
     length_range: tuple[float, float] = (0.26, 0.37)
-    """Length of petiole and rachis of a grown leaf, without the terminal leaflet, in [m]; [yjmpc] 15-45 cm
+    """Length of petiole and rachis of a grown leaf, without the leaflet at the tip, in [m]; [yjmpc] 15-45 cm
     overall."""
     insertion_deg: float = 59.0
-    """Angle between petiole and upward stem, in [deg]; [WUR] 59."""
+    """Angle between the petiole and the stem above it, in [deg]; [WUR] 59."""
     insertion_spread_deg: float = 6.5
     """Standard deviation of that angle, in [deg]; [WUR] mean absolute error 6.5."""
     end_angle_range_deg: tuple[float, float] = (112.0, 150.0)
-    """Angle of the rachis to the upward vertical at its tip (90 is level, 180 hangs), in [deg]; [looks],
-    [Helios]."""
+    """Direction of the rachis at its tip, as an angle to the upward vertical (90 is level, 180 hangs straight
+    down), in [deg]; [looks], [Helios]."""
     sway_spread_deg: float = 9.0
-    """Standard deviation of the sideways bend of a rachis, in [deg]; [looks]."""
+    """Standard deviation of a rachis's bend to the side, in [deg]; [looks]."""
     pairs_range: tuple[int, int] = (2, 4)
-    """Pairs of large lateral leaflets, so 5 to 9 leaflets with the terminal one; [yjmpc] 5-9, [Helios] 7-9.
-    """
+    """Pairs of large side leaflets, so 5 to 9 leaflets with the one at the tip; [yjmpc] 5-9, [Helios] 7-9."""
     petiole_fraction: float = 0.30
-    """Part of the petiole and rachis that is bare, from the stem to the first leaflets; [looks]."""
+    """Share of the leaf's stalk that is petiole: bare, from the stem to the first leaflets; [looks]."""
     leaflet_angle_deg: float = 66.0
-    """Angle of a lateral leaflet to the rachis before it droops, in [deg]; [looks]."""
+    """Angle of a side leaflet to the rachis before it droops, in [deg]; [looks]."""
     leaflet_angle_spread_deg: float = 7.0
-    """Standard deviation of that angle, in [deg]; [Helios] leaflet yaw 10."""
+    """Standard deviation of that angle, in [deg]; [Helios] 10."""
     leaflet_roll_spread_deg: float = 13.0
-    """Standard deviation of a leaflet's roll about its midrib, in [deg]; [Helios] +-20."""
+    """Standard deviation of a leaflet's turn about its middle vein, in [deg]; [Helios] +-20."""
     leaflet_stalk: float = 0.016
-    """Length of a lateral leaflet's own stalk, in [m]; [looks]."""
+    """Length of a side leaflet's own stalk, in [m]; [looks]."""
     petiole_radius: float = 0.0026
     """Radius of the petiole at the stem, in [m]; [Helios] 2-2.5 mm."""
     leaflet_length_range: tuple[float, float] = (0.118, 0.155)
-    """Length of the terminal leaflet, in [m]; [Helios] 0.12-0.18, [looks]."""
+    """Length of the leaflet at the tip, in [m]; [Helios] 0.12-0.18, [looks]."""
     lateral_scale: float = 0.82
-    """Length of the largest lateral leaflets over that of the terminal one; [Helios] 0.7-0.9."""
+    """Length of the largest side leaflets as a share of that of the leaflet at the tip; [Helios] 0.7-0.9."""
     leaflet_aspect: float = 0.68
-    """Width over length of a leaflet; [Helios] 0.5-0.6; [looks]."""
+    """Width of a leaflet as a share of its length; [Helios] 0.5-0.6; [looks]."""
     lobes_per_side: float = 3.5
     """Lobes or large teeth on each side of a leaflet; [yjmpc] lobed, uneven; [looks]."""
     lobe_depth: float = 0.36
-    """Depth of the sinuses near the leaflet's base over its half width; shallower towards the tip; [looks].
-    """
+    """Depth of the notches between lobes as a share of half the leaflet's width, near its base; they are
+    shallower towards the tip; [looks]."""
     leaflet_curl_range_deg: tuple[float, float] = (25.0, 65.0)
-    """Turn of the midrib from base to tip, downward, in [deg]; [Helios] strong negative curvature; [looks].
-    """
+    """How far a leaflet's middle vein turns downward from base to tip, in [deg]; [Helios] strongly bent down;
+    [looks]."""
     leaflet_droop_range: tuple[float, float] = (0.25, 0.75)
-    """Pull of gravity on a leaflet's direction, as a weight against 1 for its own direction; [looks]."""
+    """Pull of gravity on a leaflet's direction: its weight where the leaflet's own direction has weight 1;
+    [looks]."""
     fold: float = 0.16
-    """Rise of each half of the blade from the midrib over its half width; [Helios] fold 0.1."""
+    """How far each half of a leaflet rises from the middle vein to the edge, as a share of half its width;
+    [Helios] 0.1."""
     lateral_curve: float = 0.42
-    """Fall of the margin by lateral curvature over the half width; [Helios] -0.3 to -0.8."""
+    """How far the edge of a leaflet is bent down, as a share of half its width; [Helios] 0.3 to 0.8."""
     waviness: float = 0.10
-    """Amplitude of the wave of the margin over the half width; [looks]."""
+    """Height of the waves of a leaflet's edge as a share of half its width; [looks]."""
     intercalary_per_gap: int = 1
-    """Pairs of small leaflets between two large pairs; [yjmpc] size uneven; [looks]."""
+    """Pairs of small leaflets between two large pairs; [yjmpc] uneven in size; [looks]."""
     intercalary_scale: float = 0.24
-    """Length of a small leaflet over that of the terminal one; [looks]."""
+    """Length of a small leaflet as a share of that of the leaflet at the tip; [looks]."""
     young_leaves: int = 5
-    """Leaves below the apex that are still growing; [looks]."""
+    """Leaves below the stem's tip that are still growing; [looks]."""
     youngest_size: float = 0.34
-    """Size of the youngest leaf relative to a grown one; [looks]."""
+    """Size of the youngest leaf as a share of a grown one; [looks]."""
 
     def __post_init__(self) -> None:
         check_ranges(self)
@@ -155,26 +158,26 @@ class LeafConfig:
 
 @dataclass(frozen=True, kw_only=True)
 class TrussConfig:
-    """Scorpioid cymes: a peduncle with pedicels to the right and left in turn."""
+    """Trusses: a peduncle with pedicels to the right and left in turn."""
 
     azimuth_spread_deg: float = 38.0
-    """Standard deviation of a truss's direction about the aisle's (-x), in [deg]; [practice] trusses hang to
-    the aisle."""
+    """Standard deviation of the direction in which a truss grows about that of the aisle (-x), in [deg];
+    [practice] trusses hang to the aisle."""
     insertion_deg: float = 74.0
-    """Angle between peduncle and upward stem, in [deg]; [looks], [Helios] pitch 20 below level after bending.
-    """
+    """Angle between the peduncle and the stem above it, in [deg]; [looks], [Helios] 20 below level after
+    bending."""
     end_angle_deg: float = 172.0
-    """Angle of the peduncle's tip to the upward vertical, in [deg]; it hangs under the fruits' weight;
-    [looks]."""
+    """Direction of the peduncle at its tip, as an angle to the upward vertical (180 hangs straight down), in
+    [deg]; the fruits pull it down; [looks]."""
     base_length: float = 0.055
-    """Peduncle from the stem to the first pedicel, in [m]; [airobotsight] rachis 170 mm for a whole truss;
-    [looks]."""
+    """Length of the peduncle from the stem to the first pedicel, in [m]; [airobotsight] 170 mm for a whole
+    truss; [looks]."""
     pedicel_spacing: float = 0.026
-    """Peduncle between pedicels, in [m]; [airobotsight] 170 mm rachis over 6-8 fruits."""
+    """Distance between pedicels along the peduncle, in [m]; [airobotsight] 170 mm for 6-8 fruits."""
     base_radius: float = 0.0033
-    """Radius of the peduncle at the stem, in [m]; [Ci] 7 mm across at maturity."""
+    """Radius of the peduncle at the stem, in [m]; [Ci] 7 mm across when ripe."""
     tip_radius_ratio: float = 0.58
-    """Radius at the peduncle's tip over that at its base; [airobotsight] 1.9 of 3.3 mm."""
+    """Radius at the peduncle's tip as a share of that at its base; [airobotsight] 1.9 of 3.3 mm."""
     pedicel_length_range: tuple[float, float] = (0.024, 0.034)
     """Length of a pedicel from peduncle to calyx, in [m]; [looks]."""
     pedicel_angle_deg: float = 62.0
@@ -182,23 +185,24 @@ class TrussConfig:
     pedicel_angle_spread_deg: float = 9.0
     """Standard deviation of that angle, in [deg]; [looks]."""
     fruit_drop: float = 0.045
-    """How far a single fruit hangs below its truss's node, in [m]; places the nodes for `fruit_heights`."""
+    """How far a single fruit hangs below the node of its truss, in [m]; the nodes are placed by it where
+    `fruit_heights` are given."""
     pedicel_radius: float = 0.0015
     """Radius of a pedicel, in [m]; [Helios] 1.5 mm."""
     knuckle_fraction: float = 0.55
-    """Where on the pedicel the knuckle (abscission zone) sits, from the peduncle; [looks]."""
+    """Where the knuckle sits on the pedicel, as a share of the way from peduncle to calyx; [looks]."""
     knuckle_swelling: float = 0.75
-    """Thickening of the pedicel at its knuckle over its radius; [looks]."""
+    """How much thicker the pedicel is at its knuckle, as a share of its radius; [looks]."""
     sepals: int = 5
-    """Sepals of a calyx; five-merous flower."""
+    """Sepals of a calyx; a tomato flower has five."""
     sepal_length: float = 1.0
-    """Length of a sepal over the fruit's radius; [looks]."""
+    """Length of a sepal as a share of the fruit's radius; [looks]."""
     sepal_width: float = 0.0056
     """Width of a sepal on a fruit of 30 mm radius, in [m]; [looks]."""
     sepal_curl: float = 0.95
-    """Mean upward curl of a sepal towards its tip, in [rad]; [looks]."""
+    """Mean upward bend of a sepal from base to tip, in [rad]; [looks]."""
     sepal_curl_spread: float = 0.45
-    """Standard deviation of that curl, in [rad]; [looks]."""
+    """Standard deviation of that bend, in [rad]; [looks]."""
 
     def __post_init__(self) -> None:
         check_ranges(self)
@@ -208,16 +212,17 @@ class TrussConfig:
 
 @dataclass(frozen=True, kw_only=True)
 class FlowerConfig:
-    """Flowers of a truss that has set no fruit yet."""
+    """Flowers of a truss that has no fruit yet."""
 
     count_range: tuple[int, int] = (4, 8)
     """Open flowers of a truss; [practice] as many as fruits or a few more."""
     spacing: float = 0.014
-    """Peduncle between flowers, in [m]; [looks]."""
+    """Distance between flowers along the peduncle, in [m]; [looks]."""
     pedicel_length_range: tuple[float, float] = (0.012, 0.02)
     """Length of a flower's stalk, in [m]; [looks]."""
     end_angle_deg: float = 120.0
-    """Angle of the peduncle's tip to the upward vertical, in [deg]; no fruit pulls at it yet; [looks]."""
+    """Direction of the peduncle at its tip, as an angle to the upward vertical, in [deg]; no fruit pulls at it
+    yet; [looks]."""
     bud_radius: float = 0.0025
     """Radius of what the sepals and petals stand on, in [m]; [looks]."""
     sepal_length: float = 0.009
@@ -227,39 +232,39 @@ class FlowerConfig:
     petal_width: float = 0.005
     """Largest width of a petal, in [m]; [looks]."""
     petal_bend_deg: float = 110.0
-    """Turn of a petal from its base to its tip, backwards, in [deg]; [looks]."""
+    """How far a petal bends backwards from its base to its tip, in [deg]; [looks]."""
     petal_bend_spread_deg: float = 25.0
-    """Standard deviation of that turn, in [deg]; [looks]."""
+    """Standard deviation of that bend, in [deg]; [looks]."""
     anther_length: float = 0.008
-    """Length of the cone of anthers, in [m]; [looks]."""
+    """Length of the yellow cone in the middle of a flower (its anthers), in [m]; [looks]."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class FruitConfig:
-    """Berries: size, shape and how ripe they are."""
+    """Fruits: their size and shape, and how ripe they are."""
 
     radius_range: tuple[float, float] = (0.026, 0.033)
-    """Equatorial radius of a grown fruit, in [m]; truss tomatoes are 50-65 mm across."""
+    """Radius of a grown fruit where it is widest, in [m]; truss tomatoes are 50-65 mm across."""
     oblateness_range: tuple[float, float] = (0.86, 0.95)
-    """Height over width; slightly flattened round type; [looks]."""
+    """Height of a fruit as a share of its width; slightly flattened round type; [looks]."""
     ribs_range: tuple[int, int] = (5, 7)
-    """Number of ribs, as many as locules show; truss tomatoes have few."""
+    """Number of ribs; each shows one of the chambers within, of which truss tomatoes have few."""
     rib_depth_range: tuple[float, float] = (0.004, 0.018)
-    """Depth of the ribs at the shoulder over the radius; [looks]."""
+    """Depth of the ribs near the calyx as a share of the radius; [looks]."""
     shoulder_dent: float = 0.14
-    """Depth of the dent around the calyx over the radius; [looks]."""
+    """Depth of the dent around the calyx as a share of the radius; [looks]."""
     tilt_spread_deg: float = 9.0
-    """Standard deviation of the fruit's axis about its pedicel's end, in [deg]; [looks]."""
+    """Standard deviation of the tilt of a fruit at the end of its pedicel, in [deg]; [looks]."""
     truss_ripening_step: float = 0.30
-    """Loss of ripeness (0 to 1) from one truss to the next above; about 8 days a truss, [practice]."""
+    """How much less ripe the next truss above is, ripeness being 0 to 1; about 8 days a truss, [practice]."""
     fruit_ripening_step: float = 0.055
-    """Loss of ripeness from one fruit to the next, further from the stem; [practice]."""
+    """How much less ripe the next fruit is, going outward from the stem; [practice]."""
     ripeness_spread: float = 0.05
     """Standard deviation of a fruit's ripeness; [looks]."""
     ripe_above: float = 0.62
     """Ripeness from which a fruit is red all over; between it and `turning_above` it is turning."""
     turning_above: float = 0.34
-    """Ripeness from which a fruit leaves green."""
+    """Ripeness from which a fruit is no longer green."""
 
     def __post_init__(self) -> None:
         check_ranges(self)
@@ -284,37 +289,41 @@ class HidingConfig:
     gap_range: tuple[float, float] = (0.010, 0.034)
     """Gap between the fruit's skin and the leaflet that hangs before it, in [m]."""
     offset_range: tuple[float, float] = (0.000, 0.032)
-    """Shift of that leaflet away from the clear side, in [m]."""
+    """Shift of that leaflet away from the side that stays clear, in [m]."""
     covered_views_deg: tuple[tuple[float, float], ...] = (
         (0.0, 0.0),
         (-22.0, 4.0),
         (12.0, 4.0),
         (-10.0, 20.0),
     )
-    """Azimuth and elevation of the views that a leaf is hung to cover, in [deg]."""
+    """Views that a leaf is hung to cover, each by its azimuth and elevation, in [deg]."""
     attempts: int = 8
-    """Leaves tried for each fruit, of which the best covers these views and spares the clear one."""
+    """Leaves tried for each fruit; the one is taken that best covers these views and leaves the clear
+    direction open."""
     clear_right_share: float = 0.75
-    """Share of fruits whose clear side is -y, where the thesis's guided exploration (Eq. 5-6) leads."""
+    """Share of the fruits whose clear side is -y, to which the thesis's guided exploration (Eq. 5-6) leads.
+    """
     clear_azimuth_range_deg: tuple[float, float] = (36.0, 62.0)
-    """Angle of the clear direction to the robot's side, in [deg]."""
+    """Angle between the clear direction and the robot's side, in [deg]."""
     clear_elevation_range_deg: tuple[float, float] = (-36.0, -10.0)
     """Elevation of the clear direction, in [deg]; negative is from below, where leaves hang open."""
     truss_spread_deg: float = 10.0
-    """Standard deviation of a truss's direction about that of the leaf above it, in [deg]; it hangs under the
-    leaf."""
+    """Standard deviation of the direction of a truss about that of the leaf above it, in [deg]; it hangs under
+    the leaf."""
     truss_lean: float = 0.8
-    """Truss's angle to the robot's side after it has leaned to the aisle, over the angle before; [practice].
-    """
+    """Trusses lean towards the aisle: what remains of a truss's angle to the robot's side, as a share;
+    [practice]."""
     plant_turn_spread_deg: float = 9.0
-    """Standard deviation of the direction of the leaf above the middle fruit about the robot's side, in
-    [deg]."""
+    """Standard deviation of the direction of the leaf above the middle fruit about the robot's side, in [deg].
+    """
     clear_half_angle_deg: float = 8.0
-    """Half angle by which the corridor free of other leaves widens away from the fruit, in [deg]."""
+    """The corridor along the clear direction, which other leaves leave free, widens away from the fruit by
+    this angle to each side, in [deg]."""
     clear_share: float = 0.95
-    """Share of the fruit that the covering leaf shall leave open in the clear direction."""
+    """Share of the fruit that the covering leaf must leave open in the clear direction."""
     curtain_clear_share: float = 0.80
-    """Radius over the fruit's radius of the corridor that the covering leaf's side leaflets keep free."""
+    """Radius of the corridor that the side leaflets of the covering leaf leave free, as a share of the fruit's
+    radius."""
 
     def __post_init__(self) -> None:
         check_ranges(self)
@@ -330,7 +339,7 @@ class PlantConfig:
     name: str = "full"
     """Name of the preset, kept in `Plant.preset`."""
     stem: StemConfig = field(default_factory=StemConfig)
-    """Numbers of the main shoot."""
+    """Numbers of the main stem."""
     leaf: LeafConfig = field(default_factory=LeafConfig)
     """Numbers of the leaves."""
     truss: TrussConfig = field(default_factory=TrussConfig)
@@ -340,21 +349,21 @@ class PlantConfig:
     flower: FlowerConfig = field(default_factory=FlowerConfig)
     """Numbers of the flowers."""
     fruits_per_truss: tuple[int, ...] = (6, 6, 5, 4, 2)
-    """Fruits of each truss from the lowest up; ~8 on cocktail, 6-7 on plum trusses before pruning;
-    [practice]."""
+    """Fruits of each truss, from the lowest up; about 8 on cocktail and 6-7 on plum trusses before some are
+    cut off; [practice]."""
     fruit_heights: tuple[float, ...] = ()
-    """Heights of the fruits over the ground, in [m], when each truss carries a single one; empty leaves them
+    """Heights of the fruits above the ground where each truss carries a single one, in [m]; empty leaves them
     free."""
     fruit_height_spread: float = 0.0
-    """Half width of the uniform spread about `fruit_heights`, in [m]."""
+    """Heights are drawn evenly from so far below to so far above `fruit_heights`, in [m]."""
     hiding: HidingConfig | None = None
-    """How leaves hang before the fruits, for the thesis's plants with a single fruit a truss; None leaves
-    them free."""
+    """How leaves hang before the fruits, on the thesis's plants with one fruit a truss; None leaves the leaves
+    where they grow."""
     leaves_kept_below_truss: int = 0
     """Leaves left below the lowest truss; growers take them off as it ripens; [practice]."""
     leaf_density: float = 1.0
-    """Foliage relative to the preset: 0 none, below 1 leaves and leaflets are left out, above 1 side-shoot
-    leaves, at 4 three at every node."""
+    """Foliage as a multiple of the preset's: at 0 there is none; below 1, leaves and leaflets are left out;
+    above 1, leaves of side shoots are added, at 4 three to a node."""
     shoots: int = 1
     """Shoots from the ground: 1 for a vine, more for a bush."""
     shoot_lean_range_deg: tuple[float, float] = (6.0, 24.0)
@@ -364,7 +373,7 @@ class PlantConfig:
     flowering_trusses: int = 0
     """Trusses in flower above those with fruits, as far as the stem's height leaves room for them."""
     clutter: int = 0
-    """Things about the plant that are no plant: boards, boxes, strings, loose triangles."""
+    """Things about the plant that are not part of it: boards, boxes, strings, loose triangles."""
 
     def __post_init__(self) -> None:
         check_ranges(self)

@@ -3,6 +3,9 @@
 import ast
 import dataclasses
 import hashlib
+import inspect
+import itertools
+import textwrap
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -450,16 +453,29 @@ def test_a_configuration_of_ones_own_grows() -> None:
     "config",
     [StemConfig(), LeafConfig(), TrussConfig(), FlowerConfig(), FruitConfig(), HidingConfig(), PlantConfig()],
 )
-def test_the_plants_page_lists_every_parameter_with_its_default(
+def test_the_plants_page_lists_every_parameter_with_its_default_and_meaning(
     config: StemConfig | LeafConfig | TrussConfig | FlowerConfig | FruitConfig | HidingConfig | PlantConfig,
 ) -> None:
     page = (Path(__file__).parents[2] / "docs" / "plants.md").read_text(encoding="utf-8")
     section = page.split(f"### {type(config).__name__}\n")[1].split("\n### ")[0]
+    told = told_of(type(config))
     for item in dataclasses.fields(config):
         (row,) = [line for line in section.splitlines() if line.startswith(f"| `{item.name}` |")]
         value = getattr(config, item.name)
         if not dataclasses.is_dataclass(value):
             assert ast.literal_eval(row.split("`")[3]) == value
+        assert row.split(" | ")[2].removesuffix(" |") == told[item.name]
+
+
+def told_of(config: type) -> dict[str, str]:
+    """What stands under each field of a config, in a line."""
+    (kind,) = ast.parse(textwrap.dedent(inspect.getsource(config))).body
+    assert isinstance(kind, ast.ClassDef)
+    return {
+        ast.unparse(item.target): " ".join(ast.literal_eval(note.value).split())
+        for item, note in itertools.pairwise(kind.body)
+        if isinstance(item, ast.AnnAssign) and isinstance(note, ast.Expr)
+    }
 
 
 @pytest.mark.parametrize("name", MATERIALS)
