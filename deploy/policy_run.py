@@ -189,12 +189,11 @@ def run_goal(
                 _logger.warning("only a dry run: %s", problem)
             facts = {**facts, "devices": {"arm": arm.describe(), "camera": camera.describe()}}
             info |= facts
-            every = list(recorders)
-            if config.record:
-                recorder = McapRecorder(
-                    config.out / RECORDING, info, workcell.clock, mount, workcell.arm.model
-                )
-                every.append(stack.enter_context(recorder))
+        every = list(recorders)
+        if config.record:
+            # A signal waits until the file is one that can be finished.
+            recorder = McapRecorder(config.out / RECORDING, info, workcell.clock, mount, workcell.arm.model)
+            every.append(stack.enter_context(recorder))
         try:
             # What is slow the first time is done before the loop's first beat, from which on the heartbeat is watched.
             with stops.interrupting():

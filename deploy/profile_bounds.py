@@ -31,10 +31,12 @@ class Bound:
 BOUNDS: Final[dict[str, dict[str, Bound]]] = {
     "safety": {
         "speed_fraction": Bound(0.005, LARGEST_SPEED_FRACTION, "more", "people must be able to react"),
-        "max_speed_fraction": Bound(0.005, LARGEST_SPEED_FRACTION, "more", "the same"),
+        "max_speed_fraction": Bound(0.005, LARGEST_SPEED_FRACTION, "more", "people must be able to react"),
         "joint_margin": Bound(0.01, 0.5, "less", "drivers let joints be up to 0.01 rad off"),
         "max_joint_step": Bound(0.001, 2.0, "more", "in a longer move nothing new is seen of the plant"),
-        "max_flange_step": Bound(0.001, 0.6, "more", "the same; the camera needs 0.12 m"),
+        "max_flange_step": Bound(
+            0.001, 0.6, "more", "in a longer move nothing new is seen of the plant; the camera needs 0.12 m"
+        ),
         "table_height": Bound(-1.0, 0.3, "less", "a surface farther down is not what the arm stands on"),
         "table_clearance": Bound(0.01, 0.5, "less", "heights are measured to a few millimetres"),
         "self_clearance": Bound(0.002, 0.5, "less", "meshes and joints are exact to about a millimetre"),
@@ -49,7 +51,7 @@ BOUNDS: Final[dict[str, dict[str, Bound]]] = {
     "loop": {
         "threshold": Bound(0.05, 0.999, None, "V_f is a share; above 0.999 it is never reached"),
         "max_moves": Bound(1, 1000, None, "a run ends within hours"),
-        "lost_after": Bound(1, 1000, None, "the same"),
+        "lost_after": Bound(1, 1000, None, "a run ends within hours"),
         "refused_after": Bound(1, 100, None, "what is refused a hundred times in a row is refused again"),
         "settle": Bound(0.0, 10.0, "less", "an arm stands after seconds"),
     },

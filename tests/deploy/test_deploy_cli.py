@@ -13,11 +13,13 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from mcap.reader import make_reader
 
 from maniskill_tomato.cli import deploy_commands, main, parse
 from maniskill_tomato.cli.operator_prompt import goes
 from maniskill_tomato.deploy.mock.mock_arm import MockArm
 from maniskill_tomato.deploy.mock.mock_camera import MockCamera
+from maniskill_tomato.deploy.recording import McapRecorder
 from maniskill_tomato.deploy.robot_perception import ImagePerception, TruthPerception
 from maniskill_tomato.deploy.stops import Stops
 
@@ -188,6 +190,27 @@ def test_a_signal_before_the_first_look_ends_the_command_with_its_devices_let_go
     assert len(opened) == (1 if place == "arm" else 2)
     assert not any(device.is_connected for device in opened)
     assert signal.getsignal(signal.SIGTERM) is before
+
+
+def test_ctrl_c_while_the_recording_is_begun_leaves_a_file_that_is_whole(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    begin = McapRecorder._channel
+
+    def press_and_begin(self: McapRecorder, topic: str, encoding: str, schema_id: int) -> int:
+        if topic == "/camera/color":
+            os.kill(os.getpid(), signal.SIGINT)
+        return begin(self, topic, encoding, schema_id)
+
+    monkeypatch.setattr(McapRecorder, "_channel", press_and_begin)
+    with pytest.raises(SystemExit) as end:
+        main(["deploy", "run", "--profile", "mock", "--out", str(tmp_path)])
+    assert end.value.code == 128 + signal.SIGINT
+    assert "stopped: SIGINT before the first look; nothing has moved" in capsys.readouterr().out
+    with (tmp_path / "run.mcap").open("rb") as file:
+        summary = make_reader(file).get_summary()
+    assert summary is not None
+    assert {channel.topic for channel in summary.channels.values()} >= {"/info", "/step", "/camera/color"}
 
 
 def test_a_fault_while_views_are_taken_tells_what_the_arm_does_then(
