@@ -59,6 +59,9 @@ COMMANDS: Final[dict[str, CommandEntry]] = {
     "reproduce": CommandEntry("measure_commands:Reproduce", "Reproduce the thesis's experiments"),
     "ablate": CommandEntry("measure_commands:Ablate", "Measure what each option of the learner is worth"),
     "dataset": CommandEntry("image_commands:Dataset", "Render annotated images of tomato rows"),
+    "compose-dataset": CommandEntry(
+        "image_commands:ComposeDataset", "Mix rendered images and photos as the thesis did"
+    ),
     "detect": CommandEntry("image_commands:Detect", "Find the tomatoes in images"),
     "train-segmenter light": CommandEntry("segmenter_commands:TrainLight", "The light segmenter, on a CPU"),
     "train-segmenter mask-rcnn": CommandEntry("segmenter_commands:TrainMaskRcnn", "Mask R-CNN"),
@@ -107,7 +110,7 @@ GROUPS: Final[dict[str, tuple[str, ...]]] = {
         "demonstrations",
     ),
     "Measure": ("eval", "benchmark", "benchmark-rows", "compare", "reproduce", "ablate", "judge"),
-    "See": ("dataset", "train-segmenter", "detect"),
+    "See": ("dataset", "compose-dataset", "train-segmenter", "detect"),
     "Use": ("export", "deploy"),
 }
 """The commands as the list shows them."""

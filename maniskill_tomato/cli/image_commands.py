@@ -7,7 +7,7 @@ from typing import Annotated, ClassVar, Literal
 
 import tyro
 
-from maniskill_tomato.cli.early_checks import check_counts, check_folder, check_segmenter
+from maniskill_tomato.cli.early_checks import check_counts, check_folder, check_place, check_segmenter
 from maniskill_tomato.errors import InvalidInputError
 
 
@@ -35,6 +35,8 @@ class Dataset:
     """Cherry and beef tomatoes and other leaf densities too, instead of the tasks' own plants alone."""
     plants: Path | None = None
     """Mesh file or folder whose plants of the split stand in front, each alone, instead of our own rows."""
+    robot_share: float = 0.12
+    """Share of the scenes in which another arm works; only some of their images show it."""
     jobs: int | None = None
     """Processes; by default one per processor core."""
 
@@ -57,6 +59,7 @@ class Dataset:
             height=self.height,
             vary_crop=self.vary_crop,
             plants=None if self.plants is None else str(self.plants),
+            robot_share=self.robot_share,
         )
         photos = read_annotated(self.real, self.real_split) if self.real is not None else None
         if photos is not None and photos.skipped:
@@ -70,6 +73,60 @@ class Dataset:
         print(f"COCO   {self.out / 'annotations.json'} and {self.out / 'annotations_amodal.json'}")
         print(f"VOC    {self.out / 'Annotations'}")
         print(f"report {page}")
+
+
+@dataclass(frozen=True, kw_only=True)
+class ComposeDataset:
+    """Draw rendered images and photos into the thesis's training, validation and test sets.
+
+    Trainings and `judge segmenter` take them as OUT:train, OUT:validation and OUT:test.
+    """
+
+    preset: Literal["strategy-1", "strategy-2", "strategy-3", "yolo"] = "strategy-1"
+    """Whose numbers of images: those of a Mask R-CNN strategy, or YOLO's photos. The sets of one seed contain each
+    other, and the test images are the same for all strategies."""
+    rendered: tuple[str, ...] = ()
+    """Folder of `maniskill-tomato dataset`: one for all sets, or one each for training, validation and test."""
+    photos: tuple[str, ...] = ()
+    """Folder of photos in COCO's or Pascal VOC's format, or FOLDER:SPLIT for one list of it; one, or three as above.
+    Their boxes are taken, and no masks."""
+    train: tuple[int, int] | None = None
+    """How many rendered images and photos to train on, if not the thesis's."""
+    validation: tuple[int, int] | None = None
+    """The same to validate on."""
+    test: tuple[int, int] | None = None
+    """The same to test on."""
+    seed: int = 0
+    """Draws the images."""
+    out: Path = Path("runs/composed")
+    """Folder of the images and of a COCO file for each set."""
+
+    def run(self) -> None:
+        """Draws, copies and says how many images each set has."""
+        for name, places in (("--rendered", self.rendered), ("--photos", self.photos)):
+            for place in places:
+                check_place(name, place)
+
+        from maniskill_tomato.segmentation.datasets.composition import PARTS, Counts, Part, compose
+
+        asked: dict[Part, tuple[int, int] | None] = {
+            "train": self.train,
+            "validation": self.validation,
+            "test": self.test,
+        }
+        counts: dict[Part, Counts] = {
+            part: Counts(rendered=n[0], photos=n[1]) for part, n in asked.items() if n is not None
+        }
+        found = compose(self.preset, self.rendered, self.photos, self.out, seed=self.seed, counts=counts)
+        for part in PARTS:
+            images = found[part].images
+            rendered = sum(any(i.visible_mask is not None for i in image.instances) for image in images)
+            robots = sum(any(i.category == "robot" for i in image.instances) for image in images)
+            fruits = sum(len(image.fruits) for image in images)
+            print(
+                f"{self.out}:{part}: {len(images)} images, {rendered} of them with masks, {robots} with the robot; "
+                f"{fruits} visible fruits"
+            )
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -11,7 +11,7 @@ from maniskill_tomato.cli.arguments import Flat
 from maniskill_tomato.cli.early_checks import check_counts, check_file, check_place
 from maniskill_tomato.cli.shared_options import say
 from maniskill_tomato.errors import InvalidInputError
-from maniskill_tomato.segmentation.detector_configs import MASK_RCNN_PRESETS, LightTrainConfig
+from maniskill_tomato.segmentation.detector_configs import MASK_RCNN_PRESETS, Backbone, LightTrainConfig
 
 if TYPE_CHECKING:
     from maniskill_tomato.segmentation.datasets.annotations import AnnotatedImage
@@ -95,12 +95,20 @@ class TrainMaskRcnn(ImageOptions):
     preset: Literal["light-lite0", "strategy-1", "strategy-2", "strategy-3"] = "light-lite0"
     """Settings: `light-lite0` for a CPU, or those of Tables 4-3, 4-4 and section 6-2."""
     pretrained: bool = False
-    """Start from ImageNet weights of the backbone: of `light-lite0` those of the extra `pretrained`, of the others
-    torchvision's, which are downloaded."""
+    """Start from ImageNet weights of the backbone: of `efficientnet_lite0` those of the extra `pretrained`, of the
+    others torchvision's, which are downloaded."""
+    backbone: Backbone | None = None
+    """Network under the pyramid, if not that of the preset; `efficientnet_lite0` is small enough for a CPU."""
     epochs: int | None = None
     """Epochs, if not those of the preset."""
     steps_per_epoch: int | None = None
     """Steps in an epoch, if not those of the preset."""
+    step_scale: float = 1.0
+    """Factor on the steps of an epoch in training and validation; epochs and the learning rates of each stay."""
+    input_scale: float = 1.0
+    """Factor on the sides of the input and of the anchors."""
+    anchors: Literal["preset", "data"] = "preset"
+    """Sides of the anchors: those of the preset, or five clusters of the boxes in --data (k-means)."""
     seed: int = 0
     """Of the weights and the pictures."""
 
@@ -108,18 +116,22 @@ class TrainMaskRcnn(ImageOptions):
         """Trains and says where the weights are."""
         self.check()
         check_counts(epochs=self.epochs, steps_per_epoch=self.steps_per_epoch)
-        preset = MASK_RCNN_PRESETS[self.preset]
+        preset = MASK_RCNN_PRESETS[self.preset].scaled(steps=self.step_scale, size=self.input_scale)
         config = replace(
             preset,
+            backbone=self.backbone or preset.backbone,
             epochs=preset.epochs if self.epochs is None else self.epochs,
             steps_per_epoch=preset.steps_per_epoch if self.steps_per_epoch is None else self.steps_per_epoch,
         )
 
+        from maniskill_tomato.segmentation.training.anchors import anchor_sides
         from maniskill_tomato.segmentation.training.mask_rcnn_training import MaskRcnnTraining
 
-        _tell_weights(
-            lambda: _train(MaskRcnnTraining(config, self.read(), self.pretrained, self.seed), self.out)
-        )
+        images = self.read()
+        if self.anchors == "data":
+            config = replace(config, anchor_sides=anchor_sides((i for s in images.sets for i in s), config))
+            print(f"anchors {', '.join(map(str, config.anchor_sides))} px")
+        _tell_weights(lambda: _train(MaskRcnnTraining(config, images, self.pretrained, self.seed), self.out))
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -5,7 +5,7 @@ in `training.yolo_training`.
 """
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Literal
 
 from maniskill_tomato.errors import InvalidInputError
@@ -190,6 +190,31 @@ class MaskRcnnConfig:
     def learning_rate(self, epoch: int) -> float:
         """The learning rate of an epoch, counted from 1."""
         return [rate for first, rate in self.learning_rates if first <= epoch][-1]
+
+    def scaled(self, *, steps: float = 1.0, size: float = 1.0) -> "MaskRcnnConfig":
+        """The same training with fewer steps in each epoch, on smaller pictures.
+
+        Epochs, and with them the places where the learning rate falls, stay. So does the size of the anchors over that
+        of the picture.
+
+        Args:
+            steps: Factor on the steps of an epoch, in training and in validation; at least one of each is left.
+            size: Factor on the sides of the input and of the anchors.
+
+        Raises:
+            InvalidInputError: A factor is not above 0 and at most 1.
+        """
+        for name, factor in (("steps", steps), ("size", size)):
+            if not 0 < factor <= 1:
+                raise InvalidInputError(f"the factor on {name} must be above 0 and at most 1, got {factor}")
+        return replace(
+            self,
+            steps_per_epoch=max(1, round(self.steps_per_epoch * steps)),
+            validation_steps=max(1, round(self.validation_steps * steps)),
+            longest_side=round(self.longest_side * size),
+            shortest_side=round(self.shortest_side * size),
+            anchor_sides=tuple(max(1, round(side * size)) for side in self.anchor_sides),
+        )
 
 
 FOUR_AUGMENTATIONS = ClassicAugmentation(probability=0.8, brightness=(0.7, 1.3), contrast=(0.6, 1.4))

@@ -19,10 +19,10 @@ from maniskill_tomato.segmentation.datasets.annotations import (
     joined,
 )
 from maniskill_tomato.segmentation.datasets.coco import read_coco, write_coco
+from maniskill_tomato.segmentation.datasets.composition import copied
 from maniskill_tomato.segmentation.datasets.reading import read_annotated
 from maniskill_tomato.segmentation.datasets.voc import read_voc, write_voc
 from maniskill_tomato.segmentation.masks import EncodedMask
-from maniskill_tomato.segmentation.synthesis.dataset_rendering import copy_photos
 
 pytest.importorskip("pycocotools")
 
@@ -85,11 +85,11 @@ def test_photos_of_one_name_from_several_folders_are_all_copied_in(tmp_path: Pat
         photos.append(AnnotatedImage(path=path, file_name=name, width=60, height=40, instances=()))
     out = tmp_path / "out"
     for _ in range(2):
-        copied = copy_photos(AnnotatedImages(images=tuple(photos)), out)
-        assert [image.path.read_bytes() for image in copied.images] == [bytes([k]) * 10 for k in range(3)]
-        write_voc(copied, out)
+        copies = copied(AnnotatedImages(images=tuple(photos)), out, "real")
+        assert [image.path.read_bytes() for image in copies.images] == [bytes([k]) * 10 for k in range(3)]
+        write_voc(copies, out)
     photos[0].path.write_bytes(b"retouched.")
-    again = copy_photos(AnnotatedImages(images=tuple(photos)), out)
+    again = copied(AnnotatedImages(images=tuple(photos)), out, "real")
     assert again.images[0].path.read_bytes() == b"retouched."
 
 

@@ -1,6 +1,7 @@
 """The thesis's settings, number by number, and that the networks are built with them."""
 
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -8,11 +9,13 @@ import pytest
 import torch
 
 from maniskill_tomato.errors import InvalidInputError
+from maniskill_tomato.segmentation.datasets.annotations import AnnotatedImage, Instance
 from maniskill_tomato.segmentation.detector_configs import (
     MASK_RCNN_PRESETS,
     ClassicAugmentation,
     MaskRcnnConfig,
 )
+from maniskill_tomato.segmentation.training.anchors import anchor_sides, clustered_sizes, shape_overlaps
 from maniskill_tomato.segmentation.training.augmentation import (
     brighter,
     classic_augmentation,
@@ -83,12 +86,63 @@ def test_yolo_is_table_4_1() -> None:
     assert settings["imgsz"] == 368 and settings["multi_scale"] * 368 == pytest.approx(80)
     assert (OBJECT_THRESHOLD, NMS_THRESHOLD) == (0.5, 0.45)
     assert not settings["pretrained"]
+    # "The absence of image augmentation" (4-2-2): what Ultralytics documents as augmentation of detection.
+    for name in (
+        *("hsv_h", "hsv_s", "hsv_v", "bgr", "degrees", "translate", "scale", "shear", "perspective"),
+        *("flipud", "fliplr", "mosaic", "mixup", "cutmix", "copy_paste"),
+    ):
+        assert settings[name] == 0, name
+    assert settings["augmentations"] == []
 
 
 def test_stock_yolo_is_what_the_library_does_by_itself() -> None:
     stock = YOLO_SETTINGS["stock"]
     assert (stock["epochs"], stock["imgsz"]) == (100, 448)
-    assert "lr0" not in stock and not stock["pretrained"]
+    assert "lr0" not in stock and "mosaic" not in stock and not stock["pretrained"]
+
+
+def test_a_scaled_training_keeps_its_schedule_and_the_anchors_size_over_the_picture() -> None:
+    whole = MASK_RCNN_PRESETS["strategy-2"]
+    small = whole.scaled(steps=0.01, size=0.5)
+    assert (small.epochs, small.steps_per_epoch, small.validation_steps) == (65, 10, 1)
+    assert (small.longest_side, small.shortest_side) == (512, 400)
+    assert small.anchor_sides == (8, 32, 64, 128, 256)
+    same = ("learning_rates", "dropout", "proposal_nms", "rois_per_image", "augmentation", "batch_size")
+    assert [getattr(small, name) for name in same] == [getattr(whole, name) for name in same]
+    assert whole.scaled() == whole
+    for factor in (0.0, 1.5):
+        with pytest.raises(InvalidInputError, match="above 0 and at most 1"):
+            whole.scaled(steps=factor)
+
+
+def test_clusters_of_boxes_are_the_sizes_that_the_boxes_have() -> None:
+    rng = np.random.default_rng(0)
+    true = np.array([[10, 12], [30, 25], [60, 80], [150, 140], [300, 320]], float)
+    sizes = np.concatenate([size * rng.uniform(0.95, 1.05, (40, 2)) for size in true])
+    found = clustered_sizes(rng.permutation(sizes), 5)
+    np.testing.assert_allclose(found, true, rtol=0.02)
+    overlaps = shape_overlaps(np.array([[10.0, 10.0]]), np.array([[20.0, 5.0], [10.0, 10.0]]))
+    # 10 x 5 px are common to a square of 100 px and a box of 100 px.
+    np.testing.assert_allclose(overlaps, [[50 / 150, 1.0]])
+    with pytest.raises(InvalidInputError, match="at least 5 boxes"):
+        clustered_sizes(np.array([[10, 10]] * 20), 5)
+
+
+def test_anchors_from_data_are_in_pixels_of_the_networks_input(tmp_path: Path) -> None:
+    sides = (20.0, 40.0, 60.0, 120.0, 240.0)
+    fruits = tuple(Instance(category="tomato", box_xywh=(0.0, 0.0, side, side)) for side in sides)
+    leaf = Instance(category="leaf", box_xywh=(0.0, 0.0, 300.0, 300.0))
+    tiny = Instance(category="tomato", box_xywh=(0.0, 0.0, 3.0, 3.0))
+    image = AnnotatedImage(
+        path=tmp_path / "a.png", file_name="a.png", width=640, height=480, instances=(*fruits, leaf, tiny)
+    )
+    config = MASK_RCNN_PRESETS["strategy-1"]
+    # 480 px become 768, because 640 may not become more than 1024.
+    assert anchor_sides([image], config) == tuple(round(1.6 * side) for side in sides)
+    assert anchor_sides([image], config.scaled(size=0.5)) == tuple(round(0.8 * side) for side in sides)
+    alike = tuple(Instance(category="tomato", box_xywh=(0.0, 0.0, 20 + k / 100, 20.0)) for k in range(9))
+    with pytest.raises(InvalidInputError, match="too alike"):
+        anchor_sides([replace(image, instances=alike)], config)
 
 
 def test_settings_that_cannot_be_are_refused() -> None:

@@ -14,7 +14,7 @@ import torch
 from numpy.typing import NDArray
 
 from maniskill_tomato.cli import main
-from maniskill_tomato.errors import CheckpointError
+from maniskill_tomato.errors import CheckpointError, InvalidInputError
 from maniskill_tomato.segmentation.datasets.annotations import AnnotatedImage, AnnotatedImages, Instance
 from maniskill_tomato.segmentation.datasets.coco import write_coco
 from maniskill_tomato.segmentation.detector_configs import MASK_RCNN_PRESETS
@@ -137,11 +137,66 @@ def test_a_picture_without_masks_does_not_train_the_mask_head(tmp_path: Path) ->
 def test_the_target_of_mask_rcnn_leaves_out_fruits_set_aside(tmp_path: Path) -> None:
     (image, *_) = drawn_set(tmp_path / "set")
     picture = replace(training_picture(image), ignored=np.array([True, False]))
-    target = mask_rcnn_target(picture)
+    target = mask_rcnn_target(picture, ("tomato", "robot"))
     assert target["boxes"].shape == (1, 4) and target["labels"].tolist() == [1]
     rows, columns = np.nonzero(target["masks"][0].numpy())
     expected = target["boxes"][0].tolist()
     assert [columns.min(), rows.min(), columns.max() + 1, rows.max() + 1] == expected
+
+
+def with_robot(image: AnnotatedImage) -> AnnotatedImage:
+    """The image with a robot in its uppermost ten rows, which no ellipse reaches, and a leaf beside it."""
+    arm, leaf = np.zeros((2, image.height, image.width), bool)
+    arm[:10, 20:90] = True
+    leaf[:10, :20] = True
+    things = [
+        Instance(category=name, box_xywh=box, visible_mask=EncodedMask.encode(mask))
+        for name, box, mask in (
+            ("leaf", (0.0, 0.0, 20.0, 10.0), leaf),
+            ("robot", (20.0, 0.0, 70.0, 10.0), arm),
+        )
+    ]
+    return replace(image, instances=(things[0], *image.instances, things[1]))
+
+
+def test_the_robot_is_a_class_of_mask_rcnn_with_its_box_and_mask(tmp_path: Path) -> None:
+    image = with_robot(drawn_set(tmp_path / "set")[0])
+    target = mask_rcnn_target(training_picture(image, ["robot"]), ("tomato", "robot"))
+    assert target["labels"].tolist() == [1, 1, 2]
+    assert target["boxes"][2].tolist() == [20, 0, 90, 10]
+    assert target["masks"][2].sum() == 700 and target["masks"][2, :10, 20:90].all()
+    # Detectors of fruits alone are told of fruits alone.
+    assert len(training_picture(image).boxes) == 2
+    with_leaves = mask_rcnn_target(training_picture(image, ["leaf"]), ("tomato", "leaf"))
+    assert with_leaves["labels"].tolist() == [1, 1, 2]
+
+
+def test_mask_rcnn_learns_the_robot_where_pictures_show_it(tmp_path: Path) -> None:
+    images = [with_robot(image) for image in drawn_set(tmp_path / "set")]
+    training = MaskRcnnTraining(TINY, TrainingImages(sets=[images], validation=images[:1]))
+    assert training.images.drawn(np.random.default_rng(0)).categories.tolist() == [0, 0, 5]  # type: ignore[union-attr]
+    (checked,) = next(iter(training.validation_batches()))
+    assert len(checked.boxes) == 3
+    with pytest.raises(InvalidInputError, match="kettle"):
+        MaskRcnnTraining(replace(TINY, categories=("tomato", "kettle")), TrainingImages(sets=[images]))
+
+
+def test_pictures_without_masks_leave_the_masks_of_others_in_their_batch_to_be_learned(
+    tmp_path: Path,
+) -> None:
+    (drawn, *_) = drawn_set(tmp_path / "set")
+    (boxed, *_) = drawn_set(tmp_path / "boxes", masks=False)
+    training = MaskRcnnTraining(replace(TINY, batch_size=2), TrainingImages(sets=[[drawn], [boxed]]))
+    pictures = [training_picture(drawn), training_picture(boxed)]
+    terms = training.losses(training.network.train(), pictures)
+    assert terms["loss_mask"] > 0
+    torch.manual_seed(1)
+    alone = training.losses(training.network, pictures[:1])
+    torch.manual_seed(1)
+    beside = training.losses(training.network, pictures)
+    # The picture with masks comes first, so that it draws the same regions; it is half of the batch.
+    torch.testing.assert_close(beside["loss_mask"], alone["loss_mask"] / 2)
+    assert beside["loss_box_reg"] > alone["loss_box_reg"] / 2
 
 
 def test_yolo_labels_are_shares_of_the_image(tmp_path: Path) -> None:

@@ -23,6 +23,7 @@ from maniskill_tomato.robot.d435 import (
 )
 from maniskill_tomato.robot.depth_noise import DepthNoise, measure_depth
 from maniskill_tomato.segmentation.datasets.annotations import BEHIND
+from maniskill_tomato.segmentation.synthesis.appearance import draw_appearance
 from maniskill_tomato.segmentation.synthesis.dataset_rendering import DatasetConfig, _numbers, make_dataset
 from maniskill_tomato.segmentation.synthesis.silhouette import draw_silhouette
 
@@ -104,7 +105,15 @@ def test_what_is_too_near_too_far_or_nothing_has_no_depth() -> None:
 
 @pytest.mark.parametrize(
     "change",
-    [{"count": 0}, {"seed": -1}, {"split": "test"}, {"width": 10}, {"height": 5000}, {"quality": 0}],
+    [
+        {"count": 0},
+        {"seed": -1},
+        {"split": "test"},
+        {"width": 10},
+        {"height": 5000},
+        {"quality": 0},
+        {"robot_share": 1.2},
+    ],
 )
 def test_a_data_set_that_makes_no_sense_is_refused(change: dict[str, Any]) -> None:
     with pytest.raises(InvalidInputError):
@@ -120,6 +129,14 @@ def test_scenes_share_the_images_out() -> None:
 def test_another_data_set_is_not_overwritten(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (tmp_path / "dataset.json").write_text(json.dumps(DatasetConfig(seed=5).identity()))
     with pytest.raises(InvalidInputError, match="another seed"):
+        make_dataset(DatasetConfig(count=1, seed=6), tmp_path)
+    # Written before scenes could have a share of robots of their own.
+    older = DatasetConfig(seed=5).identity()
+    del older["robot_share"]
+    (tmp_path / "dataset.json").write_text(json.dumps(older))
+    with pytest.raises(InvalidInputError, match="another robot_share"):
+        make_dataset(DatasetConfig(count=1, seed=5, robot_share=0.5), tmp_path)
+    with pytest.raises(InvalidInputError, match="another seed; choose"):
         make_dataset(DatasetConfig(count=1, seed=6), tmp_path)
     (tmp_path / "full").mkdir()
     (tmp_path / "full" / "thesis.txt").write_text("mine")
@@ -154,8 +171,18 @@ def test_a_data_set_on_mesh_files_is_another_one_and_needs_plants_of_its_split(t
 
 
 @pytest.mark.render
+def test_the_share_of_robots_changes_nothing_else_in_a_scene() -> None:
+    usual, robots, none = (
+        [draw_appearance(np.random.default_rng(k), robot_share=share) for k in range(40)]
+        for share in (0.12, 1.0, 0.0)
+    )
+    assert all(scene.robot for scene in robots) and not any(scene.robot for scene in none)
+    # Binomial, with a mean of 5 and a standard deviation of 2.
+    assert 0 < sum(scene.robot for scene in usual) < 12
+    assert [replace(scene, robot=False) for scene in robots] == none
+
+
 def test_the_sun_lights_the_row_in_front_and_leaves_shade_it() -> None:
-    from maniskill_tomato.segmentation.synthesis.appearance import draw_appearance
     from maniskill_tomato.segmentation.synthesis.greenhouse import GreenhouseScene
 
     intrinsics = color_intrinsics(160, 120)

@@ -156,6 +156,8 @@ def test_the_thesis_steps_are_what_they_say() -> None:
     rgb[2, 2] = (95, 100, 0)
     leaves = operations.leaf_image(rgb, 10)
     assert leaves[0, 0] == 255 and np.count_nonzero(leaves) == 1
+    # The thesis takes every positive difference.
+    assert np.argwhere(operations.leaf_image(rgb, ThesisConfig().leaf_threshold)).tolist() == [[0, 0], [2, 2]]
     assert np.flatnonzero(operations.red_image(rgb)).tolist() == [5]
     binary = np.full((1, 3), 255, np.uint8)
     kept = operations.remove_deeper(binary, np.array([[0.3, 0.0, 0.9]]), 0.5)
@@ -219,6 +221,8 @@ def test_wrong_images_are_refused() -> None:
     ):
         with pytest.raises(InvalidInputError):
             SegmentedImage(**(good | change))  # type: ignore[arg-type]
+    with pytest.raises(InvalidInputError, match="leaf_threshold must be from 0"):
+        ThesisConfig(leaf_threshold=-1)
     with pytest.raises(InvalidInputError, match="behind_m must be positive"):
         ThesisConfig(behind_m=-1.0)
     with pytest.raises(InvalidInputError, match="margin must be positive"):

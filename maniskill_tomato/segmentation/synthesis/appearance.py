@@ -155,12 +155,19 @@ def _any_kind(rng: Generator) -> PlantConfig:
     )
 
 
-def draw_appearance(rng: Generator, *, vary_crop: bool = True) -> SceneAppearance:
+ROBOT_SHARE = 0.12
+"""Share of the scenes in which another arm works, where nothing else is asked for."""
+
+
+def draw_appearance(
+    rng: Generator, *, vary_crop: bool = True, robot_share: float = ROBOT_SHARE
+) -> SceneAppearance:
     """Draws the appearance of a scene.
 
     Args:
         rng: Its random numbers.
         vary_crop: Whether the crop is drawn too; otherwise it is the tasks' own `full` plant.
+        robot_share: How often another arm works in the row, 0 to 1.
     """
     crop = draw_crop(rng) if vary_crop else make_full_config()
     azimuth, height = rng.uniform(0, 2 * np.pi), np.deg2rad(rng.uniform(25, 75))
@@ -201,7 +208,7 @@ def draw_appearance(rng: Generator, *, vary_crop: bool = True) -> SceneAppearanc
         wall=(wall, wall * float(rng.uniform(0.95, 1.08)), wall * float(rng.uniform(0.9, 1.1))),
         greenery=bool(rng.random() < 0.6),
         strings=int(rng.integers(0, 9)),
-        robot=bool(rng.random() < 0.12),
+        robot=bool(rng.random() < robot_share),
     )
 
 

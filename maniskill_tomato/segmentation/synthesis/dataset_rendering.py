@@ -28,8 +28,10 @@ from maniskill_tomato.segmentation.datasets.annotations import (
     joined,
 )
 from maniskill_tomato.segmentation.datasets.coco import read_coco, write_coco
+from maniskill_tomato.segmentation.datasets.composition import copied
 from maniskill_tomato.segmentation.datasets.picture_files import write_picture
 from maniskill_tomato.segmentation.datasets.voc import write_voc
+from maniskill_tomato.segmentation.synthesis.appearance import ROBOT_SHARE
 from maniskill_tomato.text_files import read_json
 from maniskill_tomato.worker_pool import run_jobs
 
@@ -66,6 +68,8 @@ class DatasetConfig:
     """Of the JPEG files, 1 to 100."""
     plants: str | None = None
     """Mesh file or folder whose plants of the split stand in front, each alone; None grows rows of our own."""
+    robot_share: float = ROBOT_SHARE
+    """Share of the scenes in which another arm works; only some of their images show it."""
 
     def __post_init__(self) -> None:
         if self.count < 1:
@@ -80,6 +84,8 @@ class DatasetConfig:
             )
         if not 1 <= self.quality <= 100:
             raise InvalidInputError(f"quality must be 1 to 100, got {self.quality}")
+        if not 0 <= self.robot_share <= 1:
+            raise InvalidInputError(f"robot_share must be from 0 to 1, got {self.robot_share}")
         if self.plants is not None:
             self.mesh_plants(self.plants).seeds(self.split)
 
@@ -148,30 +154,10 @@ def _make(
             on_scene(len(_numbers(config, scene)))
     parts = [read_coco(_scene_file(out, k), root=out) for k in range(config.scenes)]
     rendered = joined(parts).filtered(lambda image: int(Path(image.file_name).stem) < config.count)
-    result = joined([rendered, copy_photos(real, out)]) if real is not None else rendered
+    result = joined([rendered, copied(real, out, "real")]) if real is not None else rendered
     write_coco(result, out)
     write_voc(result, out)
     return result
-
-
-def copy_photos(photos: AnnotatedImages, out: Path) -> AnnotatedImages:
-    """Copies photos into a data set's folder under names of their own."""
-    copied = []
-    taken: set[str] = set()
-    for image in photos.images:
-        # Photos of several folders may have one name, and Pascal VOC knows files without their endings.
-        stem = first = f"real_{Path(image.file_name).stem}"
-        count = 1
-        while stem in taken:
-            count += 1
-            stem = f"{first}_{count}"
-        taken.add(stem)
-        name = f"images/{stem}{image.path.suffix}"
-        target, content = out / name, image.path.read_bytes()
-        if not target.is_file() or target.read_bytes() != content:
-            write_atomically(target, content)
-        copied.append(replace(image, path=target, file_name=name, depth_path=None))
-    return AnnotatedImages(images=tuple(copied), skipped=photos.skipped)
 
 
 def _claim(config: DatasetConfig, out: Path) -> None:
@@ -180,6 +166,8 @@ def _claim(config: DatasetConfig, out: Path) -> None:
         found = read_json(path)
         if not isinstance(found, dict):
             raise InvalidInputError(f"{path} describes no data set; choose another folder")
+        # A data set that was begun before an option existed has that option's default.
+        found = {"robot_share": DatasetConfig.robot_share} | found
         differing = [k for k, v in config.identity().items() if found.get(k) != v]
         if differing:
             raise InvalidInputError(
@@ -232,7 +220,7 @@ def render_scene(config: DatasetConfig, out: Path, scene: int) -> int:
 
     low, high = SEED_SPLITS[config.split]
     rng = np.random.default_rng([config.seed, low, scene])
-    appearance = draw_appearance(rng, vary_crop=config.vary_crop)
+    appearance = draw_appearance(rng, vary_crop=config.vary_crop, robot_share=config.robot_share)
     coarse: Plant
     fine: Plant
     if config.plants is None:

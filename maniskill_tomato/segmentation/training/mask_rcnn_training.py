@@ -1,7 +1,7 @@
 """Training of Mask R-CNN with stochastic gradient descent, epochs and steps of the learning rate, as in 4-2-3."""
 
-from collections.abc import Iterator
-from dataclasses import asdict
+from collections.abc import Iterator, Sequence
+from dataclasses import asdict, replace
 from typing import Any
 
 import numpy as np
@@ -9,7 +9,9 @@ import torch
 from torch import Tensor
 from torchvision.models.detection import MaskRCNN
 
+from maniskill_tomato.segmentation.datasets.annotations import CATEGORIES, is_fruit
 from maniskill_tomato.segmentation.detector_configs import MaskRcnnConfig
+from maniskill_tomato.segmentation.instances import TOMATO
 from maniskill_tomato.segmentation.mask_rcnn import build_mask_rcnn
 from maniskill_tomato.segmentation.training.augmentation import classic_augmentation
 from maniskill_tomato.segmentation.training.detector_training import DetectorTraining
@@ -44,7 +46,8 @@ class MaskRcnnTraining(DetectorTraining[MaskRCNN]):
 
         Args:
             config: How to train.
-            images: What to train on; without masks, a picture does not train the mask head.
+            images: What to train on; without masks, a picture does not train the mask head. Its `things` are those of
+                the configuration.
             pretrained: Start from ImageNet weights of the backbone.
             seed: Of the weights and the pictures.
             log_every: Steps between two lines of the history.
@@ -54,7 +57,7 @@ class MaskRcnnTraining(DetectorTraining[MaskRCNN]):
             MissingPackageError: They come from a package that is not installed.
         """
         super().__init__(
-            images,
+            replace(images, things=[name for name in config.categories if name != TOMATO]),
             steps=config.epochs * config.steps_per_epoch,
             batch_size=config.batch_size,
             log_every=min(log_every, config.steps_per_epoch),
@@ -82,17 +85,30 @@ class MaskRcnnTraining(DetectorTraining[MaskRCNN]):
     def validation_batches(self) -> Iterator[list[TrainingPicture]]:
         """The first validation images, each on its own."""
         for image in self.images.validation[: self.config.validation_steps * self.config.batch_size]:
-            yield [training_picture(image)]
+            yield [training_picture(image, self.images.things)]
 
     def losses(self, network: MaskRCNN, pictures: list[TrainingPicture]) -> dict[str, Tensor]:
-        """The loss terms by torchvision's names."""
-        images = [torch.from_numpy(p.image).permute(2, 0, 1).float() / 255 for p in pictures]
-        with torch.autocast("cpu", dtype=torch.bfloat16, enabled=self.config.bfloat16):
-            found: dict[str, Tensor] = network(images, [mask_rcnn_target(p) for p in pictures])
-        terms = {name: term.float() for name, term in found.items()}
-        if any(p.labels is None for p in pictures):
-            terms["loss_mask"] = terms["loss_mask"] * 0
-        return terms
+        """The loss terms by torchvision's names.
+
+        torchvision has one mask loss for a whole batch, so that pictures with masks and pictures with boxes alone go
+        through the network one after the other.
+        """
+        with_masks = [p for p in pictures if p.labels is not None]
+        boxes_only = [p for p in pictures if p.labels is None]
+        sums: dict[str, Tensor] = {}
+        for group in (with_masks, boxes_only):
+            if not group:
+                continue
+            images = [torch.from_numpy(p.image).permute(2, 0, 1).float() / 255 for p in group]
+            targets = [mask_rcnn_target(p, self.config.categories) for p in group]
+            with torch.autocast("cpu", dtype=torch.bfloat16, enabled=self.config.bfloat16):
+                found: dict[str, Tensor] = network(images, targets)
+            for name, term in found.items():
+                share = len(group) / len(pictures)
+                if name == "loss_mask" and group is boxes_only:
+                    share = 0.0
+                sums[name] = sums.get(name, torch.zeros(())) + share * term.float()
+        return sums
 
     def network_config(self) -> dict[str, Any]:
         """See `MaskRcnnConfig`."""
@@ -103,18 +119,22 @@ class MaskRcnnTraining(DetectorTraining[MaskRCNN]):
         return {**asdict(self.config), "seed": self.seed, "pretrained": self.pretrained}
 
 
-def mask_rcnn_target(picture: TrainingPicture) -> dict[str, Tensor]:
+def mask_rcnn_target(picture: TrainingPicture, categories: Sequence[str]) -> dict[str, Tensor]:
     """What torchvision wants to know about a picture: `boxes` (N, 4), `labels` (N,), `masks` (N, H, W).
 
-    All fruits are of class 1, `tomato`; fruits that are set aside are left out.
+    Args:
+        picture: Things that are set aside are left out.
+        categories: The network's classes without the background; fruits of every ripeness are `tomato`.
     """
     kept = np.flatnonzero(~picture.ignored)
     height, width = picture.image.shape[:2]
     masks = np.zeros((len(kept), height, width), np.uint8)
     if picture.labels is not None and len(kept):
         masks = (picture.labels[None] == (kept + 1)[:, None, None]).astype(np.uint8)
+    kinds = [-1] * len(kept) if picture.categories is None else picture.categories[kept].tolist()
+    names = [TOMATO if kind < 0 or is_fruit(CATEGORIES[kind]) else CATEGORIES[kind] for kind in kinds]
     return {
         "boxes": torch.from_numpy(np.ascontiguousarray(picture.boxes[kept], np.float32)),
-        "labels": torch.ones(len(kept), dtype=torch.int64),
+        "labels": torch.tensor([1 + categories.index(name) for name in names], dtype=torch.int64),
         "masks": torch.from_numpy(masks),
     }

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from maniskill_tomato.errors import InvalidInputError
 from maniskill_tomato.segmentation.datasets.annotations import (
-    FRUIT_CATEGORIES,
+    CATEGORIES,
     AnnotatedImage,
     ignored_fruit,
 )
@@ -22,25 +22,30 @@ class TrainingPicture:
     image: NDArray[np.uint8]
     """Red, green, blue. Shape (H, W, 3)."""
     boxes: NDArray[np.float32]
-    """Visible boxes, left, top, right, bottom in [px]. Shape (N, 4)."""
+    """Visible boxes of the fruits and of the other things asked for: left, top, right, bottom in [px]. Shape (N, 4)."""
     ignored: NDArray[np.bool_]
-    """Fruits that the losses leave out, for instance because they are tiny. Shape (N,)."""
+    """Things that the losses leave out, for instance because they are tiny. Shape (N,)."""
     labels: NDArray[np.int16] | None = None
-    """Index of the fruit at each pixel plus one; 0 without a fruit, -1 where unknown. None if there are no masks.
+    """Index of the thing at each pixel plus one; 0 without one, -1 where unknown. None if there are no masks.
     Shape (H, W)."""
     whole_boxes: NDArray[np.float32] | None = None
     """Boxes of the whole fruits in [px], NaN where not known. Shape (N, 4)."""
     categories: NDArray[np.int64] | None = None
-    """Kinds, -1 where not known. Shape (N,)."""
+    """Kinds, as indices in `annotations.CATEGORIES`; -1 is a fruit of unknown ripeness. Shape (N,)."""
 
 
-def training_picture(image: AnnotatedImage) -> TrainingPicture:
-    """An image with its fruits as boxes and labels.
+def training_picture(image: AnnotatedImage, things: Sequence[str] = ()) -> TrainingPicture:
+    """An image with its fruits, and other things, as boxes and labels.
+
+    Args:
+        image: An annotated image.
+        things: Categories besides fruits that are wanted, such as `robot`.
 
     Raises:
         InvalidInputError: The image cannot be read.
     """
-    fruits = image.fruits
+    others = tuple(i for i in image.instances if i.category in things and not i.fruit and i.box_xywh[2] > 0)
+    fruits = (*image.fruits, *others)
     count = len(fruits)
     boxes = np.array([f.box_xywh for f in fruits], np.float32).reshape(-1, 4)
     boxes[:, 2:] += boxes[:, :2]
@@ -64,7 +69,7 @@ def training_picture(image: AnnotatedImage) -> TrainingPicture:
         labels=labels if with_masks or not count else None,
         whole_boxes=whole,
         categories=np.array(
-            [FRUIT_CATEGORIES.index(f.category) if f.category in FRUIT_CATEGORIES else -1 for f in fruits],
+            [CATEGORIES.index(f.category) if f.category in CATEGORIES else -1 for f in fruits],
             np.int64,
         ),
     )
@@ -80,6 +85,8 @@ class TrainingImages:
     """How often each set is drawn from, by default all alike; they need not add up to 1."""
     validation: Sequence[AnnotatedImage] = ()
     """Images whose losses are measured too."""
+    things: Sequence[str] = ()
+    """Categories of `annotations.CATEGORIES` that are learned besides fruits."""
 
     def __post_init__(self) -> None:
         self.shares = tuple(self.shares) or (1.0,) * len(self.sets)
@@ -89,6 +96,8 @@ class TrainingImages:
             raise InvalidInputError(
                 f"there must be one share, at least 0, for each of {len(self.sets)} sets; got {list(self.shares)}"
             )
+        if unknown := [name for name in self.things if name not in CATEGORIES]:
+            raise InvalidInputError.choice("a thing to learn", unknown[0], CATEGORIES)
         self._drawn: dict[tuple[int, int], TrainingPicture] = {}
 
     @property
@@ -108,7 +117,7 @@ class TrainingImages:
         index = int(rng.integers(len(self.sets[which])))
         key = which, index
         if key not in self._drawn:
-            self._drawn[key] = _compact(training_picture(self.sets[which][index]))
+            self._drawn[key] = _compact(training_picture(self.sets[which][index], self.things))
         return self._drawn[key]
 
 

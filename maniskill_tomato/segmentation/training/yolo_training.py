@@ -16,6 +16,16 @@ from maniskill_tomato.segmentation.metrics.detection_plots import plot_losses
 from maniskill_tomato.segmentation.training.training_pictures import TrainingImages
 from maniskill_tomato.segmentation.yolo import LARGEST_INPUT, SMALLEST_INPUT, import_ultralytics
 
+WITHOUT_AUGMENTATION: dict[str, Any] = {
+    # Colours; place, size and mirror image; several pictures in one; blur, grey and contrast by Albumentations, which
+    # Ultralytics adds where that package is installed.
+    **dict.fromkeys(("hsv_h", "hsv_s", "hsv_v", "bgr"), 0.0),
+    **dict.fromkeys(("translate", "scale", "degrees", "shear", "perspective", "fliplr", "flipud"), 0.0),
+    **dict.fromkeys(("mosaic", "mixup", "cutmix", "copy_paste"), 0.0),
+    "augmentations": [],
+}
+"""Everything by which Ultralytics varies pictures for detection, off; only the size of the input varies then."""
+
 YOLO_SETTINGS: dict[str, dict[str, Any]] = {
     "thesis": {
         "epochs": 100,
@@ -26,13 +36,15 @@ YOLO_SETTINGS: dict[str, dict[str, Any]] = {
         "patience": 3,
         "optimizer": "Adam",
         "pretrained": False,
+        **WITHOUT_AUGMENTATION,
     },
     # Ultralytics' own batch of 16 fills a small machine's memory.
     "stock": {"epochs": 100, "batch": 8, "imgsz": LARGEST_INPUT, "pretrained": False},
 }
 """Settings in Ultralytics' words: Table 4-1, or what the library (version 8.4) does when nothing is asked of it.
 
-Deviations from the table: Ultralytics lowers the learning rate along its own schedule instead of at plateaus, and
+The thesis trained without augmentation (4-2-2). Deviations: Ultralytics' networks have no anchors, which the thesis
+generated from its boxes; Ultralytics lowers the learning rate along its own schedule instead of at plateaus, and
 rounds the sizes of the input to multiples of 32."""
 
 

@@ -13,10 +13,11 @@ from maniskill_tomato.sensing.visible_fraction.image_operations import Contour, 
 
 @dataclass(frozen=True, kw_only=True)
 class ThesisConfig:
-    """The constants, which the thesis does not give; these are for images 640 pixels wide."""
+    """The constants; except for the first the thesis does not give them. They are for images 640 pixels wide."""
 
-    leaf_threshold: int = 10
-    """By how much green must exceed red for a leaf, of 255."""
+    leaf_threshold: int = 0
+    """By how much green must exceed red for a leaf, of 255. The thesis takes every positive difference. Where the
+    background is not exactly grey or the pictures have noise, 10 keeps it from being taken for leaves."""
     inpaint_radius: float = 3.0
     """Neighbourhood that the inpainting draws from, in [px]."""
     erosion: int = 5
@@ -29,6 +30,8 @@ class ThesisConfig:
     """Smallest contour, in [px]."""
 
     def __post_init__(self) -> None:
+        if not 0 <= self.leaf_threshold < 255:
+            raise InvalidInputError(f"leaf_threshold must be from 0 to 254, got {self.leaf_threshold}")
         for name in ("inpaint_radius", "erosion", "dilation", "behind_m", "smallest"):
             if not getattr(self, name) > 0:
                 raise InvalidInputError(f"{name} must be positive, got {getattr(self, name)}")
