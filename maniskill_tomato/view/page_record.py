@@ -1,7 +1,7 @@
 """The controls that choose a stored episode, and what each policy made of it, side by side."""
 
 import html
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Any, Final
 
 import viser
@@ -82,13 +82,30 @@ class RecordChoices:
         self._player.show(0)
 
     def _next_failure(self, which: str) -> None:
-        """The failure before or after the shown episode; from the ends it goes on at the other one."""
-        failures = self._record.failures(self._record.policy)
-        if not failures:
-            return
-        at = failures.index(self._record.seed) if self._record.seed in failures else -1
-        step = -1 if which == "previous" else 1
-        self._choose(seed=failures[(at + step) % len(failures)])
+        """Shows the failure before or after the shown episode."""
+        seed = failure_beside(self._record.failures(self._record.policy), self._record.seed, which)
+        if seed is not None:
+            self._choose(seed=seed)
+
+
+def failure_beside(failures: Sequence[int], shown: int, which: str) -> int | None:
+    """The failure before or after an episode; from the ends it goes on at the other one.
+
+    Args:
+        failures: Seeds, in the order in which they are gone through.
+        shown: Seed of the shown episode; from one that is no failure, `next` leads to the first and `previous` to the
+            last.
+        which: `previous` or `next`.
+
+    Returns:
+        A seed; None if nothing failed.
+    """
+    if not failures:
+        return None
+    if shown not in failures:
+        return failures[-1 if which == "previous" else 0]
+    step = -1 if which == "previous" else 1
+    return failures[(failures.index(shown) + step) % len(failures)]
 
 
 def ways_side_by_side(recording: EpisodeRecording, shown: int) -> str:

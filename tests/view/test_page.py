@@ -6,6 +6,7 @@ import socket
 import time
 from collections.abc import Iterator
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -18,6 +19,7 @@ from maniskill_tomato.plants.row import generate_row
 from maniskill_tomato.view.page import PlayPage
 from maniskill_tomato.view.page_export import export_page
 from maniskill_tomato.view.page_head import headline, last_moves
+from maniskill_tomato.view.page_plot import FractionPlot
 from maniskill_tomato.view.page_scene import score_colours
 from maniskill_tomato.view.plant_meshes import organ_colours, plant_layers
 from maniskill_tomato.view.play_session import PlaySession
@@ -150,6 +152,32 @@ def test_a_port_that_is_taken_is_refused_in_words() -> None:
         port = taken.getsockname()[1]
         with pytest.raises(InvalidInputError, match=f"127.0.0.1:{port} .*choose another --port"):
             PlayPage(Player(PlaySession, PlaySettings(policy="nbv")), port=port)
+
+
+class Gui:
+    """Stands for viser's: keeps the plot that is added to it."""
+
+    def __init__(self) -> None:
+        self.plot = SimpleNamespace(bands=None)
+
+    def add_uplot(self, data: Any, series: Any, **options: Any) -> SimpleNamespace:
+        return self.plot
+
+
+def test_the_plot_fills_the_band_in_which_a_measured_fraction_may_lie_and_no_other() -> None:
+    gui = Gui()
+    plot = FractionPlot(gui)  # type: ignore[arg-type]
+    exact = PlaySession(PlaySettings(policy="nbv")).recording
+    measured = PlaySession(PlaySettings(perception="occlusion_model", policy="nbv", target="any")).recording
+    band = measured.snapshots[0].measured
+    assert band is not None
+    plot.tell(measured)
+    (filled,) = gui.plot.bands
+    edges = [float(gui.plot.data[index][0]) for index in filled["series"]]
+    assert edges == pytest.approx([band.band[2], band.band[0]]) and edges[0] > edges[1]
+    assert [gui.plot.series[index]["label"] for index in filled["series"]] == ["at most", "at least"]
+    plot.tell(exact)
+    assert gui.plot.bands is None and len(gui.plot.data) == len(gui.plot.series)
 
 
 def test_the_words_tell_what_came_of_each_move() -> None:

@@ -11,7 +11,7 @@ from maniskill_tomato.cli import main
 from maniskill_tomato.errors import InvalidInputError
 from maniskill_tomato.experiments.episode_record import EpisodeRecord
 from maniskill_tomato.view.page_plot import curves
-from maniskill_tomato.view.page_record import ways_side_by_side
+from maniskill_tomato.view.page_record import failure_beside, ways_side_by_side
 from maniskill_tomato.view.play_session import PlaySession
 from maniskill_tomato.view.play_settings import PlaySettings
 from maniskill_tomato.view.player import Player
@@ -68,6 +68,24 @@ def test_whoever_was_done_first_waits_at_the_end_of_its_way(session: RecordSessi
     assert recording.at(player.shown) is recording.snapshots[-1]
     lines = {str(series.get("label")): values for series, values in curves(recording)}
     assert len(lines["nbv"]) == recording.moves + 1 and len(lines["random_step"]) == other.moves + 1
+
+
+@pytest.mark.parametrize(
+    ("shown", "which", "seed"),
+    [
+        (4, "next", 9),
+        (9, "next", 2),
+        (2, "next", 4),
+        (4, "previous", 2),
+        (9, "previous", 4),
+        (2, "previous", 9),
+        (7, "next", 4),
+        (7, "previous", 2),
+    ],
+)
+def test_failures_are_gone_through_in_a_circle_either_way(shown: int, which: str, seed: int) -> None:
+    assert failure_beside([4, 9, 2], shown, which) == seed
+    assert failure_beside([], shown, which) is None
 
 
 def test_what_all_cameras_see_stands_side_by_side_with_how_it_ended(session: RecordSession) -> None:
