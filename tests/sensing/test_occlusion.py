@@ -113,6 +113,21 @@ def test_the_thesis_model_bridges_a_leaf_across_a_tomato() -> None:
     assert estimate.visible_fraction == pytest.approx(truth, abs=0.1)
 
 
+def test_what_the_camera_could_not_measure_beside_a_tomato_is_background_to_the_thesis_model() -> None:
+    view, _ = draw(leaf_from=2.0)
+    # A reddish wall in the shadow that stereo leaves beside the tomato.
+    columns = np.flatnonzero(view.masks[0].any(axis=0))
+    rgb, depth = view.rgb.copy(), view.depth_m.copy()
+    beside = np.zeros_like(view.masks[0])
+    beside[100:140, columns[-1] - 2 : columns[-1] + 15] = True
+    beside &= ~view.masks[0]
+    rgb[beside], depth[beside] = (150, 100, 90), 0.0
+    shaded = SegmentedImage(rgb=rgb, depth_m=depth, masks=view.masks, intrinsics=INTRINSICS)
+    (estimate,) = ThesisModel()(shaded)
+    assert estimate.visible_fraction > 0.95
+    assert estimate.whole is not None and not (estimate.whole & beside).sum() > 20
+
+
 def test_the_learned_whole_box_completes_a_tomato_that_the_segmenter_found() -> None:
     seen: BinaryMask = np.zeros((100, 100), bool)
     seen[40:60, 40:50] = True

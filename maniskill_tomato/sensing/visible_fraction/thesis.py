@@ -7,7 +7,13 @@ import numpy as np
 
 from maniskill_tomato.errors import InvalidInputError
 from maniskill_tomato.sensing.visible_fraction import image_operations as operations
-from maniskill_tomato.sensing.visible_fraction.estimate import Estimate, SegmentedImage, UInt8, fruit_depth
+from maniskill_tomato.sensing.visible_fraction.estimate import (
+    Estimate,
+    SegmentedImage,
+    UInt8,
+    filled_depth,
+    fruit_depth,
+)
 from maniskill_tomato.sensing.visible_fraction.image_operations import Contour, Ellipse
 
 
@@ -76,7 +82,9 @@ class ThesisModel:
         binary = operations.clean(operations.red_image(inpainted), c.erosion, c.dilation)
         depths = [d for mask in view.masks if np.isfinite(d := fruit_depth(view.depth_m, mask))]
         farthest = max(depths) + c.behind_m if depths else np.inf
-        binary = operations.remove_deeper(binary, view.depth_m, farthest)
+        # A camera's holes lie beside what is near and show what is behind it; the thesis's simulated one had none.
+        depth_m = filled_depth(view.depth_m)
+        binary = operations.remove_deeper(binary, depth_m, farthest)
         contours, ellipses, whole, fractions = [], [], [], []
         for contour in operations.outlines(binary, c.smallest):
             ellipse = operations.fit_ellipse(contour)
@@ -87,7 +95,7 @@ class ThesisModel:
             if not np.isfinite(own):
                 continue
             # Only the largest of the new contours is the tomato; the depth filter leaves crumbs.
-            filtered = operations.remove_deeper(inside, view.depth_m, own + c.behind_m)
+            filtered = operations.remove_deeper(inside, depth_m, own + c.behind_m)
             pieces = operations.outlines(filtered, c.smallest)
             if not pieces:
                 continue
