@@ -119,8 +119,18 @@ def test_on_a_phone_most_of_the_page_is_scene_and_the_panel_can_be_worked(browse
         served.close()
 
 
-def test_dragging_the_target_by_its_handle_changes_the_fraction(browser_page: Page) -> None:
+def test_dragging_the_target_by_its_handle_changes_the_fraction(
+    browser_page: Page, monkeypatch: pytest.MonkeyPatch
+) -> None:
     player = Player(PlaySession, PlaySettings(env_id="TomatoViewpointGuided-v1", policy="random", seed=2))
+    left: list[NDArray[np.float64] | None] = []
+    drop = player.drop_target
+
+    def told() -> None:
+        left.append(player.target_place())
+        drop()
+
+    monkeypatch.setattr(player, "drop_target", told)
     served = PlayPage(player, port=0)
     try:
         browser_page.set_viewport_size({"width": 900, "height": 700})
@@ -158,6 +168,9 @@ def test_dragging_the_target_by_its_handle_changes_the_fraction(browser_page: Pa
         assert place is not None and place[2] > before[2] + 0.05
         assert abs(player.recording.snapshots[0].visible_fraction - fraction) > 0.02
         np.testing.assert_allclose(place[:2], before[:2], atol=1e-3)
+        # Where the target is left, the policy decides anew.
+        wait_for(browser_page, lambda: bool(left))
+        np.testing.assert_allclose(np.array(left[-1]), place)
     finally:
         served.close()
 
