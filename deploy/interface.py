@@ -93,6 +93,8 @@ class FrameTruth:
     """What the task's pattern of rays about the target meets."""
     fruit_labels: tuple[int, ...] = ()
     """Labels of all fruits in the order of `Plant.fruits`; empty where that is not known."""
+    stem_labels: tuple[int, ...] = ()
+    """Labels of stems and trusses; empty where that is not known."""
     ripe_fractions: tuple[float, ...] = ()
     """V_f of the ripe fruits by ray casting, in the order of `ripe_labels`; empty where that is not known."""
 

@@ -278,6 +278,7 @@ def _truth(frame: Frame) -> dict[str, Any]:
         "visible_fraction": truth.visible_fraction,
         "ripe_labels": list(truth.ripe_labels),
         "fruit_labels": list(truth.fruit_labels),
+        "stem_labels": list(truth.stem_labels),
         "ripe_fractions": list(truth.ripe_fractions),
         "rays": {
             "direction_c": pack(truth.rays.direction_c.numpy()),

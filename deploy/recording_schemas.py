@@ -154,6 +154,7 @@ TRUTH: Final = _object(
         "visible_fraction": _NUMBER,
         "ripe_labels": {"type": "array", "items": _INTEGER},
         "fruit_labels": {"type": "array", "items": _INTEGER},
+        "stem_labels": {"type": "array", "items": _INTEGER},
         "ripe_fractions": {"type": "array", "items": _NUMBER},
         "rays": _object({"direction_c": _PACKED, "distance": _PACKED, "label": _PACKED}),
     }

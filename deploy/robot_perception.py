@@ -3,6 +3,7 @@
 import importlib
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any, Final, Literal, Protocol
 
 import numpy as np
@@ -11,7 +12,7 @@ import torch
 from maniskill_tomato.deploy.deploy_errors import PerceptionError, ProfileError
 from maniskill_tomato.deploy.interface import Float64, Frame, FrameTruth
 from maniskill_tomato.errors import TomatoError
-from maniskill_tomato.raycast.images import ROBOT_LABEL
+from maniskill_tomato.raycast.images import ROBOT_LABEL, Role
 from maniskill_tomato.raycast.view_rays import ViewRays
 from maniskill_tomato.robot.arm_model import ArmModel
 from maniskill_tomato.robot.d435 import CameraIntrinsics
@@ -26,6 +27,7 @@ from maniskill_tomato.sensing.belief import Belief
 from maniskill_tomato.sensing.camera_perception import CameraPerception
 from maniskill_tomato.sensing.fruit_detector import FruitDetector
 from maniskill_tomato.sensing.fruit_map import FruitMap
+from maniskill_tomato.sensing.image_observation import ImageLayout, ImageSource, picture_images
 from maniskill_tomato.sensing.inspection import STALE_AFTER
 from maniskill_tomato.sensing.measurement import RIPE_CATEGORIES
 from maniskill_tomato.sensing.observation import ObservationLayout, ViewpointObserver
@@ -73,6 +75,8 @@ class Sighting:
     """Whether there is a target; without one the robot looks for one about `target_position`."""
     is_new_target: bool = False
     """Whether the robot has just chosen it."""
+    images: ImageSource | None = None
+    """Delivers the picture as policies observe it."""
 
     @property
     def target_seen(self) -> bool:
@@ -203,6 +207,7 @@ class ImagePerception:
             target_position=perception.position_w(0),
             recall=self._recall if moved else None,
             has_target=perception.target(0) is not None,
+            images=perception.images,
         )
 
     @property
@@ -271,7 +276,22 @@ class TruthPerception:
             mask=np.asarray(truth.labels == truth.target_label),
             fruits_seen=sum(bool((truth.labels == label).any()) for label in truth.ripe_labels),
             target_position=self._target,
+            images=partial(_true_images, frame, truth),
         )
+
+
+def _true_images(frame: Frame, truth: FrameTruth, layout: ImageLayout) -> dict[str, torch.Tensor]:
+    """A twin's picture with true roles, as the simulated task has it."""
+    role = np.where(truth.labels > ROBOT_LABEL, int(Role.LEAF), int(Role.BACKGROUND)).astype(np.uint8)
+    for labels, shown in (
+        ((ROBOT_LABEL,), Role.ROBOT),
+        (truth.stem_labels, Role.STEM),
+        (truth.fruit_labels or truth.ripe_labels, Role.OTHER_FRUIT),
+        ((truth.target_label,), Role.TARGET),
+    ):
+        role[np.isin(truth.labels, labels)] = int(shown)
+    told = picture_images(frame.depth, role, frame.color, frame.intrinsics, layout)
+    return {kind: torch.from_numpy(image)[None] for kind, image in told.items()}
 
 
 def open_perception(sight: Sight, segmenter: str) -> Perception:
@@ -361,7 +381,7 @@ class RobotBelief:
             torch.tensor([moves_left]),
             qpos=torch.as_tensor(np.array(joint_positions)[None], dtype=torch.float32),
         )
-        return self._observer.belief
+        return replace(self._observer.belief, images=sighting.images)
 
     def _poses(self, joint_positions: Float64) -> tuple[torch.Tensor, torch.Tensor]:
         joints = torch.as_tensor(np.array(joint_positions)[None], dtype=torch.float32)

@@ -345,6 +345,7 @@ def _truth(message: dict[str, Any]) -> FrameTruth:
         ripe_labels=tuple(int(label) for label in message["ripe_labels"]),
         rays=ViewRays(rays["direction_c"], rays["distance"], rays["label"]),
         fruit_labels=tuple(int(label) for label in message.get("fruit_labels", ())),
+        stem_labels=tuple(int(label) for label in message.get("stem_labels", ())),
         ripe_fractions=tuple(float(v) for v in message.get("ripe_fractions", ())),
     )
 

@@ -23,6 +23,8 @@ from maniskill_tomato.robot.look_at import carried_pose
 from maniskill_tomato.robot.robot_description import link_meshes
 from maniskill_tomato.robot.viewpoint_move import viewpoint_of
 from maniskill_tomato.sensing.belief import Belief
+from maniskill_tomato.sensing.camera_perception import CameraPerception
+from maniskill_tomato.sensing.image_observation import ImageLayout, cast_images
 from maniskill_tomato.tasks.arm_moves import ACTION_SIZES, ArmMoves, Plan
 from maniskill_tomato.tasks.ground_truth import WorldTruth
 from maniskill_tomato.tasks.numpy_streams import (
@@ -476,6 +478,31 @@ class World:
     def observation(self) -> Tensor:
         """The observation of state vectors. Shape (N, D)."""
         return torch.cat(tuple(self.game.observation().values()), dim=-1)
+
+    def images(self, layout: ImageLayout) -> dict[str, Tensor]:
+        """What the wrist cameras show: of a camera's perception what it measured, else the truth.
+
+        Args:
+            layout: What is wanted.
+
+        Returns:
+            By kind, each of shape (N, H, W, C).
+
+        Raises:
+            InvalidInputError: Colours are wanted, and the world has no renderer.
+        """
+        perception: CameraPerception | None = getattr(self.game, "perception", None)
+        if perception is not None:
+            return perception.images(layout)
+        cast = self.scene.image(
+            layout.intrinsics(self.intrinsics),
+            self.T_w_camera,
+            self.state.target,
+            self.plant_batch.T_world_plant,
+            self.T_w_links,
+        )
+        colours = self.pictures(self.state.qpos) if layout.needs_colours and self.pictures else None
+        return cast_images(cast, layout, colours)
 
     def info(self) -> dict[str, Tensor]:
         """What came of the last move."""

@@ -135,6 +135,9 @@ class TwinWorld:
         self._target_label = FIRST_ORGAN_LABEL + fruits[episode.target].organ_index
         self._ripe = [j for j, fruit in enumerate(fruits) if fruit.ripeness == "ripe"]
         self._fruit_labels = tuple(FIRST_ORGAN_LABEL + fruit.organ_index for fruit in fruits)
+        self._stem_labels = tuple(
+            FIRST_ORGAN_LABEL + k for k, organ in enumerate(organs) if organ is SemanticClass.STEM
+        )
 
     def advance(self) -> float:
         """Moves the arm on to the present; that time, in [s]."""
@@ -174,6 +177,7 @@ class TwinWorld:
             ripe_labels=tuple(self._fruit_labels[j] for j in self._ripe),
             rays=rays,
             fruit_labels=self._fruit_labels,
+            stem_labels=self._stem_labels,
             ripe_fractions=self.visible_fractions(self._ripe, self.arm.joint_positions),
         )
 

@@ -28,8 +28,8 @@ class Train:
     ] = None
     """Id of the task."""
     preset: PresetName = "td3"
-    """Named configuration: a good default (td3, or general-td3 for the general tasks), or the thesis's Table 5-1 or
-    5-2."""
+    """Named configuration: a good default (td3, or general-td3 for the general tasks; with images pixel-td3 and
+    general-pixel-td3), or the thesis's Table 5-1 or 5-2."""
     config_file: Annotated[Path | None, tyro.conf.arg(name="config", metavar="FILE")] = None
     """Options from a .toml file or from the config.json of a run; flags replace them."""
     resume: Annotated[Path | None, tyro.conf.arg(metavar="DIR")] = None
@@ -173,7 +173,7 @@ def _default(argv: Sequence[str]) -> Train:
     else:
         run_file = RunFile()
     env_id = run_file.env_id or next((word for word in argv if word in TASK_IDS), None)
-    preset = run_file.preset or default_preset(env_id)
+    preset = run_file.preset or default_preset(env_id, _asked(argv, "--obs-mode"))
     asked = _asked(argv, "--preset")
     for name in PRESETS:
         if asked == name:

@@ -34,7 +34,13 @@ from maniskill_tomato.files import write_atomically, write_json
 from maniskill_tomato.learning.rl.envs import make_env
 from maniskill_tomato.learning.rl.history import load_history
 from maniskill_tomato.policies.adapters import origin
-from maniskill_tomato.policies.opening import RANDOM, find_policy, open_policy, shipped_policy
+from maniskill_tomato.policies.opening import (
+    RANDOM,
+    find_policy,
+    needs_colours,
+    open_policy,
+    shipped_policy,
+)
 from maniskill_tomato.policies.protocol import Planner, Policy
 from maniskill_tomato.rendering import vulkan_probe
 from maniskill_tomato.run_facts import duration, is_command_running, run_facts
@@ -260,7 +266,7 @@ def _run_policy(
     config: EvaluationConfig, found: str | Path
 ) -> tuple[list[EpisodeRecord], EpisodeLimits, Policy]:
     def make(num_envs: int) -> tuple[gym.Env[Any, Any], Policy]:
-        env = make_env(config.env_id, num_envs, **config.env_options)
+        env = make_env(config.env_id, num_envs, colours=needs_colours(found), **config.env_options)
         return env, _open(config, found, env)
 
     env, policy = open_widest(make, min(config.num_envs, config.episodes))
@@ -284,7 +290,7 @@ def _with_true_association(config: EvaluationConfig, found: str | Path) -> list[
     if config.env_id == ROW_ID:
         return None
     logger.info("the same episodes with a true association, to compare")
-    env = make_env(config.env_id, **options, association="truth")
+    env = make_env(config.env_id, colours=needs_colours(found), **options, association="truth")
     try:
         policy = _open(config, found, env)
         return run_episodes(env, policy, config.episodes, config.seed, config.show_progress)

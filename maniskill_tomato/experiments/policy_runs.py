@@ -16,7 +16,7 @@ from maniskill_tomato.experiments.result_store import ResultStore, fingerprint
 from maniskill_tomato.experiments.rollout import open_widest, run_listed
 from maniskill_tomato.experiments.stored_episodes import about_condition
 from maniskill_tomato.learning.rl.envs import make_env
-from maniskill_tomato.policies.opening import find_policy, open_policy
+from maniskill_tomato.policies.opening import find_policy, needs_colours, open_policy
 from maniskill_tomato.policies.protocol import Policy
 from maniskill_tomato.policies.registry import policy_names
 from maniskill_tomato.worker_pool import run_jobs
@@ -223,13 +223,16 @@ def _opened(spec: PolicySpec, condition: Condition, num_envs: int) -> tuple[gym.
         for env in _kept.get("envs", {}).values():
             env.close()
         _kept.update(key=key, envs={}, policies={})
-    envs: dict[int, gym.Env[Any, Any]] = _kept["envs"]
+    envs: dict[tuple[int, bool], gym.Env[Any, Any]] = _kept["envs"]
     policies: dict[Any, tuple[gym.Env[Any, Any], Policy]] = _kept["policies"]
 
+    colours = needs_colours(find_policy(spec.source))
+
     def make(count: int) -> tuple[gym.Env[Any, Any], Policy]:
-        if count not in envs:
-            envs[count] = make_env(condition.env_id, count, **condition.env_options)
-        return envs[count], open_for(spec, envs[count], condition.contact_free)
+        key = (count, colours)
+        if key not in envs:
+            envs[key] = make_env(condition.env_id, count, colours=colours, **condition.env_options)
+        return envs[key], open_for(spec, envs[key], condition.contact_free)
 
     which = (spec, condition.contact_free, num_envs)
     if which not in policies:

@@ -7,8 +7,10 @@ import torch
 from torch import Tensor
 
 from maniskill_tomato.errors import PolicyError
+from maniskill_tomato.policies.pixel_policy import PixelFollower, PixelPolicy
 from maniskill_tomato.policies.protocol import Planner, Policy, StatePolicy, reseed
 from maniskill_tomato.sensing.belief import Belief
+from maniskill_tomato.sensing.image_observation import Observation, Sight, images_of, state_of
 
 if TYPE_CHECKING:
     from maniskill_tomato.policies.onnx_policy import OnnxPolicy
@@ -46,10 +48,17 @@ class ExportedActor:
     def __init__(self, exported: "OnnxPolicy") -> None:
         self.exported = exported
 
-    def act(self, observations: Tensor) -> Tensor:
-        """Actions of shape (B, A) for observations of shape (B, D), in the task's units."""
-        actions = self.exported.act(observations.detach().cpu().numpy())
-        return torch.from_numpy(actions).to(observations.device)
+    @property
+    def sight(self) -> Sight | None:
+        """The images that it observes; None if it observes none."""
+        return self.exported.description.sight
+
+    def act(self, observations: Observation) -> Tensor:
+        """Actions of shape (B, A) for observations of shape (B, D) or with images, in the task's units."""
+        state = state_of(observations)
+        images = {kind: image.cpu().numpy() for kind, image in images_of(observations).items()}
+        actions = self.exported.act(state.detach().cpu().numpy(), images)
+        return torch.from_numpy(actions).to(state.device)
 
     def describe(self) -> dict[str, Any]:
         """Where it comes from."""
@@ -110,6 +119,8 @@ def as_state_policy(policy: Policy | StatePolicy, env: Any) -> StatePolicy:
         return BeliefFollower(policy, env)
     if isinstance(policy, ObservationPolicy):
         return policy.policy
+    if isinstance(policy, PixelPolicy):
+        return PixelFollower(policy, env)
     raise PolicyError(f"{policy.name} decides from beliefs, which this environment does not have")
 
 

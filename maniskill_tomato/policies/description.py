@@ -3,15 +3,18 @@
 import json
 import math
 from dataclasses import asdict, dataclass
-from typing import Any
+from typing import Any, Final
 
 import maniskill_tomato
 from maniskill_tomato.errors import PolicyError
 from maniskill_tomato.policies.layout import layout_of
+from maniskill_tomato.raycast.images import Role
+from maniskill_tomato.sensing.image_observation import ImageLayout, Sight
 from maniskill_tomato.text_files import parse_json
 
-FORMAT = 1
-"""Version of the layout that `PolicyDescription.to_json` writes."""
+FORMAT = 2
+"""Version of the layout that `PolicyDescription.to_json` writes for policies that see images; 1 for all others, which
+earlier versions read too."""
 
 INPUT_NAME = "observation"
 OUTPUT_NAME = "action"
@@ -69,12 +72,14 @@ class PolicyDescription:
     trained_with: dict[str, Any] | None = None
     """Options of the task in the training, such as `plant`, `plant_pose`; empty if it was as it is, None if not
     known."""
+    sight: Sight | None = None
+    """The images that stand beside the observation; None if there are none."""
 
     def to_json(self) -> str:
         """The file's text."""
-        layout = layout_of(self.env_id)
-        content = {
-            "format": FORMAT,
+        layout = layout_of(self.env_id, self.sight)
+        content: dict[str, Any] = {
+            "format": 1 if self.sight is None else FORMAT,
             "package_version": self.package_version,
             "task": {
                 "id": self.env_id,
@@ -107,6 +112,8 @@ class PolicyDescription:
             "training": self.training,
             "onnx": {"sha256": self.onnx_sha256},
         }
+        if self.sight is not None:
+            content["images"] = _images_json(self.sight)
         return json.dumps(content, indent=2, allow_nan=False) + "\n"
 
     @classmethod
@@ -147,10 +154,11 @@ class PolicyDescription:
                 training=dict(content["training"]),
                 onnx_sha256=_text(content["onnx"]["sha256"]),
                 trained_with=None if trained_with is None else dict(trained_with),
+                sight=_sight(content["images"]) if "images" in content else None,
             )
         except KeyError as error:
             raise PolicyError(f"it lacks the entry {error}") from error
-        except (TypeError, ValueError) as error:
+        except (TypeError, ValueError, AttributeError) as error:
             raise PolicyError(f"an entry has the wrong type ({error})") from error
         description.check_layout()
         return description
@@ -161,7 +169,7 @@ class PolicyDescription:
         Raises:
             PolicyError: Names, units or their order differ, or the normaliser has another length.
         """
-        layout = layout_of(self.env_id)
+        layout = layout_of(self.env_id, self.sight)
         for what, components, names, units in (
             ("observation", self.observation, layout.observation_names, layout.observation_units),
             ("action", self.action, layout.action_names, layout.action_units),
@@ -175,6 +183,43 @@ class PolicyDescription:
                 )
         if not len(self.normalizer_centre) == len(self.normalizer_half_range) == len(self.observation):
             raise PolicyError(f"its normaliser must have {len(self.observation)} centres and half ranges")
+
+
+IMAGE_MEANINGS: Final = {
+    "rgb": ("uint8", "sRGB colours"),
+    "depth": ("int16", "along the optical axis, in mm; 0 where it was not measured"),
+    "segmentation": (
+        "uint8",
+        "roles by number: " + ", ".join(f"{role.value} {role.name.lower()}" for role in Role),
+    ),
+}
+"""Type and meaning of each image."""
+
+
+def _images_json(sight: Sight) -> dict[str, Any]:
+    return {
+        "frames": sight.frames,
+        "state_parts": list(sight.state_parts),
+        "inputs": [
+            {
+                "input": kind,
+                "dtype": IMAGE_MEANINGS[kind][0],
+                "shape": ["batch", *shape],
+                "meaning": IMAGE_MEANINGS[kind][1],
+            }
+            for kind, shape in sight.shapes.items()
+        ],
+    }
+
+
+def _sight(entry: dict[str, Any]) -> Sight:
+    inputs = entry["inputs"]
+    _, height, width, _ = inputs[0]["shape"]
+    images = ImageLayout(kinds=tuple(one["input"] for one in inputs), width=width, height=height)
+    sight = Sight(images=images, frames=entry["frames"], state_parts=tuple(entry["state_parts"]))
+    if _images_json(sight)["inputs"] != inputs:
+        raise ValueError(f"images {inputs!r} are not of one layout")
+    return sight
 
 
 def shortened(names: list[str]) -> str:

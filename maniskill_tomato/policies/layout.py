@@ -1,6 +1,10 @@
 """The order and the units of what a policy observes and does, by task."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from maniskill_tomato.sensing.image_observation import Sight
 
 OBSERVATION_NAMES = (
     "ee_x",
@@ -77,6 +81,19 @@ def has_belief(env_id: str) -> bool:
     return env_id in GENERAL_IDS
 
 
-def layout_of(env_id: str) -> PolicyLayout:
-    """What the policies of a task observe and do; the thesis's for tasks that this package does not know."""
-    return GENERAL_LAYOUT if has_belief(env_id) else THESIS_LAYOUT
+def layout_of(env_id: str, sight: "Sight | None" = None) -> PolicyLayout:
+    """What the policies of a task observe and do; the thesis's for tasks that this package does not know.
+
+    Args:
+        env_id: The task.
+        sight: The images that they see; beside them only some parts of the general tasks' observation are observed.
+    """
+    if not has_belief(env_id):
+        return THESIS_LAYOUT
+    if sight is None:
+        return GENERAL_LAYOUT
+    from maniskill_tomato.sensing.observation import ObservationLayout
+
+    slices = ObservationLayout(parts=sight.state_parts).slices
+    names = tuple(f"{part}_{i}" for part, place in slices.items() for i in range(place.stop - place.start))
+    return replace(GENERAL_LAYOUT, observation_names=names, observation_units=("1",) * len(names))

@@ -1,6 +1,7 @@
 """A trained policy from an ONNX file and its description, ready to act on hardware."""
 
 import hashlib
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -9,7 +10,8 @@ import onnxruntime
 from numpy.typing import ArrayLike, NDArray
 
 from maniskill_tomato.errors import InvalidInputError, PolicyError
-from maniskill_tomato.policies.description import INPUT_NAME, OUTPUT_NAME, PolicyDescription
+from maniskill_tomato.policies.description import IMAGE_MEANINGS, INPUT_NAME, OUTPUT_NAME, PolicyDescription
+from maniskill_tomato.sensing.image_observation import check_images
 
 _EXPORT_AGAIN = "run `maniskill-tomato export` again"
 
@@ -75,12 +77,15 @@ class OnnxPolicy:
         policy._check_graph(path)
         return policy
 
-    def act(self, observations: ArrayLike) -> NDArray[np.float32]:
+    def act(
+        self, observations: ArrayLike, images: Mapping[str, NDArray[Any]] | None = None
+    ) -> NDArray[np.float32]:
         """The actions for a batch of observations.
 
         Args:
-            observations: End-effector x, y, z [m], roll, pitch, yaw [rad], target x, y, z [m], world frame;
-                float32 or what converts to it. Shape (B, 9).
+            observations: As the description says, for the thesis's tasks end-effector x, y, z [m], roll, pitch, yaw
+                [rad], target x, y, z [m], world frame; float32 or what converts to it. Shape (B, D).
+            images: Those of the description's `sight` by kind, each of shape (B, H, W, C); None without one.
 
         Returns:
             Increments dx, dy, dz [m], droll, dpitch, dyaw [rad]. Shape (B, 6).
@@ -104,7 +109,15 @@ class OnnxPolicy:
             raise InvalidInputError(
                 f"observations must be finite; {name} of observation {row} is {given[row, column]}"
             )
-        (output,) = self._session.run([OUTPUT_NAME], {INPUT_NAME: values})
+        inputs: dict[str, NDArray[Any]] = {INPUT_NAME: values}
+        if (sight := self.description.sight) is not None:
+            check_images(images or {}, sight, len(values))
+            for kind in sight.images.kinds:
+                dtype = IMAGE_MEANINGS[kind][0]
+                if (given := np.asarray((images or {})[kind])).dtype != dtype:
+                    raise InvalidInputError(f"this policy observes {kind} as {dtype}, got {given.dtype}")
+                inputs[kind] = given
+        (output,) = self._session.run([OUTPUT_NAME], inputs)
         actions = np.asarray(output, dtype=np.float32)
         if not np.isfinite(actions).all():
             raise PolicyError("the policy answered with actions that are not finite; the arm must not move")
@@ -125,16 +138,21 @@ class OnnxPolicy:
 
     def _check_graph(self, path: Path) -> None:
         """Refuses a graph with another input or output than the description's."""
+        inputs = [(INPUT_NAME, "tensor(float)", [len(self.description.observation)])]
+        if (sight := self.description.sight) is not None:
+            inputs += [
+                (kind, f"tensor({IMAGE_MEANINGS[kind][0]})", list(shape))
+                for kind, shape in sight.shapes.items()
+            ]
         ends = (
-            (self._session.get_inputs(), INPUT_NAME, len(self.description.observation)),
-            (self._session.get_outputs(), OUTPUT_NAME, len(self.description.action)),
+            (self._session.get_inputs(), inputs),
+            (self._session.get_outputs(), [(OUTPUT_NAME, "tensor(float)", [len(self.description.action)])]),
         )
-        for nodes, name, width in ends:
+        for nodes, wanted in ends:
             got = [(node.name, node.type, list(node.shape)[1:]) for node in nodes]
-            if got != [(name, "tensor(float)", [width])]:
-                raise PolicyError(
-                    f"{path} must have one tensor {name!r} of shape (batch, {width}), got {got}; {_EXPORT_AGAIN}"
-                )
+            if got != wanted:
+                listed = " and ".join(f"{name!r} of shape {('batch', *shape)}" for name, _, shape in wanted)
+                raise PolicyError(f"{path} must have one tensor {listed}, got {got}; {_EXPORT_AGAIN}")
 
 
 def _read(path: Path, what: str) -> bytes:

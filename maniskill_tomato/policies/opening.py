@@ -55,6 +55,36 @@ def find_policy(name_or_file: str | Path, env_id: str | None = None) -> str | Pa
     return path
 
 
+def needs_colours(found: str | Path) -> bool:
+    """Whether a policy observes colours, so that its environments need a renderer.
+
+    Args:
+        found: What `find_policy` gave.
+
+    Raises:
+        PolicyError: Its file cannot be read.
+    """
+    if not isinstance(found, Path):
+        return False
+    try:
+        if found.suffix.lower() in (".onnx", ".json"):
+            from maniskill_tomato.policies.onnx_policy import OnnxPolicy
+
+            sight = OnnxPolicy.load(found).description.sight
+        else:
+            from maniskill_tomato.files import read_tensors
+            from maniskill_tomato.policies.trained_actor import sight_of
+
+            content = read_tensors(found)
+            config = content.get("config") if isinstance(content, dict) else None
+            sight = sight_of(config) if isinstance(config, dict) else None
+    except PolicyError:
+        raise
+    except TomatoError as error:
+        raise PolicyError(str(error)) from error
+    return sight is not None and sight.images.needs_colours
+
+
 def open_policy(
     name_or_file: str | Path,
     *,
@@ -143,20 +173,29 @@ def _random(env_id: str | None, context: PolicyContext) -> "Policy":
 
 def _open_file(path: Path, env_id: str | None, context: PolicyContext) -> "Policy":
     if path.suffix.lower() in (".onnx", ".json"):
-        from maniskill_tomato.policies.adapters import ExportedActor, ObservationPolicy
+        from maniskill_tomato.policies.adapters import ExportedActor
         from maniskill_tomato.policies.onnx_policy import OnnxPolicy
 
-        return ObservationPolicy(ExportedActor(OnnxPolicy.load(path, env_id)))
+        exported = ExportedActor(OnnxPolicy.load(path, env_id))
+        return _acting(exported, exported.sight)
     from maniskill_tomato.files import read_tensors
 
     content = read_tensors(path)
     kind = content.get("format") if isinstance(content, dict) else None
     if isinstance(kind, str):
         return _open_network(path, kind, env_id, context)
-    from maniskill_tomato.policies.adapters import ObservationPolicy
     from maniskill_tomato.policies.trained_actor import load_actor
 
-    return ObservationPolicy(load_actor(path, context.device, env_id))
+    actor = load_actor(path, context.device, env_id)
+    return _acting(actor, actor.sight)
+
+
+def _acting(actor: Any, sight: Any) -> "Policy":
+    """A trained actor as a policy, by whether it sees images."""
+    from maniskill_tomato.policies.adapters import ObservationPolicy
+    from maniskill_tomato.policies.pixel_policy import PixelPolicy
+
+    return ObservationPolicy(actor) if sight is None else PixelPolicy(actor, sight)
 
 
 def _open_network(path: Path, kind: str, env_id: str | None, context: PolicyContext) -> "Policy":

@@ -1,5 +1,6 @@
 """Reading what a training wrote: checkpoints, and the actor in them, ready to act."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -12,6 +13,16 @@ from maniskill_tomato.errors import CheckpointError, InvalidInputError
 from maniskill_tomato.files import read_tensors
 from maniskill_tomato.network_weights import check_weight, fill_network
 from maniskill_tomato.policies.actor import Actor, ObservationNormalizer
+from maniskill_tomato.policies.image_encoder import ImageEncoder
+from maniskill_tomato.sensing.image_observation import (
+    ImageLayout,
+    Observation,
+    Sight,
+    check_images,
+    images_of,
+    state_of,
+)
+from maniskill_tomato.sensing.perception_kinds import STATE_MODE
 
 FORMAT = 1
 """Version of the layout that `learning.rl.checkpoint.make_checkpoint` documents."""
@@ -52,22 +63,30 @@ class TrainedActor:
     env_options: dict[str, Any] | None = None
     """Options of the task that it was trained with, such as its plant; empty if the task was as it is, None if the
     file is of a version that did not keep them."""
+    encoder: ImageEncoder | None = None
+    """What turns images into features; None for an actor that observes none."""
 
     @property
     def observation_dim(self) -> int:
-        """Number of observed values."""
+        """Number of observed values, those of images left out."""
         return len(self.normalizer.centre)
+
+    @property
+    def sight(self) -> Sight | None:
+        """The images that it observes; None if it observes none."""
+        return None if self.encoder is None else sight_of(self.config)
 
     @property
     def algorithm(self) -> str:
         """TD3 or DDPG."""
         return "TD3" if self.config.get("twin_critics", False) else "DDPG"
 
-    def act(self, observations: Tensor) -> Tensor:
+    def act(self, observations: Observation) -> Tensor:
         """The actions for a batch of observations, without exploration.
 
         Args:
-            observations: As the task gives them: world frame, [m] and [rad]. Shape (B, observation_dim).
+            observations: As the task gives them: world frame, [m] and [rad]. Shape (B, observation_dim), or a
+                dictionary with such a `state` and the images of `sight`.
 
         Returns:
             In units of the environment, [m] and [rad]. Shape (B, action_dim).
@@ -75,12 +94,18 @@ class TrainedActor:
         Raises:
             InvalidInputError: The observations have another shape.
         """
-        if observations.ndim != 2 or observations.shape[1] != self.observation_dim:
+        state = state_of(observations)
+        if state.ndim != 2 or state.shape[1] != self.observation_dim:
             raise InvalidInputError(
-                f"observations must have shape (B, {self.observation_dim}), got {tuple(observations.shape)}"
+                f"observations must have shape (B, {self.observation_dim}), got {tuple(state.shape)}"
             )
+        if (sight := self.sight) is not None:
+            check_images(images_of(observations), sight, len(state))
         with torch.no_grad():
-            actions: Tensor = self.actor(self.normalizer(observations)) * self.action_scale
+            seen = self.normalizer(state)
+            if self.encoder is not None:
+                seen = torch.cat((seen, self.encoder(images_of(observations))), dim=-1)
+            actions: Tensor = self.actor(seen) * self.action_scale
         return torch.maximum(torch.minimum(actions, self.action_high), self.action_low)
 
     def describe(self) -> dict[str, Any]:
@@ -119,7 +144,10 @@ def load_actor(
     try:
         (observation_dim,) = data["observation"]["shape"]
         scale = data["action"]["scale"]
-        actor = Actor(observation_dim, len(scale), tuple(data["config"]["actor_hidden"])).to(device)
+        encoder = _encoder(data, device)
+        features = 0 if encoder is None else encoder.features
+        hidden = tuple(data["config"]["actor_hidden"])
+        actor = Actor(observation_dim + features, len(scale), hidden).to(device)
         fill_network(actor, data["actor"])
         normalizer = ObservationNormalizer.identity(observation_dim).to(device)
         fill_network(normalizer, data["normalizer"])
@@ -144,7 +172,30 @@ def load_actor(
         package_version=data["package_version"],
         counters=data["counters"],
         env_options=options,
+        encoder=encoder,
     )
+
+
+def sight_of(config: Mapping[str, Any]) -> Sight | None:
+    """What a training with some options observed as images; None for state vectors alone.
+
+    Args:
+        config: As `learning.rl.train_config.TrainConfig.to_dict` writes it, of any version.
+    """
+    images = ImageLayout.parse(config.get("obs_mode", STATE_MODE), config.get("image_size", (64, 48)))
+    if images is None:
+        return None
+    return Sight(images=images, frames=int(config["frame_stack"]), state_parts=tuple(config["state_parts"]))
+
+
+def _encoder(data: Mapping[str, Any], device: torch.device | str) -> ImageEncoder | None:
+    """The encoder of a checkpoint that has one."""
+    sight = sight_of(data["config"])
+    if sight is None:
+        return None
+    encoder = ImageEncoder(sight.images, sight.frames, int(data["config"]["image_features"])).to(device)
+    fill_network(encoder, data["encoder"])
+    return encoder.eval().requires_grad_(False)
 
 
 def load_checkpoint(path: Path | str, device: torch.device | str = "cpu") -> dict[str, Any]:

@@ -19,13 +19,9 @@ from maniskill_tomato.raycast.kernels import (
 
 wp.set_module_options({"enable_backward": False})
 
-SHOWS_NOTHING = wp.constant(wp.int8(0))
-SHOWS_TARGET = wp.constant(wp.int8(1))
-SHOWS_PLANT = wp.constant(wp.int8(2))
-SHOWS_ROBOT = wp.constant(wp.int8(3))
-
 NO_FACE = wp.constant(-1)
 FACE_OF_ROBOT = wp.constant(-2)
+FACE_OF_TARGET = wp.constant(-3)
 
 
 @wp.struct
@@ -53,21 +49,22 @@ def trace_image(
     pinhole: Pinhole,
     farthest: float,
     depths: wp.array3d[wp.float32],
-    labels: wp.array3d[wp.int8],
+    faces: wp.array3d[wp.int32],
 ):
-    """One pixel: the depth of what its centre shows, `farthest` without anything, and which kind of thing that is."""
+    """One pixel: the depth of what its centre shows, `farthest` without anything, and which triangle of the plant that
+    is, unless it is the target or none."""
     view, row, column = wp.tid()
     direction_c = pixel_direction(pinhole, row, column)
     hit = first_hit(scene, views, view, direction_c, NEAR, farthest)
-    label = SHOWS_NOTHING
+    face = NO_FACE
     if hit.kind == LINK:
-        label = SHOWS_ROBOT
+        face = FACE_OF_ROBOT
     elif hit.kind == PLANT:
-        label = SHOWS_PLANT
+        face = hit.face
         if is_target(scene, views, view, direction_c, NEAR, hit.distance):
-            label = SHOWS_TARGET
+            face = FACE_OF_TARGET
     depths[view, row, column] = hit.distance
-    labels[view, row, column] = label
+    faces[view, row, column] = face
 
 
 @wp.kernel

@@ -1,5 +1,6 @@
 """Images by ray casting: what each pixel of a camera shows, without a renderer."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from enum import IntEnum
 from typing import Final
@@ -7,6 +8,8 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 from torch import Tensor
+
+from maniskill_tomato.plants.organs import SemanticClass
 
 BACKGROUND_DEPTH: Final = 4.0
 """Depth of a pixel of `CastImages` that shows neither plant nor robot, in [m]: a greenhouse always has a wall."""
@@ -19,26 +22,43 @@ FIRST_ORGAN_LABEL: Final = 2
 """Label of the plant's organ 0 in a `Picture`; organ k has this plus k."""
 
 
-class PixelLabel(IntEnum):
-    """What a pixel shows."""
+class Role(IntEnum):
+    """What a pixel shows, as far as a search for one fruit is concerned; the same numbers for every plant."""
 
-    NOTHING = 0
-    """The background."""
-    TARGET = 1
+    BACKGROUND = 0
+    """Neither plant nor robot."""
+    ROBOT = 1
+    STEM = 2
+    LEAF = 3
+    OTHER_FRUIT = 4
+    """A fruit that is not the target."""
+    TARGET = 5
     """The target fruit."""
-    PLANT = 2
-    """A leaf, a stem or another fruit."""
-    ROBOT = 3
+    OBJECT = 6
+    """A thing between the plants, such as a string or a board."""
+
+
+ROLE_OF_CLASS: Final[Mapping[SemanticClass, Role]] = {
+    SemanticClass.BACKGROUND: Role.BACKGROUND,
+    SemanticClass.STEM: Role.STEM,
+    SemanticClass.LEAF: Role.LEAF,
+    SemanticClass.FRUIT_RIPE: Role.OTHER_FRUIT,
+    SemanticClass.FRUIT_TURNING: Role.OTHER_FRUIT,
+    SemanticClass.FRUIT_GREEN: Role.OTHER_FRUIT,
+    SemanticClass.ROBOT: Role.ROBOT,
+    SemanticClass.OBJECT: Role.OBJECT,
+}
+"""The role of every class, of a fruit as one that is not the target."""
 
 
 @dataclass(frozen=True, eq=False)
 class CastImages:
-    """What the cameras of B environments see, as a perfect segmenter that knows the target labels it."""
+    """What the cameras of B environments see, as a perfect segmenter that knows the target tells it."""
 
     depth: Tensor
     """Along the optical axis, in [m]; `BACKGROUND_DEPTH` for the background. Shape (B, H, W)."""
-    label: Tensor
-    """Values of `PixelLabel`, int8. Shape (B, H, W)."""
+    role: Tensor
+    """Values of `Role`, uint8. Shape (B, H, W)."""
 
 
 @dataclass(frozen=True, eq=False)

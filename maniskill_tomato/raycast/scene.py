@@ -203,13 +203,12 @@ class RayScene:
         T_w_plant: Tensor,
         T_w_links: Tensor | None = None,
     ) -> CastImages:
-        """Depth and labels of every pixel in each environment.
+        """Depth and role of every pixel in each environment.
 
         Args:
             intrinsics: Of the images.
             T_w_camera: Poses of the optical frames, translation in [m]. Shape (N, 4, 4).
-            target_fruit: Indices into the plants' `fruits`; none is labelled for one that does not exist.
-                Shape (N,).
+            target_fruit: Indices into the plants' `fruits`; no pixel shows one that does not exist. Shape (N,).
             T_w_plant: Poses of the plants. Shape (N, 4, 4).
             T_w_links: Poses of `iiwa14.LINK_NAMES`; None for no robot. Shape (N, 9, 4, 4).
 

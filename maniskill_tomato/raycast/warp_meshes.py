@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from maniskill_tomato.errors import InvalidInputError
 from maniskill_tomato.plants.organs import Plant
 from maniskill_tomato.plants.plant_store import PLANT_STORE
+from maniskill_tomato.raycast.images import ROLE_OF_CLASS
 from maniskill_tomato.robot.iiwa14 import LINK_NAMES
 
 BYTES_OF_A_FACE: Final = 90
@@ -47,6 +48,9 @@ class PlantMeshes:
         self.spheres = np.array([(*fruit.centre, fruit.radius) for fruit in plant.fruits], dtype=np.float32)
         """Centre in the plant frame and radius of each fruit, in [m]. Shape (F, 4)."""
         self.is_ripe = np.array([fruit.ripeness == "ripe" for fruit in plant.fruits], dtype=np.int32)
+        roles = np.array([ROLE_OF_CLASS[organ.semantic_class] for organ in plant.organs], dtype=np.uint8)
+        self.role_of_face = torch.from_numpy(roles[plant.organ_of_face])
+        """Values of `Role` of the triangles of `whole`, on the CPU. Shape (F,), uint8."""
         faces = len(plant.faces) + sum(len(organ.faces) for organ in organs)
         self.size = BYTES_OF_A_FACE * faces
         """In memory, in [bytes]."""

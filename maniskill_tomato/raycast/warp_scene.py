@@ -32,10 +32,11 @@ from maniskill_tomato.raycast.images import (
     ROBOT_LABEL,
     CastImages,
     Picture,
+    Role,
 )
 from maniskill_tomato.raycast.view_rays import NEAREST_DEPTH, RANGE, RAYS_PER_SIDE, ViewRays, ray_pattern
 from maniskill_tomato.raycast.visibility import Visibility, ray_lattice
-from maniskill_tomato.raycast.warp_meshes import LinkMeshes, LinkTriangles, plant_meshes
+from maniskill_tomato.raycast.warp_meshes import LinkMeshes, LinkTriangles, PlantMeshes, plant_meshes
 from maniskill_tomato.robot.d435 import CAMERA_FAR, CameraIntrinsics
 from maniskill_tomato.robot.iiwa14 import LINK_NAMES
 from maniskill_tomato.robot.spheres import sphere_table
@@ -76,6 +77,7 @@ class WarpScene:
         self._coarse_pattern = self._points(ray_lattice(_COARSE_RAYS_PER_SIDE))
 
         self._shown = [plant_meshes(plant, self._warp_device) for plant in plants]
+        self._roles: _RoleTable | None = None
         self._links = LinkMeshes(robot_meshes, self._warp_device)
         self._scene: Any = kernels.Scene()
         self._links.describe(self._scene, device)
@@ -95,6 +97,7 @@ class WarpScene:
         self._finish_work()
         for env, shown in meshes.items():
             self._shown[env] = shown
+        self._roles = None
         if max(len(shown.fruits) for shown in meshes.values()) > self._fruit_meshes.shape[1]:
             self._allocate_tables()
         else:
@@ -162,8 +165,10 @@ class WarpScene:
         recorded = self._recorded(self._record_image, intrinsics)
         self._views.place(T_w_camera, target_fruit, T_w_plant, T_w_links)
         recorded.launch()
-        depth, label = recorded.outputs
-        return CastImages(depth.clone(), label.clone())
+        depth, face = recorded.outputs
+        if self._roles is None:
+            self._roles = _RoleTable(self._shown, self._device)
+        return CastImages(depth.clone(), self._roles.of(face))
 
     def picture(
         self,
@@ -314,15 +319,15 @@ class WarpScene:
 
     def _record_image(self, intrinsics: CameraIntrinsics) -> "_Recorded":
         shape = (self._views.count, intrinsics.height, intrinsics.width)
-        depth, label = self._zeros(*shape), self._zeros(*shape, dtype=torch.int8)
-        arrays = [wp.from_torch(depth), wp.from_torch(label)]
+        depth, face = self._zeros(*shape), self._zeros(*shape, dtype=torch.int32)
+        arrays = [wp.from_torch(depth), wp.from_torch(face)]
         arguments = [self._scene, self._views.struct, _pinhole(intrinsics), BACKGROUND_DEPTH, *arrays]
         launch = RecordedLaunch(
             self._device,
             (kernels.prepare, shape[0], [self._scene, self._views.struct]),
             (image_kernels.trace_image, shape, arguments),
         )
-        return _Recorded(launch, outputs=(depth, label))
+        return _Recorded(launch, outputs=(depth, face))
 
     def _record_picture(self, intrinsics: CameraIntrinsics) -> "_Recorded":
         views = self._first_view
@@ -382,6 +387,34 @@ def _pinhole(intrinsics: CameraIntrinsics) -> Any:
         intrinsics.cy,
     )
     return pinhole
+
+
+class _RoleTable:
+    """The role of every triangle that is shown, for all environments in one tensor."""
+
+    def __init__(self, shown: Sequence[PlantMeshes], device: torch.device) -> None:
+        special = torch.zeros(3, dtype=torch.uint8)
+        for face, role in (
+            (image_kernels.NO_FACE, Role.BACKGROUND),
+            (image_kernels.FACE_OF_ROBOT, Role.ROBOT),
+            (image_kernels.FACE_OF_TARGET, Role.TARGET),
+        ):
+            special[face] = int(role)
+        starts: dict[int, int] = {}
+        parts, length = [special], len(special)
+        for meshes in shown:
+            if id(meshes) not in starts:
+                starts[id(meshes)] = length
+                parts.append(meshes.role_of_face)
+                length += len(meshes.role_of_face)
+        self._table = torch.cat(parts).to(device)
+        first = torch.tensor([starts[id(meshes)] for meshes in shown], device=device)
+        self._first = first[:, None, None]
+        self._specials = len(special)
+
+    def of(self, face: Tensor) -> Tensor:
+        """Roles of triangles as the kernel numbers them, below 0 what is none. Shape (N, H, W), int32 to uint8."""
+        return self._table[torch.where(face < 0, face + self._specials, face + self._first)]
 
 
 class _Views:

@@ -18,6 +18,7 @@ from maniskill_tomato.segmentation.masks import BinaryMask
 from maniskill_tomato.sensing.axis_search import AxisSearch
 from maniskill_tomato.sensing.fruit_detector import FruitDetector
 from maniskill_tomato.sensing.fruit_map import Fraction, FruitMap, MapConfig, MappedView, Track
+from maniskill_tomato.sensing.image_observation import ImageLayout, measured_images
 from maniskill_tomato.sensing.inspection import LEAST_GAIN
 from maniskill_tomato.sensing.measurement import Measurement, Position
 from maniskill_tomato.sensing.observation import ViewpointObserver
@@ -308,6 +309,26 @@ class CameraPerception:
     def rays(self) -> ViewRays:
         """The pattern about the believed positions, read from the last views; OUTSIDE where there is none yet."""
         return self._rays([self.last_view(k) for k in range(self.num_envs)])
+
+    def images(self, layout: ImageLayout) -> dict[str, Tensor]:
+        """The last views as images, with the roles that segmenter and map give their pixels.
+
+        Args:
+            layout: What is wanted.
+
+        Returns:
+            By kind, each of shape (N, H, W, C).
+
+        Raises:
+            InvalidInputError: Colours are wanted of a camera that has none.
+        """
+        views = [self.last_view(k) for k in range(self.num_envs)]
+        images = measured_images(
+            [None if view is None else view.measurement for view in views],
+            [self.target_fruit(k) for k in range(self.num_envs)],
+            layout,
+        )
+        return {kind: image.to(self._device) for kind, image in images.items()}
 
     def recall(self, observer: ViewpointObserver, env_idx: Tensor) -> None:
         """Begins the memory of some environments anew about where their targets are believed to be now, and takes in

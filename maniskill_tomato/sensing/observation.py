@@ -6,7 +6,7 @@ whatever its roll.
 """
 
 from dataclasses import dataclass
-from typing import Any, Final, Literal, get_args
+from typing import Any, Final, get_args
 
 import torch
 import warp as wp
@@ -19,10 +19,9 @@ from maniskill_tomato.robot.iiwa14 import IIWA14
 from maniskill_tomato.sensing import observation_kernels as kernels
 from maniskill_tomato.sensing.belief import Belief
 from maniskill_tomato.sensing.occlusion_memory import OcclusionMemory
+from maniskill_tomato.sensing.perception_kinds import Part
 from maniskill_tomato.sensing.view_lattice import FIRST_DISTANCE, ViewLattice
 from maniskill_tomato.warp_runtime import RecordedLaunch
-
-Part = Literal["viewpoint", "pose", "target", "visible_fraction", "time", "patch", "map", "near_map"]
 
 PATCH_SIDE: Final = int(kernels.PATCH)
 MAP_SIDE: Final = int(kernels.MAP)
@@ -227,6 +226,7 @@ class ViewpointObserver:
             lattice=self.lattice,
             reachable=self._reachable.bool(),
             qpos=None if qpos is None else qpos.clone(),
+            layout=self.layout,
         )
         return observation
 

@@ -1,4 +1,5 @@
-"""The words for how a robot sees, and for how it is told its target; free of anything that is slow to import."""
+"""The words for how a robot sees, what it observes, and how it is told its target; free of anything that is slow to
+import."""
 
 from typing import Final, Literal
 
@@ -27,3 +28,12 @@ Association = Literal["map", "truth"]
 
 MAP_NOISE: Final = 0.03
 """Standard deviation of each coordinate of a place that a map of the row gives, in [m]."""
+
+Part = Literal["viewpoint", "pose", "target", "visible_fraction", "time", "patch", "map", "near_map"]
+"""Parts of the general tasks' observation; see `sensing.observation.ObservationLayout`."""
+
+ImageKind = Literal["rgb", "depth", "segmentation"]
+"""What an image of an observation tells of every pixel; see `sensing.image_observation.ImageLayout`."""
+
+STATE_MODE: Final = "state"
+"""The observation mode without images."""

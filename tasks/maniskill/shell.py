@@ -19,6 +19,7 @@ from maniskill_tomato.plants.episode_list import Episode
 from maniskill_tomato.plants.organs import SemanticClass
 from maniskill_tomato.robot.d435 import CameraIntrinsics
 from maniskill_tomato.sensing.belief import Belief
+from maniskill_tomato.sensing.image_observation import ImageLayout
 from maniskill_tomato.sensing.observation import ObservationLayout
 from maniskill_tomato.sensing.simulated_camera import RENDERED_SIZE
 from maniskill_tomato.tasks.arm_moves import Plan
@@ -104,6 +105,7 @@ class TomatoEnv(BaseEnv):  # type: ignore[misc]
             kwargs.setdefault("sensor_configs", {"width": width, "height": height})
         rendering = shell_options.needs_rendering(obs_mode, render_mode) or setup.needs_pictures
         render_backend = shell_options.pick_render_backend(render_backend, rendering)
+        self._renders = render_backend != "none"
         self._in_glasshouse = scenery == "greenhouse" and render_backend != "none"
         # A new plant to look at needs new actors, and so a new scene.
         self._has_actors = not setup.plant.changes or render_backend != "none"
@@ -157,7 +159,7 @@ class TomatoEnv(BaseEnv):  # type: ignore[misc]
                 self.device,
                 control=CONTROL_MODES.get(self.control_mode, default_control(self.env_id)),
                 intrinsics=self.camera_intrinsics,
-                pictures=self._wrist_pictures if self._setup.needs_pictures else None,
+                pictures=self._wrist_pictures if self._renders else None,
             )
         world = self.world
         self._hand_over_generators()
@@ -355,6 +357,10 @@ class TomatoEnv(BaseEnv):  # type: ignore[misc]
     def belief(self) -> Belief:
         """What is known after the last look, for policies; see `World.belief`."""
         return self.world.belief
+
+    def images(self, layout: ImageLayout) -> dict[str, Tensor]:
+        """What the wrist cameras show; see `World.images`."""
+        return self.world.images(layout)
 
     @property
     def qpos(self) -> Tensor:

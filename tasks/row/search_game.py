@@ -4,6 +4,7 @@ With a `TargetSequence` all ripe fruits of a row in reach are looked for, one af
 """
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -118,7 +119,7 @@ class SearchGame:
     @property
     def belief(self) -> Belief:
         """What is known after the last look."""
-        return self._observer.belief
+        return replace(self._observer.belief, images=self._world.images)
 
     def episode(self, env_index: int, options: Mapping[str, Any]) -> Episode | None:
         """The episode of the list that a reset with these options begins; None without a list."""
@@ -354,7 +355,7 @@ class SearchGame:
 
     def observation(self) -> dict[str, Tensor]:
         """The parts of the observer's vector."""
-        vector = self.belief.observation
+        vector = self._observer.belief.observation
         return {str(name): vector[:, part].clone() for name, part in self.layout.slices.items()}
 
     def info(self) -> dict[str, Tensor]:

@@ -3,6 +3,8 @@
 import copy
 from dataclasses import replace
 
+import gymnasium as gym
+import numpy as np
 import pytest
 import torch
 
@@ -18,6 +20,8 @@ from maniskill_tomato.learning.rl.agent import (
 )
 from maniskill_tomato.learning.rl.presets import TrainConfig, get_preset
 from maniskill_tomato.learning.rl.replay import Batch, ReplayBuffer
+
+STATE_SPACE = gym.spaces.Box(-np.inf, np.inf, (9,), np.float32)
 
 DDPG = get_preset("thesis-guided")
 TD3 = replace(get_preset("td3"), target_noise=0.0, pre_tanh_penalty=0.0)
@@ -194,7 +198,7 @@ def held(buffer: ReplayBuffer) -> set[float]:
 
 
 def test_replay_overwrites_the_oldest_first() -> None:
-    buffer = ReplayBuffer(5, 9, 6)
+    buffer = ReplayBuffer(5, STATE_SPACE, 6)
     buffer.add(rows([0.0, 1.0, 2.0]))
     assert (len(buffer), held(buffer)) == (3, {0.0, 1.0, 2.0})
     buffer.add(rows([3.0, 4.0, 5.0, 6.0]))
@@ -204,7 +208,7 @@ def test_replay_overwrites_the_oldest_first() -> None:
 
 
 def test_replay_keeps_the_parts_of_a_transition_together() -> None:
-    buffer = ReplayBuffer(7, 9, 6)
+    buffer = ReplayBuffer(7, STATE_SPACE, 6)
     for start in range(0, 30, 3):
         buffer.add(rows([float(start + k) for k in range(3)]))
     batch = buffer.sample(100)
@@ -215,7 +219,7 @@ def test_replay_keeps_the_parts_of_a_transition_together() -> None:
 
 
 def test_replay_samples_uniformly_and_repeatably() -> None:
-    buffer = ReplayBuffer(4, 9, 6)
+    buffer = ReplayBuffer(4, STATE_SPACE, 6)
     buffer.add(rows([0.0, 1.0, 2.0, 3.0]))
     drawn = buffer.sample(8000, torch.Generator().manual_seed(5)).rewards
     assert torch.bincount(drawn.long()).float().sub(2000).abs().max() < 200  # Five standard deviations.
@@ -223,10 +227,10 @@ def test_replay_samples_uniformly_and_repeatably() -> None:
 
 
 def test_replay_refuses_what_it_cannot_do() -> None:
-    buffer = ReplayBuffer(3, 9, 6)
+    buffer = ReplayBuffer(3, STATE_SPACE, 6)
     with pytest.raises(InvalidInputError, match="empty"):
         buffer.sample(1)
     with pytest.raises(InvalidInputError, match="4 transitions at once do not fit a replay buffer of 3"):
         buffer.add(rows([0.0, 1.0, 2.0, 3.0]))
     with pytest.raises(InvalidInputError, match="1 or more"):
-        ReplayBuffer(0, 9, 6)
+        ReplayBuffer(0, STATE_SPACE, 6)

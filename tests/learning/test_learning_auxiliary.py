@@ -2,6 +2,8 @@
 
 from dataclasses import replace
 
+import gymnasium as gym
+import numpy as np
 import pytest
 import torch
 
@@ -90,7 +92,7 @@ def test_what_cannot_be_predicted_is_refused() -> None:
 
 
 def test_a_buffer_that_keeps_visible_fractions_refuses_transitions_without() -> None:
-    buffer = ReplayBuffer(10, 9, 6, visible_fractions=True)
+    buffer = ReplayBuffer(10, gym.spaces.Box(-np.inf, np.inf, (9,), np.float32), 6, visible_fractions=True)
     step = Batch(torch.zeros(2, 9), torch.zeros(2, 6), torch.zeros(2), torch.zeros(2, 9), torch.zeros(2))
     with pytest.raises(InvalidInputError, match="keeps visible_fractions"):
         buffer.add(step)

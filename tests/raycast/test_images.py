@@ -7,7 +7,7 @@ import trimesh
 
 from maniskill_tomato.errors import InvalidInputError
 from maniskill_tomato.plants.generator import generate_plant
-from maniskill_tomato.raycast.images import BACKGROUND_DEPTH, FIRST_ORGAN_LABEL, ROBOT_LABEL, PixelLabel
+from maniskill_tomato.raycast.images import BACKGROUND_DEPTH, FIRST_ORGAN_LABEL, ROBOT_LABEL, Role
 from maniskill_tomato.raycast.scene import RayScene
 from maniskill_tomato.raycast.view_rays import RayLabel
 from maniskill_tomato.robot.d435 import CameraIntrinsics
@@ -33,10 +33,10 @@ def test_a_cast_image_shows_what_the_rays_say() -> None:
         camera, target = camera_towards(plant.fruits[k].centre, 0.35), torch.tensor([k])
         image = scene.image(INTRINSICS, camera, target, stand)
         visible = scene.visibility(camera, target, stand)
-        pixels = int((image.label == int(PixelLabel.TARGET)).sum())
+        pixels = int((image.role == int(Role.TARGET)).sum())
         seen_some += pixels > 0
         assert pixels == pytest.approx(float(visible.visible[0]), abs=0.06 * float(visible.total[0]) + 3)
-        mask = image.label[0] == int(PixelLabel.TARGET)
+        mask = image.role[0] == int(Role.TARGET)
         read = sample_view(image.depth[0], mask, INTRINSICS, camera[0], centre[0])
         cast = scene.view_rays(camera, target, centre, stand)
         both = (read.label != RayLabel.OUTSIDE) & (cast.label != RayLabel.OUTSIDE)
@@ -54,7 +54,7 @@ def test_where_nothing_stands_the_background_is_seen() -> None:
     away = camera_towards(np.array([-2.0, 0.0, 0.5]), 0.5)
     away[0, :3, :3] = away[0, :3, :3] @ torch.diag(torch.tensor([-1.0, 1.0, -1.0]))
     image = scene.image(INTRINSICS, away, torch.tensor([0]), torch.eye(4)[None])
-    assert bool((image.label == int(PixelLabel.NOTHING)).all())
+    assert bool((image.role == int(Role.BACKGROUND)).all())
     assert float(image.depth.min()) == BACKGROUND_DEPTH
 
 
@@ -76,20 +76,28 @@ def test_a_picture_shows_the_organs_that_an_image_labels() -> None:
         links[..., :3, 3] = camera[0, :3, 3] + torch.tensor([0.2, 0.06, 0.0])
         image = scene.image(INTRINSICS, camera, torch.tensor([k]), stand, links)
         picture = scene.picture(INTRINSICS, camera[0], stand[0], links[0])
-        label, depth = image.label[0].numpy(), image.depth[0].numpy()
-        assert np.array_equal(picture.labels == ROBOT_LABEL, label == int(PixelLabel.ROBOT))
+        label, depth = image.role[0].numpy(), image.depth[0].numpy()
+        assert np.array_equal(picture.labels == ROBOT_LABEL, label == int(Role.ROBOT))
         assert np.array_equal(
-            picture.labels == FIRST_ORGAN_LABEL + plant.fruits[k].organ_index, label == int(PixelLabel.TARGET)
+            picture.labels == FIRST_ORGAN_LABEL + plant.fruits[k].organ_index, label == int(Role.TARGET)
         )
         # A picture reaches farther than an image does.
-        near = label != int(PixelLabel.NOTHING)
-        assert np.count_nonzero(label == int(PixelLabel.ROBOT)) > 100
+        near = label != int(Role.BACKGROUND)
+        for row, column in np.argwhere(
+            near & (picture.labels >= FIRST_ORGAN_LABEL) & (label != int(Role.TARGET))
+        ):
+            organ = plant.organs[picture.labels[row, column] - FIRST_ORGAN_LABEL]
+            expected = (
+                "OTHER_FRUIT" if organ.semantic_class.name.startswith("FRUIT") else organ.semantic_class.name
+            )
+            assert Role(int(label[row, column])).name == expected
+        assert np.count_nonzero(label == int(Role.ROBOT)) > 100
         np.testing.assert_array_equal(picture.depth[near], depth[near])
         assert picture.facing.min() >= 0.0 and picture.facing.max() <= 1.0 + 1e-6
         # The cube's face looks straight at the camera: along its depth the rays open by their own angle.
         x, y = np.meshgrid(*(np.arange(n) + 0.5 for n in (INTRINSICS.width, INTRINSICS.height)))
         angle = np.hypot((x - INTRINSICS.cx) / INTRINSICS.fx, (y - INTRINSICS.cy) / INTRINSICS.fy)
-        front = (label == int(PixelLabel.ROBOT)) & (np.abs(depth - 0.175) < 1e-4)
+        front = (label == int(Role.ROBOT)) & (np.abs(depth - 0.175) < 1e-4)
         np.testing.assert_allclose(picture.facing[front], 1 / np.hypot(1, angle)[front], atol=1e-4)
         organs.append(set(np.unique(picture.labels[picture.labels >= FIRST_ORGAN_LABEL])))
     assert all(len(seen) > 3 and max(seen) < FIRST_ORGAN_LABEL + len(plant.organs) for seen in organs)
@@ -103,4 +111,4 @@ def test_each_environment_has_its_own_image() -> None:
     for k, plant in enumerate(plants):
         alone = RayScene([plant], INTRINSICS).image(INTRINSICS, cameras[k : k + 1], torch.tensor([0]), stand)
         torch.testing.assert_close(together.depth[k : k + 1], alone.depth, atol=0, rtol=0)
-        torch.testing.assert_close(together.label[k : k + 1], alone.label, atol=0, rtol=0)
+        torch.testing.assert_close(together.role[k : k + 1], alone.role, atol=0, rtol=0)

@@ -9,7 +9,7 @@ import torch
 
 import maniskill_tomato  # noqa: F401
 from maniskill_tomato.errors import InvalidInputError
-from maniskill_tomato.raycast.images import PixelLabel
+from maniskill_tomato.raycast.images import Role
 from maniskill_tomato.robot.d435 import color_intrinsics
 from maniskill_tomato.robot.kinematics import link_transforms
 from maniskill_tomato.segmentation.instances import Instances
@@ -258,13 +258,15 @@ def test_rendered_perceptions_run_and_their_pictures_lie_on_the_cast_labels(perc
         task.plant_batch.T_world_plant,
         T_w_links,
     )
-    target = (images.label[0] == int(PixelLabel.TARGET)).numpy()
+    target = (images.role[0] == int(Role.TARGET)).numpy()
     if np.count_nonzero(target) > 20:
         red, green, _ = picture[target].T
         assert np.median(red - green) > 30
     # Leaves and stems are green where rays meet the plant.
-    plant = (images.label[0] == int(PixelLabel.PLANT)).numpy()
-    nothing = (images.label[0] == int(PixelLabel.NOTHING)).numpy()
+    plant = torch.isin(
+        images.role[0], torch.tensor([Role.STEM, Role.LEAF, Role.OTHER_FRUIT], dtype=torch.uint8)
+    ).numpy()
+    nothing = (images.role[0] == int(Role.BACKGROUND)).numpy()
     colourful = picture.max(-1) - picture.min(-1)
     assert np.median(colourful[plant]) > 2 * np.median(colourful[nothing])
     env.close()
@@ -361,7 +363,7 @@ class LabelSegmenter:
             env.plant_batch.T_world_plant,
             T_w_links,
         )
-        target = (images.label[0] == int(PixelLabel.TARGET)).numpy()
+        target = (images.role[0] == int(Role.TARGET)).numpy()
         other = np.zeros_like(target)
         other[:30, :30] = True
         self._masks = np.stack([target, other][::order])

@@ -11,9 +11,18 @@ from maniskill_tomato.errors import CheckpointError
 from maniskill_tomato.learning.rl.auxiliary import AuxiliaryHeads
 from maniskill_tomato.learning.rl.critic import CategoricalCritic, Critic, project
 from maniskill_tomato.learning.rl.presets import OBSERVATION_CENTRE, OBSERVATION_HALF_RANGE, TrainConfig
+from maniskill_tomato.learning.rl.random_shift import shifted
 from maniskill_tomato.learning.rl.replay import Batch
 from maniskill_tomato.policies.actor import Actor, ObservationNormalizer
+from maniskill_tomato.policies.image_encoder import ImageEncoder
 from maniskill_tomato.policies.trained_actor import TrainedActor
+from maniskill_tomato.sensing.image_observation import (
+    PRIVILEGED,
+    ImageLayout,
+    Observation,
+    images_of,
+    state_of,
+)
 
 SMALLEST_SPREAD = 0.05
 """Observed values whose standard deviation is below this, in [m] or [rad], are scaled by this instead: what never
@@ -70,17 +79,41 @@ class Agent:
     """What a running normaliser follows; unused otherwise."""
     heads: AuxiliaryHeads
     """Empty unless auxiliary losses have a weight."""
+    encoder: ImageEncoder | None = None
+    """The eye that actor and critics share; None where no images are observed.
 
-    def observe(self, observations: Tensor) -> None:
+    The critics' loss trains it, and the actor takes its features as they are (DrQ-v2); with `asymmetric_critic` the
+    critics see no images, and the actor's gradient trains it."""
+
+    @property
+    def actor_trains_encoder(self) -> bool:
+        """Whether the encoder learns from the actor's gradient."""
+        return self.encoder is not None and self.config.asymmetric_critic
+
+    def observe(self, observations: Observation) -> None:
         """Lets a running normaliser follow what the environments show. Shape (B, observation_dim)."""
         if self.config.normalize_observations == "running":
-            self.statistics.update(observations, self.normalizer)
+            self.statistics.update(state_of(observations), self.normalizer)
 
-    def policy(self, observations: Tensor) -> Tensor:
+    def policy(self, observations: Observation) -> Tensor:
         """The policy's actions, in units of the action scale. Shape (B, action_dim)."""
         with torch.no_grad():
-            actions: Tensor = self.actor(self.normalizer(observations))
+            actions: Tensor = self.actor(self.actor_input(observations))
         return actions
+
+    def actor_input(self, observations: Observation) -> Tensor:
+        """What the actor sees: the state, normalised, and features of the images. Shape (B, D)."""
+        state: Tensor = self.normalizer(state_of(observations))
+        if self.encoder is None:
+            return state
+        return torch.cat((state, self.encoder(images_of(observations))), dim=-1)
+
+    def critic_input(self, observations: Observation) -> Tensor:
+        """What the critics see: the same, or with `asymmetric_critic` the task's whole state. Shape (B, D)."""
+        if not self.config.asymmetric_critic:
+            return self.actor_input(observations)
+        assert not isinstance(observations, Tensor)
+        return torch.cat((self.normalizer(state_of(observations)), observations[PRIVILEGED]), dim=-1)
 
 
 def make_normalizer(config: TrainConfig, observation_dim: int) -> ObservationNormalizer:
@@ -103,27 +136,47 @@ def make_critic(config: TrainConfig, observation_dim: int, action_dim: int) -> C
     return Critic(*dims)
 
 
+def make_encoder(config: TrainConfig) -> ImageEncoder | None:
+    """A freshly initialised encoder of the configured images; None without images."""
+    images = ImageLayout.parse(config.obs_mode, config.image_size)
+    return None if images is None else ImageEncoder(images, config.frame_stack, config.image_features)
+
+
 def make_agent(
-    config: TrainConfig, observation_dim: int, action_dim: int, device: torch.device | str = "cpu"
+    config: TrainConfig,
+    observation_dim: int,
+    action_dim: int,
+    device: torch.device | str = "cpu",
+    *,
+    privileged_dim: int = 0,
 ) -> Agent:
     """A freshly initialised agent; the weights come from torch's global random state.
 
     Args:
         config: How it learns.
-        observation_dim: Number of observed values.
+        observation_dim: Number of observed values, those of images left out.
         action_dim: Number of actions.
         device: Where the networks are.
+        privileged_dim: Number of values that only critics see, with `asymmetric_critic`.
     """
-    actor = make_actor(config, observation_dim, action_dim).to(device)
+    encoder = make_encoder(config)
+    features = 0 if encoder is None else encoder.features
+    beside = privileged_dim if config.asymmetric_critic else features
+    actor = make_actor(config, observation_dim + features, action_dim).to(device)
     critics = nn.ModuleList(
-        make_critic(config, observation_dim, action_dim) for _ in range(2 if config.twin_critics else 1)
+        make_critic(config, observation_dim + beside, action_dim)
+        for _ in range(2 if config.twin_critics else 1)
     ).to(device)
     heads = AuxiliaryHeads(config, observation_dim).to(device)
     actor_parameters, critic_parameters = (
         _trained(actor, heads.distance),
         _trained(critics, heads.visible_fraction),
     )
+    if encoder is not None:
+        encoder = encoder.to(device)
+        (actor_parameters if config.asymmetric_critic else critic_parameters).extend(encoder.parameters())
     return Agent(
+        encoder=encoder,
         config=config,
         actor=actor,
         critics=critics,
@@ -147,6 +200,10 @@ def check_fits(policy: TrainedActor, config: TrainConfig, observation_dim: int) 
     given_config = TrainConfig.from_dict(policy.config)
     for name, given, wanted in (
         ("observation length", policy.observation_dim, observation_dim),
+        ("obs_mode", given_config.obs_mode, config.obs_mode),
+        ("image_size", tuple(given_config.image_size), tuple(config.image_size)),
+        ("frame_stack", given_config.frame_stack, config.frame_stack),
+        ("image_features", given_config.image_features, config.image_features),
         ("actor_hidden", tuple(given_config.actor_hidden), tuple(config.actor_hidden)),
         ("normalize_observations", given_config.normalize_observations, config.normalize_observations),
         ("action_scale", tuple(given_config.action_scale), tuple(config.action_scale)),
@@ -162,6 +219,8 @@ def begin_with(agent: Agent, policy: TrainedActor) -> None:
     agent.actor.load_state_dict(policy.actor.state_dict())
     agent.target_actor.load_state_dict(policy.actor.state_dict())
     agent.normalizer.load_state_dict(policy.normalizer.state_dict())
+    if agent.encoder is not None and policy.encoder is not None:
+        agent.encoder.load_state_dict(policy.encoder.state_dict())
 
 
 @torch.no_grad()
@@ -203,10 +262,11 @@ def distribution_targets(agent: Agent, batch: Batch, generator: torch.Generator 
 
 
 def _target_actions(agent: Agent, batch: Batch, generator: torch.Generator | None) -> tuple[Tensor, Tensor]:
-    """s', normalised, and what the target actor does there, smoothed where configured."""
+    """s' as the critics see it, and what the target actor does there, smoothed where configured."""
     config = agent.config
-    next_observations = agent.normalizer(batch.next_observations)
-    next_actions = agent.target_actor(next_observations)
+    seen = agent.actor_input(batch.next_observations)
+    next_observations = agent.critic_input(batch.next_observations) if config.asymmetric_critic else seen
+    next_actions = agent.target_actor(seen)
     if config.target_noise > 0.0:
         noise = torch.randn(next_actions.shape, generator=generator, device=next_actions.device)
         noise = (noise * config.target_noise).clamp_(-config.target_noise_clip, config.target_noise_clip)
@@ -231,7 +291,7 @@ def update_critic(agent: Agent, batch: Batch, generator: torch.Generator | None 
     """
     categorical = agent.config.critic == "categorical"
     targets = (distribution_targets if categorical else td_targets)(agent, batch, generator)
-    observations = agent.normalizer(batch.observations)
+    observations = agent.critic_input(batch.observations)
     total = torch.zeros((), device=targets.device)
     auxiliary = torch.zeros((), device=targets.device)
     logs: dict[str, Tensor] = {}
@@ -255,33 +315,41 @@ def update_critic(agent: Agent, batch: Batch, generator: torch.Generator | None 
     if agent.heads.visible_fraction is not None:
         logs["aux_visibility_loss"] = auxiliary.detach()
         total = total + agent.config.aux_visibility_weight * auxiliary
-    _step(agent.critic_optimizer, total, _trained(agent.critics, agent.heads.visible_fraction))
+    learns = _trained(agent.critics, agent.heads.visible_fraction)
+    if agent.encoder is not None and not agent.actor_trains_encoder:
+        learns += agent.encoder.parameters()
+    _step(agent.critic_optimizer, total, learns)
     return logs
 
 
-def update_actor(agent: Agent, observations: Tensor) -> dict[str, Tensor]:
+def update_actor(agent: Agent, observations: Observation) -> dict[str, Tensor]:
     """One Adam step up the sampled policy gradient of Q(s, mu(s)); the critics stay as they are.
 
     Args:
         agent: The agent; its first critic judges.
-        observations: Unnormalised observations. Shape (B, observation_dim).
+        observations: Not normalised. Shape (B, observation_dim), or with images.
 
     Returns:
         `actor_loss`: minus the mean value, plus the penalty on saturated outputs where one is configured;
         `aux_distance_loss` where it has a weight. Scalars.
     """
-    seen = agent.normalizer(observations)
+    with torch.set_grad_enabled(agent.actor_trains_encoder):
+        seen = agent.actor_input(observations)
+    judged = agent.critic_input(observations) if agent.config.asymmetric_critic else seen
     features = agent.actor.features(seen)
     pre_activation = agent.actor.output(features)
-    loss = -agent.critics[0](seen, torch.tanh(pre_activation)).mean()
+    loss = -agent.critics[0](judged, torch.tanh(pre_activation)).mean()
     if agent.config.pre_tanh_penalty > 0.0:
         loss = loss + agent.config.pre_tanh_penalty * pre_activation.square().mean()
     logs = {"actor_loss": loss.detach()}
     if agent.heads.distance is not None:
-        distance_loss = agent.heads.distance_loss(features, observations)
+        distance_loss = agent.heads.distance_loss(features, state_of(observations))
         logs["aux_distance_loss"] = distance_loss.detach()
         loss = loss + agent.config.aux_distance_weight * distance_loss
-    _step(agent.actor_optimizer, loss, _trained(agent.actor, agent.heads.distance))
+    learns = _trained(agent.actor, agent.heads.distance)
+    if agent.encoder is not None and agent.actor_trains_encoder:
+        learns += agent.encoder.parameters()
+    _step(agent.actor_optimizer, loss, learns)
     return logs
 
 
@@ -306,12 +374,24 @@ def update(
     Returns:
         The logs of `update_critic` and, where it ran, `update_actor`.
     """
+    batch = _augmented(agent.config, batch, generator)
     logs = update_critic(agent, batch, generator)
     if index >= agent.config.actor_starts and index % agent.config.policy_frequency == 0:
         logs |= update_actor(agent, batch.observations)
     if index % agent.config.policy_frequency == 0:
         update_targets(agent)
     return logs
+
+
+def _augmented(config: TrainConfig, batch: Batch, generator: torch.Generator | None) -> Batch:
+    """The batch with randomly shifted images, those before and after a step apart."""
+    changed: dict[str, Observation] = {}
+    for name in ("observations", "next_observations"):
+        observations: Observation = getattr(batch, name)
+        if not isinstance(observations, Tensor):
+            moved = shifted(images_of(observations), config.image_shift, generator)
+            changed[name] = {**observations, **moved}
+    return batch._replace(**changed)
 
 
 @torch.no_grad()

@@ -9,7 +9,7 @@ from torch import Tensor
 import maniskill_tomato
 from maniskill_tomato.learning.rl.agent import Agent
 from maniskill_tomato.policies.layout import layout_of
-from maniskill_tomato.policies.trained_actor import FORMAT
+from maniskill_tomato.policies.trained_actor import FORMAT, sight_of
 
 TRAINING_PARTS = (
     "critics",
@@ -48,7 +48,7 @@ def make_checkpoint(
     low, high = action_bounds
     scale = torch.tensor(agent.config.action_scale)
     observation_dim = len(agent.normalizer.centre)
-    layout = layout_of(env_id)
+    layout = layout_of(env_id, sight_of(agent.config.to_dict()))
     data: dict[str, Any] = {
         "format": FORMAT,
         "package_version": maniskill_tomato.__version__,
@@ -71,6 +71,8 @@ def make_checkpoint(
         "actor": agent.actor.state_dict(),
         "counters": counters,
     }
+    if agent.encoder is not None:
+        data["encoder"] = agent.encoder.state_dict()
     if env_options is not None:
         data["env_options"] = json.loads(json.dumps(env_options))
     if with_training_state:

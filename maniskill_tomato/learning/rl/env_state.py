@@ -1,14 +1,13 @@
 """The state of a learner's environments in the middle of their episodes, with every random generator of theirs."""
 
 import logging
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any, Protocol, runtime_checkable
 
 import torch
 from torch import Tensor
 
 from maniskill_tomato.errors import CheckpointError
-from maniskill_tomato.learning.rl.envs import LearnerEnv
 from maniskill_tomato.tasks.numpy_streams import random_state, set_random_state
 
 logger = logging.getLogger(__name__)
@@ -27,7 +26,7 @@ class KeepsState(Protocol):
         ...
 
 
-def env_state(env: LearnerEnv) -> dict[str, Any] | None:
+def env_state(env: object) -> dict[str, Any] | None:
     """The state of `env` as plain data, or None where it cannot be known.
 
     That of ManiSkill's shell is the world's, completed by the joints' speeds, step counters, and the seeds and
@@ -36,8 +35,11 @@ def env_state(env: LearnerEnv) -> dict[str, Any] | None:
     if isinstance(env, KeepsState):
         return env.get_run_state()
     shell: Any = getattr(env, "base_env", None)
-    if shell is None:
-        return None
+    return None if shell is None else shell_state(shell)
+
+
+def shell_state(shell: Any) -> dict[str, Any]:
+    """The state of ManiSkill's shell as plain data."""
     return {
         "world": shell.world.save(),
         "qvel": shell.agent.robot.get_qvel().cpu().clone(),
@@ -50,7 +52,7 @@ def env_state(env: LearnerEnv) -> dict[str, Any] | None:
     }
 
 
-def set_env_state(env: LearnerEnv, state: dict[str, Any] | None) -> None:
+def set_env_state(env: object, state: dict[str, Any] | None) -> None:
     """Puts `env`, made with the same options, where it was; its global random generators are left to the caller.
 
     Raises:
@@ -65,14 +67,24 @@ def set_env_state(env: LearnerEnv, state: dict[str, Any] | None) -> None:
         env.set_run_state(state)
         return
     anything: Any = env
-    shell: Any = anything.base_env
+    set_shell_state(anything.base_env, state, anything.reset)
+
+
+def set_shell_state(shell: Any, state: dict[str, Any], reset: Callable[..., Any]) -> None:
+    """Puts ManiSkill's shell where it was.
+
+    Args:
+        shell: Made with the same options.
+        state: What `shell_state` gave.
+        reset: Resets it, by a seed a row and options.
+    """
     if shell.motion == "dynamic":
         logger.warning(
             "the physics engine keeps numbers that cannot be saved; last digits may differ from here on"
         )
     # An episode is begun from the same seed, so that the scene holds its plants, and then moved on.
     options = {"reconfigure": True} if shell.reconfiguration_freq else {}
-    anything.reset(seed=list(state["episode_seed"]), options=options)
+    reset(seed=list(state["episode_seed"]), options=options)
     shell.restore_world(state["world"], state["qvel"])
     shell._elapsed_steps[:] = state["elapsed_steps"].to(shell.device)
     shell._reconfig_counter = state["reconfig_counter"]

@@ -1,8 +1,10 @@
 """From what the environments do to transitions in the replay buffer, of other targets too."""
 
 from collections.abc import Mapping
+from pathlib import Path
 from typing import Any
 
+import gymnasium as gym
 import torch
 from torch import Tensor
 
@@ -15,16 +17,38 @@ from maniskill_tomato.policies.layout import TARGET_POSITION
 _OTHER_KEYS = ("other_visible_fraction", "other_success", "other_reward", "other_exists", "other_position")
 
 
+REPLAY_FOLDER = "replay"
+"""Where a run keeps its replay buffer with `replay_on_disk`."""
+
+
 def make_replay(
-    config: TrainConfig, observation_dim: int, action_dim: int, device: torch.device | str = "cpu"
+    config: TrainConfig,
+    observation_space: gym.Space[Any],
+    action_dim: int,
+    device: torch.device | str = "cpu",
+    run_dir: Path | None = None,
 ) -> ReplayBuffer:
-    """A replay buffer with the columns that the configuration needs."""
+    """A replay buffer with the columns that the configuration needs.
+
+    Args:
+        config: How to learn.
+        observation_space: Of one environment.
+        action_dim: Number of actions.
+        device: Where it is kept.
+        run_dir: Folder of the run, for a buffer on the disk.
+    """
+    on_disk = config.replay_on_disk and run_dir is not None
+    # A run may go on from any checkpoint that is kept; the last one may lie a whole step of all environments later.
+    spare = config.checkpoints_kept * (config.checkpoint_every + config.num_envs)
     return ReplayBuffer(
         config.buffer_size,
-        observation_dim,
+        observation_space,
         action_dim,
         device,
         visible_fractions=config.aux_visibility_weight > 0.0,
+        largest_gb=config.replay_memory_gb,
+        folder=run_dir / REPLAY_FOLDER if on_disk and run_dir is not None else None,
+        spare=spare,
     )
 
 
@@ -110,6 +134,7 @@ class Experience:
         )
         position = before["other_position"].flatten(0, 1)
         exists = before["other_exists"].flatten()
+        assert isinstance(batch.observations, Tensor) and isinstance(batch.next_observations, Tensor)
         relabelled = Batch(
             _with_target(batch.observations.repeat_interleave(count, dim=0), position),
             batch.actions.repeat_interleave(count, dim=0),
@@ -118,7 +143,7 @@ class Experience:
             terminations.float().flatten(),
             visible,
         )
-        return Batch(*(column[exists] for column in relabelled if column is not None))
+        return Batch(*(column[exists] for column in relabelled if isinstance(column, Tensor)))
 
     def _remember(self, info: Mapping[str, Tensor]) -> None:
         if self._config.hindsight_targets:

@@ -1,14 +1,15 @@
 """A trained policy as an ONNX file and a description, for machines without PyTorch and ManiSkill.
 
-The actor is a chain of a few dense layers, so its graph is written node by node with the `onnx` package rather than
-traced by `torch.onnx`: that would add onnxscript and an intermediate representation to the dependencies, and its
-output changes with their versions. Here the same policy gives the same bytes. An actor that this module does not
-know completely is caught before anything is written, because every export is compared with PyTorch.
+The actor is a chain of a few dense layers, after a few convolutions if it sees images. Its graph is therefore written
+node by node with the `onnx` package rather than traced by `torch.onnx`: that would add onnxscript and an intermediate
+representation to the dependencies, and its output changes with their versions. Here the same policy gives the same
+bytes. An actor that this module does not know completely is caught before anything is written, because every export is
+compared with PyTorch.
 """
 
 import hashlib
 import json
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Literal
@@ -33,9 +34,12 @@ from maniskill_tomato.policies.description import (
     PolicyDescription,
     shortened,
 )
+from maniskill_tomato.policies.image_encoder import DEPTH_SCALE_MM, FARTHEST, ImageEncoder
 from maniskill_tomato.policies.layout import layout_of
 from maniskill_tomato.policies.onnx_policy import OnnxPolicy, description_path
-from maniskill_tomato.policies.trained_actor import load_actor, load_checkpoint
+from maniskill_tomato.policies.trained_actor import load_actor, load_checkpoint, sight_of
+from maniskill_tomato.raycast.images import Role
+from maniskill_tomato.sensing.image_observation import STATE, Sight
 from maniskill_tomato.tasks import THESIS_IDS
 from maniskill_tomato.tasks.thesis.thesis_config import ViewpointTaskConfig, guided_task, sparse_task
 
@@ -48,6 +52,9 @@ IR_VERSION = 8
 FLOAT32_UNIT_ROUNDOFF = 2.0**-24
 """Largest relative error of one rounding to float32."""
 
+ROUNDING_SIGMAS = 10.0
+"""Standard deviations of independent roundings that an encoder's features may differ by."""
+
 _TASKS: dict[str, Callable[[], ViewpointTaskConfig]] = dict(
     zip(THESIS_IDS, (guided_task, sparse_task), strict=True)
 )
@@ -57,8 +64,8 @@ _TASKS: dict[str, Callable[[], ViewpointTaskConfig]] = dict(
 class DenseActor:
     """A policy in the parts that its graph is written from; this package's own and those of other learners."""
 
-    act: Callable[[torch.Tensor], torch.Tensor]
-    """What the export is compared with: actions of shape (B, A) for observations of shape (B, D)."""
+    act: Callable[[Any], torch.Tensor]
+    """What the export is compared with: actions of shape (B, A) for observations of shape (B, D), or with images."""
     normalizer: ObservationNormalizer
     normalizer_kind: str
     """Where the normaliser comes from, see `PolicyDescription`."""
@@ -85,6 +92,10 @@ class DenseActor:
     """Steps, episodes and seed of the training; what is missing becomes null."""
     config: dict[str, Any]
     """Every training option, as JSON can hold them."""
+    encoder: ImageEncoder | None = None
+    """What turns images into features, which join the normalised observations; None without images."""
+    sight: Sight | None = None
+    """The images that it observes; None if it observes none."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -132,6 +143,8 @@ def export_policy(path: Path | str, out: Path) -> ExportResult:
         algorithm=policy.algorithm,
         counters=policy.counters,
         config=config.to_dict(),
+        encoder=policy.encoder,
+        sight=policy.sight,
     )
     return export_actor(actor, out / f"{path.stem}.onnx", name=str(path))
 
@@ -152,9 +165,14 @@ def export_actor(actor: DenseActor, target: Path, name: str = "this policy") -> 
     model = make_model(actor)
     description = describe_policy(actor, model)
     observations = parity_observations(actor)
-    reference = actor.act(torch.from_numpy(observations)).numpy()
-    difference = np.abs(OnnxPolicy.from_bytes(model, description, target).act(observations) - reference)
-    if not (difference <= rounding_tolerance(actor, observations)).all():
+    images = parity_images(actor, len(observations))
+    state = torch.from_numpy(observations)
+    seen = {kind: torch.from_numpy(image) for kind, image in images.items()}
+    reference = actor.act({STATE: state, **seen} if seen else state).numpy()
+    difference = np.abs(
+        OnnxPolicy.from_bytes(model, description, target).act(observations, images) - reference
+    )
+    if not (difference <= rounding_tolerance(actor, observations, images)).all():
         raise PolicyError(
             f"{name} cannot be exported: ONNX Runtime and PyTorch differ by {difference.max():.1e}, more than float32 "
             "rounds; nothing was written"
@@ -173,10 +191,15 @@ def export_actor(actor: DenseActor, target: Path, name: str = "this policy") -> 
 
 
 def make_model(actor: DenseActor) -> bytes:
-    """The ONNX file of a policy: observations in [m] and [rad] in, actions in [m] and [rad] out."""
+    """The ONNX file of a policy: observations in [m] and [rad] in, and images; actions in [m] and [rad] out."""
     graph = _Graph()
     x = graph.add("Sub", INPUT_NAME, centre=actor.normalizer.centre)
     x = graph.add("Div", x, half_range=actor.normalizer.half_range)
+    inputs = [_tensor(INPUT_NAME, len(actor.normalizer.centre))]
+    if actor.encoder is not None and actor.sight is not None:
+        for kind, shape in actor.sight.shapes.items():
+            inputs.append(helper.make_tensor_value_info(kind, _TYPES[kind], ["batch", *shape]))
+        x = graph.join([x, _add_encoder(graph, actor.encoder, actor.sight)], axis=1)
     for index, layer in enumerate(actor.layers[:-1]):
         x = graph.add_dense(x, f"hidden_{index}", layer)
         x = graph.add(actor.activation, x)
@@ -193,7 +216,7 @@ def make_model(actor: DenseActor) -> bytes:
         helper.make_graph(
             graph.nodes,
             "viewpoint_policy",
-            [_tensor(INPUT_NAME, len(actor.normalizer.centre))],
+            inputs,
             [_tensor(OUTPUT_NAME, len(actor.action_scale))],
             graph.constants,
         ),
@@ -208,12 +231,54 @@ def make_model(actor: DenseActor) -> bytes:
     return content
 
 
+_TYPES = {"rgb": TensorProto.UINT8, "depth": TensorProto.INT16, "segmentation": TensorProto.UINT8}
+"""ONNX types of the images."""
+
+
+def _add_encoder(graph: "_Graph", encoder: ImageEncoder, sight: Sight) -> str:
+    """Appends the encoder's nodes, which do what `ImageEncoder.forward` does; returns the name of the features."""
+    planes = []
+    for kind in sight.images.kinds:
+        x = graph.node("Transpose", [kind], perm=[0, 3, 1, 2])
+        if kind == "segmentation":
+            x = graph.node("Cast", [x], to=TensorProto.INT64)
+            count = graph.constant(f"{kind}.roles", np.array([len(Role)], np.int64))
+            ends = graph.constant(f"{kind}.off_on", np.array([0.0, 1.0], np.float32))
+            x = graph.node("OneHot", [x, count, ends], axis=2)
+            rows, columns, frames = sight.shapes[kind]
+            shape = np.array([0, frames * len(Role), rows, columns], np.int64)
+            x = graph.node("Reshape", [x, graph.constant(f"{kind}.shape", shape)])
+        else:
+            x = graph.node("Cast", [x], to=TensorProto.FLOAT)
+            if kind == "rgb":
+                x = graph.add("Div", x, rgb_half=torch.tensor(127.5))
+            else:
+                x = graph.add("Div", x, depth_scale=torch.tensor(DEPTH_SCALE_MM))
+                x = graph.add("Min", x, depth_farthest=torch.tensor(FARTHEST))
+            x = graph.add("Sub", x, **{f"{kind}_one": torch.ones(())})
+        planes.append(x)
+    x = graph.join(planes, axis=1)
+    for index, layer in enumerate(layer for layer in encoder.convolutions if isinstance(layer, nn.Conv2d)):
+        weights = {f"convolution_{index}.weight": layer.weight, f"convolution_{index}.bias": layer.bias}
+        names = [graph.constant(name, values) for name, values in weights.items()]
+        x = graph.node("Conv", [x, *names], strides=list(layer.stride))
+        x = graph.node("Relu", [x])
+    x = graph.node("Flatten", [x], axis=1)
+    x = graph.add_dense(x, "trunk", encoder.trunk)
+    norm = [
+        graph.constant("norm.weight", encoder.norm.weight),
+        graph.constant("norm.bias", encoder.norm.bias),
+    ]
+    x = graph.node("LayerNormalization", [x, *norm], axis=-1, epsilon=encoder.norm.eps)
+    return graph.node("Tanh", [x])
+
+
 def describe_policy(actor: DenseActor, model: bytes) -> PolicyDescription:
     """The description of a policy and its ONNX file."""
     make_task = _TASKS.get(actor.env_id)
     task = make_task() if make_task else None
     config = json.dumps(actor.config, sort_keys=True)
-    layout = layout_of(actor.env_id)
+    layout = layout_of(actor.env_id, actor.sight)
     for what, given, wanted in (
         ("observes", len(actor.normalizer.centre), len(layout.observation_names)),
         ("does", len(actor.action_scale), len(layout.action_names)),
@@ -249,11 +314,12 @@ def describe_policy(actor: DenseActor, model: bytes) -> PolicyDescription:
             "config_sha256": hashlib.sha256(config.encode()).hexdigest(),
         },
         onnx_sha256=hashlib.sha256(model).hexdigest(),
+        sight=actor.sight,
     )
 
 
 def parity_observations(actor: DenseActor, count: int = 1000, seed: int = 0) -> NDArray[np.float32]:
-    """Observations on which an export is compared with PyTorch.
+    """Observation on which an export is compared with PyTorch.
 
     Returns:
         Zeros, the normaliser's centre, every value alone at and far beyond both ends of its range, all values
@@ -268,7 +334,32 @@ def parity_observations(actor: DenseActor, count: int = 1000, seed: int = 0) -> 
     return np.concatenate((np.zeros((1, len(centre))), centre[None], around)).astype(np.float32)
 
 
-def rounding_tolerance(actor: DenseActor, observations: NDArray[np.float32]) -> NDArray[np.float64]:
+def parity_images(actor: DenseActor, count: int, seed: int = 0) -> dict[str, NDArray[Any]]:
+    """Images on which an export is compared with PyTorch: all black, all at the upper end, and random ones.
+
+    Args:
+        actor: The policy.
+        count: How many, B.
+        seed: Of the random ones.
+
+    Returns:
+        By kind, each of shape (B, H, W, C); none for a policy that sees none.
+    """
+    if actor.sight is None:
+        return {}
+    rng = np.random.default_rng(seed)
+    images: dict[str, NDArray[Any]] = {}
+    for kind, box in actor.sight.images.spaces(actor.sight.frames).items():
+        most = 3000 if kind == "depth" else int(box.high.max())
+        image = rng.integers(0, most + 1, (count, *box.shape)).astype(box.dtype)
+        image[0], image[1] = 0, box.high
+        images[kind] = image
+    return images
+
+
+def rounding_tolerance(
+    actor: DenseActor, observations: NDArray[np.float32], images: Mapping[str, NDArray[Any]] | None = None
+) -> NDArray[np.float64]:
     """How far two float32 evaluations of an actor may differ: PyTorch's and ONNX Runtime's on any processor.
 
     Processors sum a layer's products in different orders, and an actor with large weights multiplies the rounding
@@ -280,6 +371,7 @@ def rounding_tolerance(actor: DenseActor, observations: NDArray[np.float32]) -> 
     Args:
         actor: The policy.
         observations: World frame, in [m] and [rad]. Shape (B, D).
+        images: Those that it sees beside them, by kind, each of shape (B, H, W, C).
 
     Returns:
         In the task's units. Shape (B, A).
@@ -295,6 +387,9 @@ def rounding_tolerance(actor: DenseActor, observations: NDArray[np.float32]) -> 
         torch.from_numpy(observations).double() - actor.normalizer.centre.cpu().double()
     ) / actor.normalizer.half_range.cpu().double()
     error = 2.0 * unit * x.abs()
+    if actor.encoder is not None:
+        features, feature_error = _encoder_errors(actor.encoder, images or {})
+        x, error = torch.cat((x, features), dim=-1), torch.cat((error, feature_error), dim=-1)
     layers: Sequence[Any] = actor.layers  # To mypy a module's weight may be a module.
     for layer, activation in zip(layers, activations, strict=True):
         weight, bias = (p.detach().cpu().double() for p in (layer.weight, layer.bias))
@@ -309,10 +404,49 @@ def rounding_tolerance(actor: DenseActor, observations: NDArray[np.float32]) -> 
     return tolerance
 
 
+def _encoder_errors(
+    encoder: ImageEncoder, images: Mapping[str, NDArray[Any]]
+) -> tuple[torch.Tensor, torch.Tensor]:
+    """Features of images in float64, and how far two float32 evaluations of them may differ. Each (B, features).
+
+    Through many layers the bound by sizes grows without end, so independent roundings are added as variances here, and
+    `ROUNDING_SIGMAS` standard deviations are allowed.
+    """
+    unit, conv = FLOAT32_UNIT_ROUNDOFF, torch.nn.functional.conv2d
+    with torch.no_grad():
+        x = encoder.scaled({kind: torch.from_numpy(image) for kind, image in images.items()}).double()
+        variance = (2.0 * unit * x).square()
+        for layer in encoder.convolutions:
+            if not isinstance(layer, nn.Conv2d):
+                continue
+            assert layer.bias is not None
+            weight, bias, stride = layer.weight.double(), layer.bias.double(), layer.stride
+            products = weight[0].numel()
+            spread = variance + products * (unit * x).square()
+            variance = conv(spread, weight.square(), (unit * bias).square(), stride)  # type: ignore[arg-type]
+            x = conv(x, weight, bias, stride).relu()  # type: ignore[arg-type]
+        x, variance = x.flatten(1), variance.flatten(1)
+        weight, bias = encoder.trunk.weight.double(), encoder.trunk.bias.double()
+        variance = (variance + weight.shape[1] * (unit * x).square()) @ weight.square().T
+        x = x @ weight.T + bias
+        # The derivative of z = (x - mean) / scale is (dx - mean(dx) - z mean(z dx)) / scale.
+        scale = (x.var(dim=-1, unbiased=False, keepdim=True) + encoder.norm.eps).sqrt()
+        z = (x - x.mean(dim=-1, keepdim=True)) / scale
+        error = ROUNDING_SIGMAS * variance.sqrt()
+        error = (
+            error + error.mean(-1, keepdim=True) + z.abs() * (z.abs() * error).mean(-1, keepdim=True)
+        ) / scale
+        error = error + 8.0 * unit * (z.abs() + x.abs().amax(dim=-1, keepdim=True) / scale)
+        gain = encoder.norm.weight.double()
+        x, error = z * gain + encoder.norm.bias.double(), error * gain.abs() + 2.0 * unit * z.abs()
+        ends = torch.maximum(torch.tanh(x + error) - torch.tanh(x), torch.tanh(x) - torch.tanh(x - error))
+        return torch.tanh(x), ends + 4.0 * unit
+
+
 def _check_layout(path: Path) -> None:
     """Refuses a policy that observes or does something else than the descriptions say."""
     data = load_checkpoint(path)
-    layout = layout_of(data["env_id"])
+    layout = layout_of(data["env_id"], sight_of(data["config"]))
     for what, names in (("observation", layout.observation_names), ("action", layout.action_names)):
         if list(data[what]["names"]) != list(names):
             raise PolicyError(
@@ -338,6 +472,22 @@ class _Graph:
         """Appends x W^T + b; returns the name of its output."""
         weights = {f"{name}.weight": layer.weight, f"{name}.bias": layer.bias}
         self._append("Gemm", x, name, weights, transB=1)
+        return name
+
+    def node(self, operator: str, inputs: Sequence[str], **attributes: Any) -> str:
+        """Appends a node of any inputs; returns the name of its output."""
+        output = f"{operator.lower()}_{len(self.nodes)}"
+        self.nodes.append(helper.make_node(operator, list(inputs), [output], name=output, **attributes))
+        return output
+
+    def join(self, parts: Sequence[str], axis: int) -> str:
+        """Appends what puts several outputs one behind the other; the name of the whole."""
+        return parts[0] if len(parts) == 1 else self.node("Concat", parts, axis=axis)
+
+    def constant(self, name: str, values: Any) -> str:
+        """Adds a constant; returns its name."""
+        array = values.detach().cpu().numpy() if isinstance(values, torch.Tensor) else values
+        self.constants.append(numpy_helper.from_array(array, name))
         return name
 
     def _append(

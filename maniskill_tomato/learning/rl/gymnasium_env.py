@@ -9,12 +9,22 @@ import torch
 from numpy.typing import NDArray
 
 from maniskill_tomato.errors import InvalidInputError
-from maniskill_tomato.learning.rl.envs import make_simulated_env
-from maniskill_tomato.learning.rl.presets import OBSERVATION_CENTRE, OBSERVATION_HALF_RANGE, get_preset
+from maniskill_tomato.learning.rl.envs import check_env_id, make_env
+from maniskill_tomato.learning.rl.presets import (
+    OBSERVATION_CENTRE,
+    OBSERVATION_HALF_RANGE,
+    default_preset,
+    get_preset,
+)
 from maniskill_tomato.learning.rl.rewards import potential_reward
+from maniskill_tomato.sensing.image_observation import STATE, ImageLayout
+from maniskill_tomato.sensing.perception_kinds import STATE_MODE
+from maniskill_tomato.tasks.observed_world import LearnerEyes
 
 Array = NDArray[np.float32]
-ArrayEnv = gym.Env[Array, Array]
+Seen = Array | dict[str, NDArray[Any]]
+"""A state vector of shape (D,), or a dictionary with `state` of that shape and images of shape (H, W, C)."""
+ArrayEnv = gym.Env[Any, Array]
 
 CENTRE: Array = np.array(OBSERVATION_CENTRE, dtype=np.float32)
 HALF_RANGE: Array = np.array(OBSERVATION_HALF_RANGE, dtype=np.float32)
@@ -22,9 +32,50 @@ HALF_RANGE: Array = np.array(OBSERVATION_HALF_RANGE, dtype=np.float32)
 _TD3 = get_preset("td3")
 
 
-class LearnableTask(gym.Wrapper[Array, Array, Array, Array]):
+class ArrayTask(gym.Env[Any, Array]):
+    """One environment of a task with NumPy arrays and plain numbers, and no automatic reset."""
+
+    metadata = {"render_modes": []}
+
+    def __init__(self, env: gym.Env[Any, Any]) -> None:
+        """Takes an environment that gives tensors with a row for each of its environments.
+
+        Args:
+            env: With one environment that does not reset itself.
+        """
+        self._env: Any = env
+        self.spec = None  # `gymnasium.make` makes another class of the same id.
+        self.observation_space = self._env.single_observation_space
+        self.action_space = self._env.single_action_space
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Seen, dict[str, Any]]:
+        super().reset(seed=seed)
+        observation, info = self._env.reset(seed=seed, options=options)
+        return _row(observation), _row(info)
+
+    def step(self, action: Array) -> tuple[Seen, float, bool, bool, dict[str, Any]]:
+        observation, reward, terminated, truncated, info = self._env.step(torch.as_tensor(action)[None])
+        return _row(observation), float(reward[0]), bool(terminated[0]), bool(truncated[0]), _row(info)
+
+    def close(self) -> None:
+        self._env.close()
+
+
+def _row(values: Any) -> Any:
+    """The only row of tensors: a number where it is one, else an array."""
+    if isinstance(values, dict):
+        return {name: _row(value) for name, value in values.items()}
+    if not isinstance(values, torch.Tensor):
+        return values
+    row = values[0].detach().cpu()
+    return row.item() if row.ndim == 0 else row.numpy()
+
+
+class LearnableTask(gym.Wrapper[Any, Array, Any, Array]):
     """A task with normalised observations, actions in [-1, 1] and a choice of reward; by default all as in the
-    `td3` preset.
+    preset `td3`, for the general tasks as in `general-td3`.
 
     `info["task_reward"]` keeps the task's own reward. The time limit truncates and never terminates, so that a
     learner which bootstraps truncated episodes does it right.
@@ -42,7 +93,7 @@ class LearnableTask(gym.Wrapper[Array, Array, Array, Array]):
         """Wraps `env`.
 
         Args:
-            env: One environment with arrays of shape (D,) and (A,), such as ManiSkill's CPUGymWrapper makes.
+            env: One environment with arrays of shape (D,) and (A,), such as `ArrayTask`.
             action_scale: The action that 1 stands for, in the task's units. Shape (A,).
             reward: The task's, or success with V_f as a potential (`learning.rl.rewards.potential_reward`).
             gamma: Discount factor of the learner; only the potential reward uses it.
@@ -69,12 +120,17 @@ class LearnableTask(gym.Wrapper[Array, Array, Array, Array]):
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
-    ) -> tuple[Array, dict[str, Any]]:
+    ) -> tuple[Any, dict[str, Any]]:
         observation, info = self.env.reset(seed=seed, options=options)
+        if self._reward == "potential" and "reward_penalty" not in info:
+            raise InvalidInputError(
+                "the potential reward is for the thesis's tasks, and this task tells no reward_penalty; use "
+                "reward='task', which is a potential already"
+            )
         self._visible_fraction = float(info["visible_fraction"])
         return normalize_observation(observation), {**info, "task_reward": 0.0}
 
-    def step(self, action: Array) -> tuple[Array, SupportsFloat, bool, bool, dict[str, Any]]:
+    def step(self, action: Array) -> tuple[Any, SupportsFloat, bool, bool, dict[str, Any]]:
         scaled = np.clip(action, -1.0, 1.0, dtype=np.float32) * self._scale
         observation, reward, terminated, truncated, info = self.env.step(scaled)
         learned = task_reward = float(reward)
@@ -98,41 +154,57 @@ class LearnableTask(gym.Wrapper[Array, Array, Array, Array]):
         )
 
 
-def normalize_observation(observation: Array) -> Array:
+def normalize_observation(observation: Any) -> Any:
     """The thesis's nine numbers in the fixed ranges of the `td3` preset, about -1 to 1; others as they are.
 
-    The general tasks' observation is scaled already. Shape (..., D), as given.
+    The general tasks' observation is scaled already, and images stay as they are.
+
+    Args:
+        observation: Shape (..., D), or a dictionary with such a `state`.
     """
+    if isinstance(observation, dict):
+        return {**observation, STATE: normalize_observation(observation[STATE])}
     if observation.shape[-1] != len(CENTRE):
         return observation
-    normalized: Array = (observation - CENTRE) / HALF_RANGE
-    return normalized
+    return (observation - CENTRE) / HALF_RANGE
 
 
 def make_gymnasium_env(
     env_id: str,
     *,
-    action_scale: Sequence[float] = _TD3.action_scale,
-    reward: Literal["task", "potential"] = "potential",
+    action_scale: Sequence[float] | None = None,
+    reward: Literal["task", "potential"] | None = None,
     gamma: float = _TD3.gamma,
     step_cost: float = _TD3.step_cost,
+    obs_mode: str = STATE_MODE,
+    image_size: tuple[int, int] = (64, 48),
     **options: Any,
 ) -> LearnableTask:
-    """One environment of a task for an outside learner: `LearnableTask` over ManiSkill's CPUGymWrapper.
+    """One environment of a task for an outside learner.
+
+    It needs no simulator, unless an option or colours ask for one.
 
     Args:
         env_id: Id of the task.
-        action_scale: See `LearnableTask`, as for the next three.
-        reward: Which reward to learn from.
-        gamma: Discount factor of the learner.
+        action_scale: See `LearnableTask`; that of the preset `td3`, for the general tasks of `general-td3`, if None.
+        reward: Which reward to learn from; the potential one for the thesis's tasks, the task's for the others if None.
+        gamma: Discount factor of the learner; only the potential reward uses it.
         step_cost: What each step costs with the potential reward.
+        obs_mode: `state`, or images beside it: see `sensing.image_observation.ImageLayout.parse`.
+        image_size: Their width and height, in [px].
         options: For `gymnasium.make`, for instance `plant=`.
 
     Raises:
         InvalidInputError: The id or an option is not allowed.
     """
-    # ManiSkill takes seconds to import; who only imports this module need not wait for it.
-    from mani_skill.utils.wrappers.gymnasium import CPUGymWrapper
-
-    env = CPUGymWrapper(make_simulated_env(env_id, **options))
-    return LearnableTask(env, action_scale=action_scale, reward=reward, gamma=gamma, step_cost=step_cost)
+    check_env_id(env_id)
+    preset = get_preset(default_preset(env_id))
+    images = ImageLayout.parse(obs_mode, image_size)
+    env = make_env(env_id, eyes=None if images is None else LearnerEyes(images=images), **options)
+    return LearnableTask(
+        ArrayTask(env),
+        action_scale=preset.action_scale if action_scale is None else action_scale,
+        reward=preset.reward if reward is None else reward,
+        gamma=gamma,
+        step_cost=step_cost,
+    )

@@ -2,12 +2,13 @@
 
 import dataclasses
 import math
-from typing import Literal
+from typing import Any, Literal
 
 from maniskill_tomato.errors import InvalidInputError
 from maniskill_tomato.learning.rl.train_config import MAY_CHANGE as MAY_CHANGE
 from maniskill_tomato.learning.rl.train_config import TrainConfig as TrainConfig
 from maniskill_tomato.learning.rl.train_config import modernise as modernise
+from maniskill_tomato.sensing.perception_kinds import STATE_MODE
 from maniskill_tomato.tasks import GENERAL_IDS
 
 OBSERVATION_CENTRE = (0.2, 0.0, 0.8, 0.0, math.pi / 2, 0.0, 0.7, 0.0, 0.8)
@@ -19,7 +20,17 @@ OBSERVATION_HALF_RANGE = (0.5, 0.5, 0.5, 1.0, 1.0, 1.0, 0.5, 0.5, 0.5)
 their difference keeps its meaning. [m], [rad]."""
 
 PresetName = Literal[
-    "td3", "fast-td3", "thesis-guided", "thesis-sparse", "general-td3", "general-ddpg", "general-fast-td3"
+    "td3",
+    "fast-td3",
+    "thesis-guided",
+    "thesis-sparse",
+    "pixel-td3",
+    "pixel-ddpg",
+    "general-td3",
+    "general-ddpg",
+    "general-fast-td3",
+    "general-pixel-td3",
+    "general-pixel-ddpg",
 ]
 
 _TD3 = TrainConfig(
@@ -122,6 +133,26 @@ _GENERAL_FAST_TD3 = dataclasses.replace(
     exploration="correlated",
 )
 
+_PIXELS: dict[str, Any] = {
+    "obs_mode": "depth+segmentation",
+    "batch_size": 128,
+    "buffer_size": 30_000,
+    "num_envs": 8,
+    "asymmetric_critic": True,
+    "checkpoint_every": 10_000,
+    "checkpoint_seconds": None,
+    "checkpoints_kept": 1,
+}
+"""What images change: a batch costs more, and a checkpoint holds half a gigabyte."""
+
+_SINGLE_CRITIC: dict[str, Any] = {"twin_critics": False, "policy_frequency": 1, "target_noise": 0.0}
+"""DDPG."""
+
+_PIXEL_TD3 = dataclasses.replace(_TD3, **_PIXELS)
+_GENERAL_PIXEL_TD3 = dataclasses.replace(
+    _GENERAL_TD3, **_PIXELS, total_timesteps=25_000, exploration_steps=15_000
+)
+
 PRESETS: dict[PresetName, TrainConfig] = {
     "td3": _TD3,
     "fast-td3": _FAST_TD3,
@@ -135,17 +166,29 @@ PRESETS: dict[PresetName, TrainConfig] = {
         exploration_steps=1800,
         exploration_noise=0.1,
     ),
+    "pixel-td3": _PIXEL_TD3,
+    "pixel-ddpg": dataclasses.replace(_PIXEL_TD3, **_SINGLE_CRITIC),
+    "general-pixel-td3": _GENERAL_PIXEL_TD3,
+    "general-pixel-ddpg": dataclasses.replace(_GENERAL_PIXEL_TD3, **_SINGLE_CRITIC),
     "general-td3": _GENERAL_TD3,
     "general-ddpg": _GENERAL_DDPG,
     "general-fast-td3": _GENERAL_FAST_TD3,
 }
 """The named configurations. The thesis's are Tables 5-1 and 5-2 on top of the defaults of `TrainConfig`; those for the
 general tasks have three actions and take the observation, which is scaled already, as it is. `general-ddpg` has the
-learning rates, tau, gamma and batch size of Lillicrap et al. (2016)."""
+learning rates, tau, gamma and batch size of Lillicrap et al. (2016). Those called pixel observe images: `pixel-td3` and
+`pixel-ddpg` on the thesis's tasks, the others on the general ones."""
 
 
-def default_preset(env_id: str | None) -> PresetName:
-    """The preset that a task is trained with unless another one is asked for."""
+def default_preset(env_id: str | None, obs_mode: str | None = None) -> PresetName:
+    """The preset that a task is trained with unless another one is asked for.
+
+    Args:
+        env_id: The task.
+        obs_mode: What is asked to be observed, if anything.
+    """
+    if obs_mode is not None and obs_mode != STATE_MODE:
+        return "general-pixel-td3" if env_id in GENERAL_IDS else "pixel-td3"
     return "general-td3" if env_id in GENERAL_IDS else "td3"
 
 

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 from typing import Any, Literal
 
 from maniskill_tomato.errors import InvalidInputError
+from maniskill_tomato.sensing.perception_kinds import STATE_MODE, Part
 from maniskill_tomato.tables import read_table
 
 ExplorationName = Literal["epsilon-greedy", "decaying-gaussian", "look-at-goals", "correlated"]
@@ -29,6 +30,8 @@ _AT_LEAST_ONE = (
     "checkpoint_every",
     "checkpoints_kept",
     "torch_threads",
+    "frame_stack",
+    "image_features",
 )
 _NOT_NEGATIVE = (
     "actor_starts",
@@ -43,6 +46,8 @@ _NOT_NEGATIVE = (
     "pre_tanh_penalty",
     "exploration_noise",
     "exploration_noise_end",
+    "image_shift",
+    "replay_memory_gb",
 )
 
 _REMOVED = {
@@ -139,6 +144,27 @@ class TrainConfig:
     action_scale: tuple[float, ...] = (1.0, 1.0, 1.0, 1.0, 1.0, 1.0)
     """The action that an actor output of 1 stands for, in [m] and [rad] (thesis: 1)."""
 
+    # Images.
+    obs_mode: str = "state"
+    """What is observed: `state`, or images beside it: `rgbd`, or `rgb`, `depth`, `segmentation` joined by `+`."""
+    image_size: tuple[int, int] = (64, 48)
+    """Width and height of the images, in [px]."""
+    frame_stack: int = 1
+    """Views that an observation holds, the present one and those before it."""
+    state_parts: tuple[Part, ...] = ("pose", "target", "time")
+    """Beside images: parts of the general tasks' observation; `map` and `near_map` are its memory. The thesis's tasks
+    have their nine numbers."""
+    image_features: int = 64
+    """Numbers that the encoder makes of the images."""
+    image_shift: int = 2
+    """Random shift of the images in updates, in [px] (DrQ-v2: 4 of 84)."""
+    asymmetric_critic: bool = False
+    """Critics see the whole state vector of the task instead of the images (Pinto et al., 2018)."""
+    replay_memory_gb: float = 4.0
+    """Most memory of the replay buffer, in [GB]."""
+    replay_on_disk: bool = False
+    """Keep the replay buffer in files of the run's folder, which checkpoints then do not hold."""
+
     # Exploration.
     exploration: ExplorationName = "epsilon-greedy"
     """How actions are explored."""
@@ -203,6 +229,7 @@ class TrainConfig:
                 f"buffer_size must be at least batch_size ({self.batch_size}) and num_envs x hindsight_targets "
                 f"({at_once}), got {self.buffer_size}"
             )
+        self._check_images()
         for name in ("actor_hidden", "critic_hidden"):
             widths = getattr(self, name)
             if not widths or min(widths) < 1:
@@ -230,6 +257,28 @@ class TrainConfig:
             raise InvalidInputError(
                 "exploration_noise_per_env needs an exploration with noise: decaying-gaussian, look-at-goals or "
                 "correlated; epsilon-greedy has none"
+            )
+
+    def _check_images(self) -> None:
+        if self.obs_mode == STATE_MODE:
+            for name, off in (("frame_stack", 1), ("asymmetric_critic", False)):
+                if getattr(self, name) != off:
+                    raise InvalidInputError(
+                        f"{name} goes with images; choose obs_mode, such as 'depth+segmentation'"
+                    )
+            return
+        # These take a second to import, and most configurations observe no images.
+        from maniskill_tomato.sensing.image_observation import ImageLayout
+        from maniskill_tomato.sensing.observation import ObservationLayout
+
+        if len(self.image_size) != 2:
+            raise InvalidInputError(f"image_size must be a width and a height, got {self.image_size}")
+        ObservationLayout(parts=self.state_parts)
+        ImageLayout.parse(self.obs_mode, self.image_size)
+        if self.hindsight_targets:
+            raise InvalidInputError(
+                "hindsight_targets relabels state vectors, and an image shows one target; set it to 0, or use "
+                "obs_mode 'state'"
             )
 
     def to_dict(self) -> dict[str, Any]:

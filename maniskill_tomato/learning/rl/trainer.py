@@ -20,6 +20,7 @@ from maniskill_tomato.learning.interrupt import StopRequest, stop_on_signals
 from maniskill_tomato.learning.rl.agent import begin_with, check_fits, update
 from maniskill_tomato.learning.rl.checkpoint import make_checkpoint
 from maniskill_tomato.learning.rl.envs import LearnerEnv, check_env_id, make_learner_env
+from maniskill_tomato.learning.rl.observations import columns_of, device_of, eyes_of
 from maniskill_tomato.learning.rl.presets import TrainConfig
 from maniskill_tomato.learning.rl.progress import Progress, TrainingLog
 from maniskill_tomato.learning.rl.replay import Batch
@@ -36,6 +37,7 @@ from maniskill_tomato.learning.rl.run_folder import (
 from maniskill_tomato.learning.rl.training_state import TrainingState, seed_global_random_state
 from maniskill_tomato.learning.rl.wandb_log import import_wandb
 from maniskill_tomato.policies.trained_actor import TrainedActor, load_actor
+from maniskill_tomato.sensing.image_observation import STATE, state_of
 
 logger = logging.getLogger(__name__)
 
@@ -95,9 +97,11 @@ class Trainer:
                 `config` does not fit `env`, or it asks for Weights & Biases and that is not installed.
         """
         observation_space, action_space = env.single_observation_space, env.single_action_space
-        if not isinstance(observation_space, gym.spaces.Box) or not isinstance(action_space, gym.spaces.Box):
-            raise InvalidInputError(f"training needs Box spaces, got {observation_space} and {action_space}")
+        columns = columns_of(observation_space)
+        if not isinstance(action_space, gym.spaces.Box):
+            raise InvalidInputError(f"training needs a Box of actions, got {action_space}")
         (action_dim,) = action_space.shape
+        ((observation_dim,), _) = columns[STATE if STATE in columns else ""]
         if len(config.action_scale) != action_dim:
             raise InvalidInputError(
                 f"action_scale must have {action_dim} values, one per action of {env_id}, got "
@@ -108,7 +112,7 @@ class Trainer:
         self._given: TrainedActor | None = None
         if config.initial_policy is not None and not resume:
             self._given = load_actor(config.initial_policy, env_id=env_id)
-            check_fits(self._given, config, observation_space.shape[0])
+            check_fits(self._given, config, observation_dim)
         if not resume:
             check_run_dir(run_dir)
         elif not (run_dir / "config.json").is_file():
@@ -129,7 +133,7 @@ class Trainer:
         self._env_options = env_options or {}
         self._resume = resume
         self._report = report
-        self._dims = observation_space.shape[0], action_dim
+        self._dims = observation_dim, action_dim
         self._action_bounds = torch.as_tensor(action_space.low), torch.as_tensor(action_space.high)
         self._checkpoint_step = 0
         self._start = self._checkpoint_time = time.perf_counter()
@@ -163,10 +167,10 @@ class Trainer:
         saved = self._saved_run()
         observations, info = self._env.reset(seed=self._seed)
         self._state = state = TrainingState(
-            self._env, self._config, self._dims, self._seed, observations, info
+            self._env, self._config, self._dims, self._seed, observations, info, self._run_dir
         )
         write_config(self._run_dir, self._env_id, self._seed, self._env_options, self._config.to_dict())
-        self._scale = torch.tensor(self._config.action_scale, device=observations.device)
+        self._scale = torch.tensor(self._config.action_scale, device=device_of(observations))
         self._start = self._checkpoint_time = time.perf_counter()
         if self._given is not None:
             begin_with(state.agent, self._given)
@@ -207,7 +211,7 @@ class Trainer:
             observations = state.observations
             state.agent.observe(observations)
             actions = state.exploration.explore(
-                state.agent.policy(observations), observations, state.step, state.episode_starts
+                state.agent.policy(observations), state_of(observations), state.step, state.episode_starts
             )
             self._check_finite(action=actions)
             next_observations, rewards, terminations, truncations, info = self._env.step(
@@ -219,7 +223,7 @@ class Trainer:
             step_info = info.get("final_info", info)
             reached = info["final_observation"] if "final_observation" in info else next_observations
             learned = learned_reward(self._config, rewards, terminations, state.visible_fraction, step_info)
-            self._check_finite(reward=learned, observation=reached)
+            self._check_finite(reward=learned, observation=state_of(reached))
             batch = Batch(observations, actions, learned, reached, terminations.float())
             state.experience.add(batch, step_info, info)
             losses = self._learn()
@@ -317,7 +321,8 @@ class Trainer:
     def _save_periodic(self) -> None:
         """Writes a checkpoint of the present step, drops the oldest, writes the history."""
         state = self._state
-        weights = (*state.agent.actor.parameters(), *state.agent.critics.parameters())
+        eye = () if state.agent.encoder is None else state.agent.encoder.parameters()
+        weights = (*state.agent.actor.parameters(), *state.agent.critics.parameters(), *eye)
         self._check_finite(weights=torch.cat([w.detach().flatten() for w in weights]))
         data = make_checkpoint(
             state.agent,
@@ -410,4 +415,5 @@ def make_training_env(env_id: str, config: TrainConfig, env_options: dict[str, A
         InvalidInputError: The id or an option cannot be used.
     """
     needed = {"other_targets": config.hindsight_targets} if config.hindsight_targets else {}
-    return make_learner_env(env_id, config.num_envs, **{**needed, **env_options})
+    eyes = eyes_of(config)
+    return make_learner_env(env_id, config.num_envs, eyes=eyes, **{**needed, **env_options})

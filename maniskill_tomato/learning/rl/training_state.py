@@ -1,6 +1,7 @@
 """Everything that changes while a run goes on, and how a checkpoint keeps it."""
 
 import random
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -20,8 +21,10 @@ from maniskill_tomato.learning.rl.envs import LearnerEnv
 from maniskill_tomato.learning.rl.experience import Experience, make_replay
 from maniskill_tomato.learning.rl.exploration import make_exploration
 from maniskill_tomato.learning.rl.history import TrainingHistory
+from maniskill_tomato.learning.rl.observations import device_of, mapped
 from maniskill_tomato.learning.rl.presets import TrainConfig
 from maniskill_tomato.learning.rl.run_folder import RUN_STATE_FORMAT
+from maniskill_tomato.sensing.image_observation import PRIVILEGED, Observation
 from maniskill_tomato.tasks.numpy_streams import numpy_state, random_state
 
 
@@ -34,23 +37,28 @@ class TrainingState:
         config: TrainConfig,
         dims: tuple[int, int],
         seed: int,
-        observations: Tensor,
+        observations: Observation,
         info: dict[str, Any],
+        run_dir: Path | None = None,
     ) -> None:
         """The state at the start of a run.
 
         Args:
             env: The environments, just reset.
             config: How to learn.
-            dims: Number of observed values and of actions.
+            dims: Number of observed values, those of images left out, and of actions.
             seed: Seed of the replay, the exploration and the target noise.
-            observations: What the reset gave. Shape (num_envs, observation_dim).
+            observations: What the reset gave. Shape (num_envs, observation_dim), or with images.
             info: What it gave beside them.
+            run_dir: Folder of the run, for a replay buffer on the disk.
         """
-        device = observations.device
+        device = device_of(observations)
+        privileged = (
+            0 if isinstance(observations, Tensor) else observations.get(PRIVILEGED, Tensor()).shape[-1]
+        )
         self.env = env
-        self.agent = make_agent(config, *dims, device)
-        self.replay = make_replay(config, *dims, device)
+        self.agent = make_agent(config, *dims, device, privileged_dim=privileged)
+        self.replay = make_replay(config, env.single_observation_space, dims[1], device, run_dir)
         self.experience = Experience(config, self.replay, dims[0])
         self.experience.begin(info)
         self.generator = torch.Generator(device=device).manual_seed(seed)
@@ -78,7 +86,7 @@ class TrainingState:
             "exploration": tensor_attributes(self.exploration),
             "history": self.history.state_dict(),
             "log": log_state,
-            "observations": self.observations.cpu(),
+            "observations": mapped(self.observations, Tensor.cpu),
             "visible_fraction": self.visible_fraction.cpu(),
             "episode_starts": self.episode_starts.cpu(),
             "generator": self.generator.get_state().cpu(),
@@ -92,15 +100,16 @@ class TrainingState:
         Raises:
             CheckpointError: It is of another run.
         """
-        run, counters, device = saved["run"], saved["counters"], self.observations.device
+        run, counters, device = saved["run"], saved["counters"], device_of(self.observations)
         try:
-            for name in ("actor", "normalizer", *TRAINING_PARTS):
+            eye = ("encoder",) if self.agent.encoder is not None else ()
+            for name in ("actor", "normalizer", *eye, *TRAINING_PARTS):
                 getattr(self.agent, name).load_state_dict(saved[name])
             self.replay.load_state_dict(run["replay"])
             self.experience.load_state_dict(run["experience"])
             set_tensor_attributes(self.exploration, run["exploration"], device)
             self.history.load_state_dict(run["history"])
-            self.observations = run["observations"].to(device)
+            self.observations = mapped(run["observations"], lambda values: values.to(device))
             self.visible_fraction = run["visible_fraction"].to(device)
             self.episode_starts = run["episode_starts"].to(device)
             self.step = counters["steps"]
