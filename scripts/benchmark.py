@@ -14,9 +14,10 @@ import sys
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import gymnasium as gym
 import numpy as np
@@ -41,11 +42,16 @@ from maniskill_tomato.segmentation.light_segmenter import FruitSession
 from maniskill_tomato.segmentation.segmenter import make_segmenter
 from maniskill_tomato.sensing.camera_perception import CameraPerception
 from maniskill_tomato.sensing.fruit_detector import FruitDetector
+from maniskill_tomato.sensing.image_observation import ImageLayout
 from maniskill_tomato.sensing.posed_frame import PosedFrame
+from maniskill_tomato.tasks.making import make_world
 
 GUIDED = "TomatoViewpointGuided-v1"
+GENERAL = "TomatoViewpoint-v1"
 EMPTY = "TomatoBenchmarkEmpty-v1"
 MIB = 2**20
+IMAGE_SIZES = ((64, 48), (84, 63), (128, 96))
+"""Of policies' images, in [px]."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -152,6 +158,36 @@ def rays_rate(rays_per_side: int) -> float:
     pose[0, :3, 3] = torch.as_tensor(plant.fruits[ripe[0]].centre) - torch.tensor([0.5, 0.0, 0.0])
     target, plant_pose = torch.tensor([ripe[0]]), torch.eye(4)[None]
     return rays_per_side**2 * per_second(lambda: scene.visibility(pose, target, plant_pose), 400)
+
+
+def image_rates(repeats: int, can_render: bool) -> dict[str, float]:
+    """Images of depth and segmentation a second in the general task, by how they are made and by their width.
+
+    Cast ones are taken of 1 and of 16 environments at once, rendered ones of one, which is all that a CPU simulates.
+    """
+    worlds = {count: make_world(GENERAL, count) for count in (1, 16)}
+    makers: dict[str, Callable[[], object]] = {}
+    for world in worlds.values():
+        world.reset(0)
+    rendered = []
+    for width, height in IMAGE_SIZES:
+        layout = ImageLayout(kinds=("depth", "segmentation"), width=width, height=height)
+        for count, world in worlds.items():
+            makers[f"cast_{width}_batch_{count}"] = partial(world.images, layout)
+        if can_render:
+            size = {"width": width, "height": height}
+            env = gym.make(GENERAL, obs_mode="depth+segmentation", sensor_configs=size)
+            env.reset(seed=0)
+            rendered.append(env)
+            makers[f"rendered_{width}"] = cast(Any, env.unwrapped).get_obs
+    rates: dict[str, list[float]] = {}
+    for _ in range(repeats):
+        for name, make in makers.items():
+            images = 16 if name.endswith("_16") else 1
+            rates.setdefault(name, []).append(images * per_second(make, 20))
+    for env in rendered:
+        env.close()
+    return {name: round(statistics.median(values), 1) for name, values in rates.items()}
 
 
 def look_times(episodes: int, views: int) -> dict[str, Any]:
@@ -274,10 +310,13 @@ def main(args: Args) -> int:
             "steps": growth(step_or_reset, args.memory_steps),
             "resets_with_new_plants": growth(new_plants.reset, args.memory_resets),
         },
+        "images_per_second": image_rates(args.repeats, rendered is not None),
         "look": look_times(args.look_episodes, 4) if rendered else None,
         "left_out": []
         if rendered
-        else ["guided_rendered_128_steps, look: no Vulkan device; `make vulkan` installs one"],
+        else [
+            "guided_rendered_128_steps, rendered images, look: no Vulkan device; `make vulkan` installs one"
+        ],
     }
     for env in (empty, guided, new_plants, rendered):
         if env is not None:

@@ -8,7 +8,6 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from maniskill_tomato.sensing.image_observation import Observation
 from maniskill_tomato.tasks.arm_moves import ACTION_SIZES
 from maniskill_tomato.tasks.making import MAX_STEPS, make_world
 from maniskill_tomato.tasks.observed_world import LearnerEyes, ObservedWorld
@@ -62,7 +61,7 @@ class VectorEnv(gym.Env[Any, Any]):
 
     def reset(
         self, *, seed: int | Sequence[int] | None = None, options: Mapping[str, Any] | None = None
-    ) -> tuple[Observation, dict[str, Any]]:
+    ) -> tuple[Any, dict[str, Any]]:
         """Begins episodes; see `World.reset`. The option `env_idx` says where, everywhere if it is missing."""
         options = dict(options or {})
         rows = self.world.env_rows(options.pop("env_idx", None))
@@ -72,7 +71,7 @@ class VectorEnv(gym.Env[Any, Any]):
 
     def step(  # type: ignore[override]
         self, actions: Any
-    ) -> tuple[Observation, Tensor, Tensor, Tensor, dict[str, Any]]:
+    ) -> tuple[Any, Tensor, Tensor, Tensor, dict[str, Any]]:
         """Makes a move in every environment.
 
         Args:

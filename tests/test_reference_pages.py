@@ -12,7 +12,8 @@ from documentation.reference_pages import PAGES
 from maniskill_tomato.cli.command_table import COMMANDS
 from maniskill_tomato.deploy.profile import load_profile
 from maniskill_tomato.deploy.profile_files import profile_names, profile_path
-from maniskill_tomato.sensing.observation import ObservationLayout, Part
+from maniskill_tomato.sensing.observation import ObservationLayout
+from maniskill_tomato.sensing.perception_kinds import Part
 from maniskill_tomato.tasks import TASK_IDS
 from maniskill_tomato.tasks.vector_env import make_vector_env
 from maniskill_tomato.text_files import parse_toml

@@ -8,6 +8,7 @@ from torch import Tensor, nn
 
 from maniskill_tomato.raycast.images import Role
 from maniskill_tomato.sensing.image_observation import CHANNELS, ImageLayout
+from maniskill_tomato.sensing.perception_kinds import ImageKind
 
 DEPTH_SCALE_MM: Final = 1000.0
 """Depths are told in this unit, at most `FARTHEST` of it."""
@@ -86,6 +87,6 @@ class ImageEncoder(nn.Module):
         return torch.cat(planes, dim=1)
 
 
-def _planes(kind: str) -> int:
+def _planes(kind: ImageKind) -> int:
     """Planes of one view of a kind of image."""
-    return len(Role) if kind == "segmentation" else CHANNELS[kind]  # type: ignore[index]
+    return len(Role) if kind == "segmentation" else CHANNELS[kind]

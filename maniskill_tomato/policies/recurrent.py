@@ -11,7 +11,8 @@ from maniskill_tomato.errors import InvalidInputError
 from maniskill_tomato.policies.network_file import load_network, save_network
 from maniskill_tomato.policies.protocol import Planner
 from maniskill_tomato.sensing.belief import Belief
-from maniskill_tomato.sensing.observation import ObservationLayout, Part
+from maniskill_tomato.sensing.observation import ObservationLayout
+from maniskill_tomato.sensing.perception_kinds import Part
 
 FORMAT: Final = "recurrent-1"
 

@@ -12,7 +12,8 @@ from maniskill_tomato.sensing.view_lattice import ViewLattice
 
 if TYPE_CHECKING:
     from maniskill_tomato.sensing.image_observation import ImageSource
-    from maniskill_tomato.sensing.observation import ObservationLayout, Part
+    from maniskill_tomato.sensing.observation import ObservationLayout
+    from maniskill_tomato.sensing.perception_kinds import Part
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

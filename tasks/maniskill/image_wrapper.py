@@ -3,7 +3,7 @@
 ManiSkill's own `FlattenRGBDObservationWrapper` drops the segmentation, whose ids mean another thing in every scene.
 """
 
-from typing import Any
+from typing import Any, cast
 
 import gymnasium as gym
 import numpy as np
@@ -36,7 +36,7 @@ class FlattenImageObservationWrapper(gym.ObservationWrapper[Any, Any, Any]):
             InvalidInputError: Its observations have no images.
         """
         super().__init__(env)
-        self._task: Any = env.unwrapped
+        self._task = cast(Any, env.unwrapped)
         first = self._task._init_raw_obs
         if not isinstance(first, dict) or CAMERA not in first.get("sensor_data", {}):
             raise InvalidInputError(

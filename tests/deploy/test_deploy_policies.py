@@ -15,8 +15,9 @@ from maniskill_tomato.assets import asset_path
 from maniskill_tomato.cli import main
 from maniskill_tomato.deploy.loop import Loop
 from maniskill_tomato.deploy.profile import load_profile
+from maniskill_tomato.deploy.robot_perception import RobotBelief
 from maniskill_tomato.deploy.run_records import KeptSteps
-from maniskill_tomato.deploy.run_replay import load_recording
+from maniskill_tomato.deploy.run_replay import load_recording, replay
 from maniskill_tomato.deploy.stops import Stops
 from maniskill_tomato.deploy.workcell import make_workcell
 from maniskill_tomato.errors import PolicyError
@@ -26,6 +27,8 @@ from maniskill_tomato.learning.rl.checkpoint import make_checkpoint
 from maniskill_tomato.learning.rl.export import export_policy
 from maniskill_tomato.learning.rl.presets import get_preset
 from maniskill_tomato.policies.opening import open_policy
+from maniskill_tomato.raycast.images import Role
+from maniskill_tomato.sensing.image_observation import ImageLayout
 from maniskill_tomato.sensing.observation import ObservationLayout
 
 TASK = "TomatoViewpoint-v1"
@@ -56,6 +59,17 @@ def saved(path: Path, bound: float = 1.0) -> Path:
         agent.actor.output.weight *= 10.0
         agent.actor.output.bias[:] = torch.tensor([0.6, 0.8, 0.5])
     bounds = (-bound * torch.ones(3), bound * torch.ones(3))
+    write_tensors(path, make_checkpoint(agent, TASK, bounds, {"steps": 1, "episodes": 1, "seed": 3}))
+    return path
+
+
+def saved_with_eyes(path: Path) -> Path:
+    """A policy that observes images, with weights that no training touched."""
+    torch.manual_seed(3)
+    agent = make_agent(get_preset("general-pixel-td3"), 11, 3, privileged_dim=ObservationLayout().size)
+    with torch.no_grad():
+        agent.actor.output.weight *= 30.0
+    bounds = (-torch.ones(3), torch.ones(3))
     write_tensors(path, make_checkpoint(agent, TASK, bounds, {"steps": 1, "episodes": 1, "seed": 3}))
     return path
 
@@ -158,3 +172,38 @@ def test_exported_policies_of_other_tasks_and_damaged_ones_are_refused_before_an
         assert not (tmp_path / "out").exists()
         with pytest.raises(PolicyError):
             open_policy(str(model), env_id=TASK)
+
+
+@pytest.mark.parametrize("sight", ["images", "rays"])
+def test_a_policy_of_images_moves_the_twin_and_its_recording_replays(
+    tmp_path: Path, profile: Path, sight: str
+) -> None:
+    profile.write_text(PROFILE.replace("[perception]", f'[perception]\nsight = "{sight}"'))
+    policy = export_policy(saved_with_eyes(tmp_path / "policy.pt"), tmp_path / "exported").model
+    content = run(profile, policy, tmp_path / "out")
+    assert content["reason"] == "budget"
+    steps = [step.facts for step in load_recording(tmp_path / "out" / "run.mcap").steps]
+    actions = np.array([facts["action"] for facts in steps if facts["action"] is not None])
+    assert len(actions) >= 3 and np.ptp(actions, axis=0).max() > 1e-3, "it looks at what it sees"
+    assert not replay(load_recording(tmp_path / "out" / "run.mcap"), str(policy)).differences
+
+
+def test_the_twins_true_roles_are_those_of_the_simulated_task(tmp_path: Path, profile: Path) -> None:
+    profile.write_text(PROFILE.replace("[perception]", '[perception]\nsight = "rays"'))
+    workcell = make_workcell(load_profile(str(profile)), SEED)
+    layout = ImageLayout(kinds=("depth", "segmentation"), width=64, height=48)
+    with workcell.arm, workcell.camera:
+        joints = workcell.arm.read().joint_positions
+        frame = workcell.camera.read()
+        belief = RobotBelief(workcell.profile.T_flange_camera, 5)
+        sighting = workcell.perception.look(frame, belief.camera_pose(joints))
+        assert sighting.images is not None and frame.truth is not None
+        images = sighting.images(layout)
+    role = images["segmentation"][0, ..., 0].numpy()
+    assert {int(Role.STEM), int(Role.LEAF)} <= set(np.unique(role).tolist())
+    rows = ((np.arange(48) + 0.5) * 120 / 48).astype(int)
+    columns = ((np.arange(64) + 0.5) * 160 / 64).astype(int)
+    labels = frame.truth.labels[np.ix_(rows, columns)]
+    assert np.array_equal(role == int(Role.TARGET), labels == frame.truth.target_label)
+    assert np.array_equal(role == int(Role.BACKGROUND), labels == 0)
+    assert np.array_equal(np.isin(labels, frame.truth.stem_labels), role == int(Role.STEM))

@@ -26,7 +26,7 @@ from maniskill_tomato.policies.opening import open_policy
 from maniskill_tomato.policies.recurrent import RecurrentActor, RecurrentPolicy, columns_of, save_recurrent
 from maniskill_tomato.robot.look_at import look_at_pose
 from maniskill_tomato.robot.look_at_move import MAX_MOVE
-from maniskill_tomato.sensing.observation import Part
+from maniskill_tomato.sensing.perception_kinds import Part
 
 PLANT = {"seed": 7, "row": False, "leaf_density": 1.2}
 ONE = torch.zeros(1, dtype=torch.int64)

@@ -5,6 +5,7 @@ from dataclasses import replace
 from typing import Any
 
 import gymnasium as gym
+import numpy as np
 import pytest
 import torch
 from torch import Tensor
@@ -35,10 +36,14 @@ def learner_env() -> Iterator[LearnerEnv]:
     env.close()
 
 
+def vectors(size: int) -> gym.Space[Any]:
+    return gym.spaces.Box(-np.inf, np.inf, (size,), np.float32)
+
+
 def walk(env: LearnerEnv, config: TrainConfig, steps: int) -> tuple[Any, list[dict[str, Any]]]:
     """Random steps through `Experience`; the replay buffer and, for every step, the state and action it began with."""
     world: Any = env.unwrapped  # type: ignore[attr-defined]
-    replay = make_replay(config, 9, 6)
+    replay = make_replay(config, vectors(9), 6)
     experience = Experience(config, replay, 9)
     generator = torch.Generator().manual_seed(4)
     observations, info = env.reset(seed=11)
@@ -185,7 +190,7 @@ class FourTomatoes:
 def test_steps_of_other_targets_against_a_plain_loop() -> None:
     """Every other tomato that exists gets the step once, with its own reward and end."""
     config = replace(get_preset("td3"), hindsight_targets=2, reward="task", aux_visibility_weight=0.1)
-    replay = make_replay(config, 9, 6)
+    replay = make_replay(config, vectors(9), 6)
     experience = Experience(config, replay, 9)
     task = FourTomatoes(0)
     info = task.info()
@@ -220,10 +225,10 @@ def test_steps_of_other_targets_against_a_plain_loop() -> None:
 
 def test_an_environment_that_does_not_judge_other_targets_is_refused() -> None:
     config = replace(get_preset("td3"), hindsight_targets=2)
-    experience = Experience(config, make_replay(config, 9, 6), 9)
+    experience = Experience(config, make_replay(config, vectors(9), 6), 9)
     info = FourTomatoes(0).info()
     del info["other_reward"]
     with pytest.raises(InvalidInputError, match="needs an environment made with other_targets=2"):
         experience.begin(info)
     with pytest.raises(InvalidInputError, match="needs the target's position at 6 ... 8"):
-        Experience(config, make_replay(config, 4, 6), 4)
+        Experience(config, make_replay(config, vectors(4), 6), 4)

@@ -219,13 +219,13 @@ def test_the_replay_sees_the_end_of_an_episode_and_not_the_start_of_the_next(tmp
         env, "Reach-v0", small_config(total_timesteps=200), tmp_path / "run", show_progress=False
     )
     trainer.run()
-    stored = trainer._state.replay._storage
-    moved = stored.next_observations[:200, :6] - stored.observations[:200, :6]
-    inside = stored.next_observations[:200, :6].abs() < 1.0
+    stored = trainer._state.replay.state_dict()
+    moved = stored["next_observations"][:200, :6] - stored["observations"][:200, :6]
+    inside = stored["next_observations"][:200, :6].abs() < 1.0
     torch.testing.assert_close(moved[inside], torch.cat(env.actions)[inside], rtol=0.0, atol=1e-6)
     curves = load_history(tmp_path / "run")
     ends = curves.episodes["end_step"].astype(int) - 1
-    terminal = stored.terminations[:200].nonzero().flatten().tolist()
+    terminal = stored["terminations"][:200].nonzero().flatten().tolist()
     assert terminal == [e for e, s in zip(ends, curves.episodes["success"], strict=True) if s]
     assert len(terminal) < len(ends)  # At least one episode ran out of time, which is no termination.
 

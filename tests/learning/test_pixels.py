@@ -57,7 +57,7 @@ def small(preset: str = "general-pixel-td3", **changes: Any) -> TrainConfig:
         "total_timesteps": 60,
         "checkpoint_every": 20,
     }
-    return dataclasses.replace(get_preset(preset), **{**options, **changes})  # type: ignore[arg-type]
+    return dataclasses.replace(get_preset(preset), **{**options, **changes})
 
 
 def space(kinds: str = MODE) -> gym.spaces.Dict:
@@ -430,7 +430,7 @@ def test_a_policy_of_images_acts_in_its_task_and_exported_it_does_the_same(
     # The first move is that of the actor on what the training's environment shows.
     learner = make_training_env(env_id, load_config(source), {})
     observations, _ = learner.reset(seed=[11, 12])
-    first = load_actor(source).act({k: v[:1] for k, v in observations.items()})  # type: ignore[union-attr]
+    first = load_actor(source).act({k: v[:1] for k, v in observations.items()})
     env.reset(seed=11)
     env.step(first)
     world: Any = env.unwrapped

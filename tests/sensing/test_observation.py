@@ -23,9 +23,9 @@ from maniskill_tomato.sensing.observation import (
     WORKSPACE_HALF_SIZE,
     WORKSPACE_MIDDLE,
     ObservationLayout,
-    Part,
     ViewpointObserver,
 )
+from maniskill_tomato.sensing.perception_kinds import Part
 from maniskill_tomato.sensing.view_lattice import ViewLattice
 
 RAYS = RAYS_PER_SIDE**2

@@ -3,6 +3,7 @@
 import copy
 from collections.abc import Iterable
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -385,7 +386,7 @@ def update(
 
 def _augmented(config: TrainConfig, batch: Batch, generator: torch.Generator | None) -> Batch:
     """The batch with randomly shifted images, those before and after a step apart."""
-    changed: dict[str, Observation] = {}
+    changed: dict[str, Any] = {}
     for name in ("observations", "next_observations"):
         observations: Observation = getattr(batch, name)
         if not isinstance(observations, Tensor):

@@ -10,7 +10,6 @@ from torch import Tensor
 
 from maniskill_tomato.errors import InvalidInputError
 from maniskill_tomato.learning.rl.env_state import set_shell_state, shell_state
-from maniskill_tomato.sensing.image_observation import Observation
 from maniskill_tomato.sensing.perception_kinds import RENDERED
 from maniskill_tomato.tasks import TASK_IDS
 from maniskill_tomato.tasks.making import MAX_STEPS, option_names
@@ -37,11 +36,11 @@ class LearnerEnv(Protocol):
         """Space of one environment's action."""
         ...
 
-    def reset(self, *, seed: int | list[int] | None = None) -> tuple[Observation, dict[str, Any]]:
+    def reset(self, *, seed: int | list[int] | None = None) -> tuple[Any, dict[str, Any]]:
         """Starts an episode everywhere."""
         ...
 
-    def step(self, actions: Tensor) -> tuple[Observation, Tensor, Tensor, Tensor, dict[str, Any]]:
+    def step(self, actions: Tensor) -> tuple[Any, Tensor, Tensor, Tensor, dict[str, Any]]:
         """Observation, rewards, terminations, truncations, info; `num_envs` rows each."""
         ...
 
@@ -152,7 +151,7 @@ class SimulatedVectorEnv(gym.Env[Any, Any]):
         self._env = env
         self.spec = env.spec
         self.auto_reset = auto_reset
-        self.base_env: Any = env.unwrapped
+        self.base_env = cast(Any, env.unwrapped)
         """ManiSkill's environment."""
         self._observed = ObservedWorld(self.base_env.world, eyes)
         self.num_envs = int(self.base_env.num_envs)
@@ -170,7 +169,7 @@ class SimulatedVectorEnv(gym.Env[Any, Any]):
 
     def reset(
         self, *, seed: int | list[int] | None = None, options: dict[str, Any] | None = None
-    ) -> tuple[Observation, dict[str, Any]]:
+    ) -> tuple[Any, dict[str, Any]]:
         """Begins episodes; the option `env_idx` says where, everywhere if it is missing."""
         rows = self.base_env.world.env_rows((options or {}).get("env_idx"))
         _, info = self._env.reset(seed=seed, options=options)  # type: ignore[arg-type]
@@ -179,7 +178,7 @@ class SimulatedVectorEnv(gym.Env[Any, Any]):
 
     def step(  # type: ignore[override]
         self, actions: Tensor
-    ) -> tuple[Observation, Tensor, Tensor, Tensor, dict[str, Any]]:
+    ) -> tuple[Any, Tensor, Tensor, Tensor, dict[str, Any]]:
         """Makes a move in every environment; see `VectorEnv.step`."""
         _, reward, terminated, _, info = self._env.step(actions)
         self._elapsed += 1

@@ -255,7 +255,7 @@ def _add_encoder(graph: "_Graph", encoder: ImageEncoder, sight: Sight) -> str:
             else:
                 x = graph.add("Div", x, depth_scale=torch.tensor(DEPTH_SCALE_MM))
                 x = graph.add("Min", x, depth_farthest=torch.tensor(FARTHEST))
-            x = graph.add("Sub", x, **{f"{kind}_one": torch.ones(())})
+            x = graph.node("Sub", [x, graph.constant(f"{kind}_one", torch.ones(()))])
         planes.append(x)
     x = graph.join(planes, axis=1)
     for index, layer in enumerate(layer for layer in encoder.convolutions if isinstance(layer, nn.Conv2d)):
@@ -423,8 +423,8 @@ def _encoder_errors(
             weight, bias, stride = layer.weight.double(), layer.bias.double(), layer.stride
             products = weight[0].numel()
             spread = variance + products * (unit * x).square()
-            variance = conv(spread, weight.square(), (unit * bias).square(), stride)  # type: ignore[arg-type]
-            x = conv(x, weight, bias, stride).relu()  # type: ignore[arg-type]
+            variance = conv(spread, weight.square(), (unit * bias).square(), stride)
+            x = conv(x, weight, bias, stride).relu()
         x, variance = x.flatten(1), variance.flatten(1)
         weight, bias = encoder.trunk.weight.double(), encoder.trunk.bias.double()
         variance = (variance + weight.shape[1] * (unit * x).square()) @ weight.square().T

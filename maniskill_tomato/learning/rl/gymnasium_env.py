@@ -1,7 +1,7 @@
 """A task as a plain Gymnasium environment of NumPy arrays, for learners from outside this package."""
 
 from collections.abc import Sequence
-from typing import Any, Literal, SupportsFloat
+from typing import Any, Literal, SupportsFloat, cast
 
 import gymnasium as gym
 import numpy as np
@@ -43,7 +43,7 @@ class ArrayTask(gym.Env[Any, Array]):
         Args:
             env: With one environment that does not reset itself.
         """
-        self._env: Any = env
+        self._env = cast(Any, env)
         self.spec = None  # `gymnasium.make` makes another class of the same id.
         self.observation_space = self._env.single_observation_space
         self.action_space = self._env.single_action_space

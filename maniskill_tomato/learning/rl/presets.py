@@ -150,7 +150,7 @@ _SINGLE_CRITIC: dict[str, Any] = {"twin_critics": False, "policy_frequency": 1, 
 
 _PIXEL_TD3 = dataclasses.replace(_TD3, **_PIXELS)
 _GENERAL_PIXEL_TD3 = dataclasses.replace(
-    _GENERAL_TD3, **_PIXELS, total_timesteps=25_000, exploration_steps=15_000
+    _GENERAL_TD3, **_PIXELS, total_timesteps=15_000, exploration_steps=10_000
 )
 
 PRESETS: dict[PresetName, TrainConfig] = {

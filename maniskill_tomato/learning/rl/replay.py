@@ -11,19 +11,18 @@ from torch import Tensor
 
 from maniskill_tomato.errors import InvalidInputError
 from maniskill_tomato.learning.rl.observations import columns_of
-from maniskill_tomato.sensing.image_observation import Observation
 
 
 class Batch(NamedTuple):
     """Transitions (s, a, r, s', done), one per row."""
 
-    observations: Observation
+    observations: Any
     """Shape (B, observation_dim), or a dictionary with images."""
     actions: Tensor
     """In units of the action scale. Shape (B, action_dim)."""
     rewards: Tensor
     """Shape (B,)."""
-    next_observations: Observation
+    next_observations: Any
     """What was seen after the action, before any reset; as `observations`."""
     terminations: Tensor
     """1.0 where the episode ended for good, 0.0 where it went on or only ran out of time. Shape (B,)."""

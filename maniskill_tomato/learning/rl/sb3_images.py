@@ -7,6 +7,7 @@ from torch import Tensor
 from maniskill_tomato.errors import InvalidInputError, MissingPackageError
 from maniskill_tomato.policies.image_encoder import ImageEncoder
 from maniskill_tomato.sensing.image_observation import CHANNELS, STATE, ImageLayout
+from maniskill_tomato.sensing.perception_kinds import ImageKind
 
 try:
     from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
@@ -14,7 +15,7 @@ except ImportError as error:
     raise MissingPackageError.extra("stable-baselines3", "sb3") from error
 
 
-class ImageFeatures(BaseFeaturesExtractor):
+class ImageFeatures(BaseFeaturesExtractor):  # type: ignore[misc]
     """State and features of the images, for the `MultiInputPolicy` of any of its algorithms.
 
     Give `policy_kwargs={"features_extractor_class": ImageFeatures, "normalize_images": False}`: the encoder scales
@@ -32,7 +33,7 @@ class ImageFeatures(BaseFeaturesExtractor):
             InvalidInputError: It is another space.
         """
         spaces = observation_space.spaces if isinstance(observation_space, gym.spaces.Dict) else {}
-        kinds = tuple(kind for kind in CHANNELS if kind in spaces)
+        kinds: tuple[ImageKind, ...] = tuple(kind for kind in CHANNELS if kind in spaces)
         if STATE not in spaces or not kinds:
             raise InvalidInputError(
                 f"ImageFeatures needs a dictionary of state and images, such as make_gymnasium_env(..., "
@@ -54,9 +55,9 @@ class ImageFeatures(BaseFeaturesExtractor):
             images[kind] = image.permute(0, 2, 3, 1) if image.shape[1:] != self._shape(kind) else image
         return torch.cat((observations[STATE], self.encoder(images)), dim=-1)
 
-    def _shape(self, kind: str) -> tuple[int, ...]:
+    def _shape(self, kind: ImageKind) -> tuple[int, ...]:
         layout = self.encoder.layout
-        return (layout.height, layout.width, CHANNELS[kind] * self.encoder.frames)  # type: ignore[index]
+        return (layout.height, layout.width, CHANNELS[kind] * self.encoder.frames)
 
 
 def _rows_first(shape: tuple[int, ...]) -> tuple[int, ...]:
