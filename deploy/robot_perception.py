@@ -12,7 +12,8 @@ import torch
 from maniskill_tomato.deploy.deploy_errors import PerceptionError, ProfileError
 from maniskill_tomato.deploy.interface import Float64, Frame, FrameTruth
 from maniskill_tomato.errors import TomatoError
-from maniskill_tomato.raycast.images import ROBOT_LABEL, Role
+from maniskill_tomato.plants.organs import Role
+from maniskill_tomato.raycast.images import ROBOT_LABEL
 from maniskill_tomato.raycast.view_rays import ViewRays
 from maniskill_tomato.robot.arm_model import ArmModel
 from maniskill_tomato.robot.d435 import CameraIntrinsics
@@ -27,7 +28,8 @@ from maniskill_tomato.sensing.belief import Belief
 from maniskill_tomato.sensing.camera_perception import CameraPerception
 from maniskill_tomato.sensing.fruit_detector import FruitDetector
 from maniskill_tomato.sensing.fruit_map import FruitMap
-from maniskill_tomato.sensing.image_observation import ImageLayout, ImageSource, picture_images
+from maniskill_tomato.sensing.image_layout import ImageLayout
+from maniskill_tomato.sensing.image_observation import ImageSource, picture_images
 from maniskill_tomato.sensing.inspection import STALE_AFTER
 from maniskill_tomato.sensing.measurement import RIPE_CATEGORIES
 from maniskill_tomato.sensing.observation import ObservationLayout, ViewpointObserver

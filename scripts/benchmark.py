@@ -42,7 +42,7 @@ from maniskill_tomato.segmentation.light_segmenter import FruitSession
 from maniskill_tomato.segmentation.segmenter import make_segmenter
 from maniskill_tomato.sensing.camera_perception import CameraPerception
 from maniskill_tomato.sensing.fruit_detector import FruitDetector
-from maniskill_tomato.sensing.image_observation import ImageLayout
+from maniskill_tomato.sensing.image_layout import ImageLayout
 from maniskill_tomato.sensing.posed_frame import PosedFrame
 from maniskill_tomato.tasks.making import make_world
 

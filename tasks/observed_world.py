@@ -9,7 +9,8 @@ import torch
 from torch import Tensor
 
 from maniskill_tomato.errors import InvalidInputError
-from maniskill_tomato.sensing.image_observation import PRIVILEGED, STATE, FrameStack, Observation, Sight
+from maniskill_tomato.sensing.image_layout import Sight
+from maniskill_tomato.sensing.image_observation import PRIVILEGED, STATE, FrameStack, Observation
 from maniskill_tomato.sensing.observation import ObservationLayout
 from maniskill_tomato.tasks.world import World
 

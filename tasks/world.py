@@ -24,7 +24,8 @@ from maniskill_tomato.robot.robot_description import link_meshes
 from maniskill_tomato.robot.viewpoint_move import viewpoint_of
 from maniskill_tomato.sensing.belief import Belief
 from maniskill_tomato.sensing.camera_perception import CameraPerception
-from maniskill_tomato.sensing.image_observation import ImageLayout, cast_images
+from maniskill_tomato.sensing.image_layout import ImageLayout
+from maniskill_tomato.sensing.image_observation import cast_images
 from maniskill_tomato.tasks.arm_moves import ACTION_SIZES, ArmMoves, Plan
 from maniskill_tomato.tasks.ground_truth import WorldTruth
 from maniskill_tomato.tasks.numpy_streams import (

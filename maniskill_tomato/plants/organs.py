@@ -4,11 +4,11 @@ Plant frame: origin where the stem leaves the ground, z up, metres, right-handed
 robot stands at -x.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from enum import IntEnum
 from functools import cached_property
-from typing import Literal
+from typing import Final, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -33,6 +33,35 @@ class SemanticClass(IntEnum):
     ROBOT = 6
     OBJECT = 7
     """Things that are neither plant nor robot."""
+
+
+class Role(IntEnum):
+    """What a pixel shows, as far as a search for one fruit is concerned; the same numbers for every plant."""
+
+    BACKGROUND = 0
+    """Neither plant nor robot."""
+    ROBOT = 1
+    STEM = 2
+    LEAF = 3
+    OTHER_FRUIT = 4
+    """A fruit that is not the target."""
+    TARGET = 5
+    """The target fruit."""
+    OBJECT = 6
+    """A thing between the plants, such as a string or a board."""
+
+
+ROLE_OF_CLASS: Final[Mapping[SemanticClass, Role]] = {
+    SemanticClass.BACKGROUND: Role.BACKGROUND,
+    SemanticClass.STEM: Role.STEM,
+    SemanticClass.LEAF: Role.LEAF,
+    SemanticClass.FRUIT_RIPE: Role.OTHER_FRUIT,
+    SemanticClass.FRUIT_TURNING: Role.OTHER_FRUIT,
+    SemanticClass.FRUIT_GREEN: Role.OTHER_FRUIT,
+    SemanticClass.ROBOT: Role.ROBOT,
+    SemanticClass.OBJECT: Role.OBJECT,
+}
+"""The role of every class, of a fruit as one that is not the target."""
 
 
 @dataclass(frozen=True, eq=False)

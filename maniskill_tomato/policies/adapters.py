@@ -10,7 +10,8 @@ from maniskill_tomato.errors import PolicyError
 from maniskill_tomato.policies.pixel_policy import PixelFollower, PixelPolicy
 from maniskill_tomato.policies.protocol import Planner, Policy, StatePolicy, reseed
 from maniskill_tomato.sensing.belief import Belief
-from maniskill_tomato.sensing.image_observation import Observation, Sight, images_of, state_of
+from maniskill_tomato.sensing.image_layout import Sight
+from maniskill_tomato.sensing.image_observation import Observation, images_of, state_of
 
 if TYPE_CHECKING:
     from maniskill_tomato.policies.onnx_policy import OnnxPolicy

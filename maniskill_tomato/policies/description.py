@@ -7,9 +7,9 @@ from typing import Any, Final
 
 import maniskill_tomato
 from maniskill_tomato.errors import PolicyError
+from maniskill_tomato.plants.organs import Role
 from maniskill_tomato.policies.layout import layout_of
-from maniskill_tomato.raycast.images import Role
-from maniskill_tomato.sensing.image_observation import ImageLayout, Sight
+from maniskill_tomato.sensing.image_layout import ImageLayout, Sight
 from maniskill_tomato.text_files import parse_json
 
 FORMAT = 2

@@ -6,8 +6,8 @@ from typing import Final
 import torch
 from torch import Tensor, nn
 
-from maniskill_tomato.raycast.images import Role
-from maniskill_tomato.sensing.image_observation import CHANNELS, ImageLayout
+from maniskill_tomato.plants.organs import Role
+from maniskill_tomato.sensing.image_layout import CHANNELS, ImageLayout
 from maniskill_tomato.sensing.perception_kinds import ImageKind
 
 DEPTH_SCALE_MM: Final = 1000.0

@@ -4,7 +4,7 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from maniskill_tomato.sensing.image_observation import Sight
+    from maniskill_tomato.sensing.image_layout import Sight
 
 OBSERVATION_NAMES = (
     "ee_x",

@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from maniskill_tomato.errors import InvalidInputError, PolicyError
 from maniskill_tomato.policies.description import IMAGE_MEANINGS, INPUT_NAME, OUTPUT_NAME, PolicyDescription
-from maniskill_tomato.sensing.image_observation import check_images
+from maniskill_tomato.sensing.image_layout import check_images
 
 _EXPORT_AGAIN = "run `maniskill-tomato export` again"
 

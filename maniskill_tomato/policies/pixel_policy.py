@@ -8,7 +8,8 @@ from torch import Tensor
 from maniskill_tomato.errors import PolicyError
 from maniskill_tomato.policies.protocol import Planner
 from maniskill_tomato.sensing.belief import Belief
-from maniskill_tomato.sensing.image_observation import STATE, FrameStack, Observation, Sight
+from maniskill_tomato.sensing.image_layout import Sight
+from maniskill_tomato.sensing.image_observation import STATE, FrameStack, Observation
 
 
 class SeeingActor(Protocol):

@@ -14,14 +14,8 @@ from maniskill_tomato.files import read_tensors
 from maniskill_tomato.network_weights import check_weight, fill_network
 from maniskill_tomato.policies.actor import Actor, ObservationNormalizer
 from maniskill_tomato.policies.image_encoder import ImageEncoder
-from maniskill_tomato.sensing.image_observation import (
-    ImageLayout,
-    Observation,
-    Sight,
-    check_images,
-    images_of,
-    state_of,
-)
+from maniskill_tomato.sensing.image_layout import ImageLayout, Sight, check_images
+from maniskill_tomato.sensing.image_observation import Observation, images_of, state_of
 from maniskill_tomato.sensing.perception_kinds import STATE_MODE
 
 FORMAT = 1

@@ -1,15 +1,11 @@
 """Images by ray casting: what each pixel of a camera shows, without a renderer."""
 
-from collections.abc import Mapping
 from dataclasses import dataclass
-from enum import IntEnum
 from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 from torch import Tensor
-
-from maniskill_tomato.plants.organs import SemanticClass
 
 BACKGROUND_DEPTH: Final = 4.0
 """Depth of a pixel of `CastImages` that shows neither plant nor robot, in [m]: a greenhouse always has a wall."""
@@ -20,35 +16,6 @@ ROBOT_LABEL: Final = 1
 """Label of the robot in a `Picture`."""
 FIRST_ORGAN_LABEL: Final = 2
 """Label of the plant's organ 0 in a `Picture`; organ k has this plus k."""
-
-
-class Role(IntEnum):
-    """What a pixel shows, as far as a search for one fruit is concerned; the same numbers for every plant."""
-
-    BACKGROUND = 0
-    """Neither plant nor robot."""
-    ROBOT = 1
-    STEM = 2
-    LEAF = 3
-    OTHER_FRUIT = 4
-    """A fruit that is not the target."""
-    TARGET = 5
-    """The target fruit."""
-    OBJECT = 6
-    """A thing between the plants, such as a string or a board."""
-
-
-ROLE_OF_CLASS: Final[Mapping[SemanticClass, Role]] = {
-    SemanticClass.BACKGROUND: Role.BACKGROUND,
-    SemanticClass.STEM: Role.STEM,
-    SemanticClass.LEAF: Role.LEAF,
-    SemanticClass.FRUIT_RIPE: Role.OTHER_FRUIT,
-    SemanticClass.FRUIT_TURNING: Role.OTHER_FRUIT,
-    SemanticClass.FRUIT_GREEN: Role.OTHER_FRUIT,
-    SemanticClass.ROBOT: Role.ROBOT,
-    SemanticClass.OBJECT: Role.OBJECT,
-}
-"""The role of every class, of a fruit as one that is not the target."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -9,9 +9,8 @@ import warp as wp
 from numpy.typing import NDArray
 
 from maniskill_tomato.errors import InvalidInputError
-from maniskill_tomato.plants.organs import Plant
+from maniskill_tomato.plants.organs import ROLE_OF_CLASS, Plant
 from maniskill_tomato.plants.plant_store import PLANT_STORE
-from maniskill_tomato.raycast.images import ROLE_OF_CLASS
 from maniskill_tomato.robot.iiwa14 import LINK_NAMES
 
 BYTES_OF_A_FACE: Final = 90

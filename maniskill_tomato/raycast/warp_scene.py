@@ -17,7 +17,7 @@ import warp as wp
 from numpy.typing import NDArray
 from torch import Tensor
 
-from maniskill_tomato.plants.organs import Plant
+from maniskill_tomato.plants.organs import Plant, Role
 from maniskill_tomato.raycast import (
     clearance_kernels,
     image_kernels,
@@ -32,7 +32,6 @@ from maniskill_tomato.raycast.images import (
     ROBOT_LABEL,
     CastImages,
     Picture,
-    Role,
 )
 from maniskill_tomato.raycast.view_rays import NEAREST_DEPTH, RANGE, RAYS_PER_SIDE, ViewRays, ray_pattern
 from maniskill_tomato.raycast.visibility import Visibility, ray_lattice

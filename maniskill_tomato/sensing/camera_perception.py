@@ -18,7 +18,8 @@ from maniskill_tomato.segmentation.masks import BinaryMask
 from maniskill_tomato.sensing.axis_search import AxisSearch
 from maniskill_tomato.sensing.fruit_detector import FruitDetector
 from maniskill_tomato.sensing.fruit_map import Fraction, FruitMap, MapConfig, MappedView, Track
-from maniskill_tomato.sensing.image_observation import ImageLayout, measured_images
+from maniskill_tomato.sensing.image_layout import ImageLayout
+from maniskill_tomato.sensing.image_observation import measured_images
 from maniskill_tomato.sensing.inspection import LEAST_GAIN
 from maniskill_tomato.sensing.measurement import Measurement, Position
 from maniskill_tomato.sensing.observation import ViewpointObserver

@@ -33,7 +33,7 @@ Part = Literal["viewpoint", "pose", "target", "visible_fraction", "time", "patch
 """Parts of the general tasks' observation; see `sensing.observation.ObservationLayout`."""
 
 ImageKind = Literal["rgb", "depth", "segmentation"]
-"""What an image of an observation tells of every pixel; see `sensing.image_observation.ImageLayout`."""
+"""What an image of an observation tells of every pixel; see `sensing.image_layout.ImageLayout`."""
 
 STATE_MODE: Final = "state"
 """The observation mode without images."""

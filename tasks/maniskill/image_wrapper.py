@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from maniskill_tomato.errors import InvalidInputError
-from maniskill_tomato.raycast.images import ROLE_OF_CLASS, Role
+from maniskill_tomato.plants.organs import ROLE_OF_CLASS, Role
 from maniskill_tomato.sensing.image_observation import STATE
 
 CAMERA = "d435"
@@ -23,7 +23,7 @@ class FlattenImageObservationWrapper(gym.ObservationWrapper[Any, Any, Any]):
 
     - `state` (N, D): all numbers of the agent and of the task, as ManiSkill orders them.
     - `rgb` (N, H, W, 3), uint8; `depth` (N, H, W, 1), int16, in [mm]; both as rendered.
-    - `segmentation` (N, H, W, 1), uint8: values of `raycast.images.Role`.
+    - `segmentation` (N, H, W, 1), uint8: values of `plants.organs.Role`.
     """
 
     def __init__(self, env: gym.Env[Any, Any]) -> None:

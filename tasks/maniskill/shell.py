@@ -19,7 +19,7 @@ from maniskill_tomato.plants.episode_list import Episode
 from maniskill_tomato.plants.organs import SemanticClass
 from maniskill_tomato.robot.d435 import CameraIntrinsics
 from maniskill_tomato.sensing.belief import Belief
-from maniskill_tomato.sensing.image_observation import ImageLayout
+from maniskill_tomato.sensing.image_layout import ImageLayout
 from maniskill_tomato.sensing.observation import ObservationLayout
 from maniskill_tomato.sensing.simulated_camera import RENDERED_SIZE
 from maniskill_tomato.tasks.arm_moves import Plan

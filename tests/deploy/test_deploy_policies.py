@@ -26,9 +26,9 @@ from maniskill_tomato.learning.rl.agent import make_agent
 from maniskill_tomato.learning.rl.checkpoint import make_checkpoint
 from maniskill_tomato.learning.rl.export import export_policy
 from maniskill_tomato.learning.rl.presets import get_preset
+from maniskill_tomato.plants.organs import Role
 from maniskill_tomato.policies.opening import open_policy
-from maniskill_tomato.raycast.images import Role
-from maniskill_tomato.sensing.image_observation import ImageLayout
+from maniskill_tomato.sensing.image_layout import ImageLayout
 from maniskill_tomato.sensing.observation import ObservationLayout
 
 TASK = "TomatoViewpoint-v1"

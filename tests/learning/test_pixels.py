@@ -27,12 +27,13 @@ from maniskill_tomato.learning.rl.presets import TrainConfig, default_preset, ge
 from maniskill_tomato.learning.rl.random_shift import shifted
 from maniskill_tomato.learning.rl.replay import Batch, ReplayBuffer
 from maniskill_tomato.learning.rl.trainer import make_training_env, train
+from maniskill_tomato.plants.organs import Role
 from maniskill_tomato.policies.image_encoder import ImageEncoder
 from maniskill_tomato.policies.onnx_policy import OnnxPolicy
 from maniskill_tomato.policies.opening import needs_colours, open_policy
 from maniskill_tomato.policies.trained_actor import load_actor, load_checkpoint
-from maniskill_tomato.raycast.images import Role
-from maniskill_tomato.sensing.image_observation import FrameStack, ImageLayout
+from maniskill_tomato.sensing.image_layout import ImageLayout
+from maniskill_tomato.sensing.image_observation import FrameStack
 from maniskill_tomato.tasks import TASK_IDS
 from maniskill_tomato.tasks.making import make_world
 

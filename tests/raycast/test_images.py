@@ -7,7 +7,8 @@ import trimesh
 
 from maniskill_tomato.errors import InvalidInputError
 from maniskill_tomato.plants.generator import generate_plant
-from maniskill_tomato.raycast.images import BACKGROUND_DEPTH, FIRST_ORGAN_LABEL, ROBOT_LABEL, Role
+from maniskill_tomato.plants.organs import Role
+from maniskill_tomato.raycast.images import BACKGROUND_DEPTH, FIRST_ORGAN_LABEL, ROBOT_LABEL
 from maniskill_tomato.raycast.scene import RayScene
 from maniskill_tomato.raycast.view_rays import RayLabel
 from maniskill_tomato.robot.d435 import CameraIntrinsics

@@ -9,7 +9,7 @@ import torch
 
 import maniskill_tomato  # noqa: F401
 from maniskill_tomato.errors import InvalidInputError
-from maniskill_tomato.raycast.images import Role
+from maniskill_tomato.plants.organs import Role
 from maniskill_tomato.robot.d435 import color_intrinsics
 from maniskill_tomato.robot.kinematics import link_transforms
 from maniskill_tomato.segmentation.instances import Instances

@@ -17,13 +17,8 @@ from maniskill_tomato.learning.rl.replay import Batch
 from maniskill_tomato.policies.actor import Actor, ObservationNormalizer
 from maniskill_tomato.policies.image_encoder import ImageEncoder
 from maniskill_tomato.policies.trained_actor import TrainedActor
-from maniskill_tomato.sensing.image_observation import (
-    PRIVILEGED,
-    ImageLayout,
-    Observation,
-    images_of,
-    state_of,
-)
+from maniskill_tomato.sensing.image_layout import ImageLayout
+from maniskill_tomato.sensing.image_observation import PRIVILEGED, Observation, images_of, state_of
 
 SMALLEST_SPREAD = 0.05
 """Observed values whose standard deviation is below this, in [m] or [rad], are scaled by this instead: what never

@@ -25,6 +25,7 @@ import maniskill_tomato
 from maniskill_tomato.errors import InvalidInputError, PolicyError
 from maniskill_tomato.files import write_atomically
 from maniskill_tomato.learning.rl.train_config import TrainConfig
+from maniskill_tomato.plants.organs import Role
 from maniskill_tomato.policies.actor import ObservationNormalizer
 from maniskill_tomato.policies.description import (
     INPUT_NAME,
@@ -38,8 +39,8 @@ from maniskill_tomato.policies.image_encoder import DEPTH_SCALE_MM, FARTHEST, Im
 from maniskill_tomato.policies.layout import layout_of
 from maniskill_tomato.policies.onnx_policy import OnnxPolicy, description_path
 from maniskill_tomato.policies.trained_actor import load_actor, load_checkpoint, sight_of
-from maniskill_tomato.raycast.images import Role
-from maniskill_tomato.sensing.image_observation import STATE, Sight
+from maniskill_tomato.sensing.image_layout import Sight
+from maniskill_tomato.sensing.image_observation import STATE
 from maniskill_tomato.tasks import THESIS_IDS
 from maniskill_tomato.tasks.thesis.thesis_config import ViewpointTaskConfig, guided_task, sparse_task
 

@@ -17,7 +17,8 @@ from maniskill_tomato.learning.rl.presets import (
     get_preset,
 )
 from maniskill_tomato.learning.rl.rewards import potential_reward
-from maniskill_tomato.sensing.image_observation import STATE, ImageLayout
+from maniskill_tomato.sensing.image_layout import ImageLayout
+from maniskill_tomato.sensing.image_observation import STATE
 from maniskill_tomato.sensing.perception_kinds import STATE_MODE
 from maniskill_tomato.tasks.observed_world import LearnerEyes
 
@@ -190,7 +191,7 @@ def make_gymnasium_env(
         reward: Which reward to learn from; the potential one for the thesis's tasks, the task's for the others if None.
         gamma: Discount factor of the learner; only the potential reward uses it.
         step_cost: What each step costs with the potential reward.
-        obs_mode: `state`, or images beside it: see `sensing.image_observation.ImageLayout.parse`.
+        obs_mode: `state`, or images beside it: see `sensing.image_layout.ImageLayout.parse`.
         image_size: Their width and height, in [px].
         options: For `gymnasium.make`, for instance `plant=`.
 

@@ -10,7 +10,8 @@ from torch import Tensor
 
 from maniskill_tomato.errors import InvalidInputError
 from maniskill_tomato.learning.rl.train_config import TrainConfig
-from maniskill_tomato.sensing.image_observation import STATE, ImageLayout, Observation, state_of
+from maniskill_tomato.sensing.image_layout import ImageLayout
+from maniskill_tomato.sensing.image_observation import STATE, Observation, state_of
 from maniskill_tomato.tasks.observed_world import LearnerEyes
 
 

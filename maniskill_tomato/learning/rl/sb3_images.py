@@ -6,7 +6,8 @@ from torch import Tensor
 
 from maniskill_tomato.errors import InvalidInputError, MissingPackageError
 from maniskill_tomato.policies.image_encoder import ImageEncoder
-from maniskill_tomato.sensing.image_observation import CHANNELS, STATE, ImageLayout
+from maniskill_tomato.sensing.image_layout import CHANNELS, ImageLayout
+from maniskill_tomato.sensing.image_observation import STATE
 from maniskill_tomato.sensing.perception_kinds import ImageKind
 
 try:

@@ -268,7 +268,7 @@ class TrainConfig:
                     )
             return
         # These take a second to import, and most configurations observe no images.
-        from maniskill_tomato.sensing.image_observation import ImageLayout
+        from maniskill_tomato.sensing.image_layout import ImageLayout
         from maniskill_tomato.sensing.observation import ObservationLayout
 
         if len(self.image_size) != 2:
