@@ -373,7 +373,7 @@ def test_the_command_trains_evaluates_and_exports_with_the_pixel_preset(
     )
     metrics = json.loads((tmp_path / "eval" / "metrics.json").read_text())
     assert metrics["policy"]["kind"] == "TD3"
-    cli.main(["export", policy, "--out", str(tmp_path / "exported")])
+    cli.main(["export", "--policy", policy, "--out", str(tmp_path / "exported")])
     assert (tmp_path / "exported" / "policy.onnx").is_file()
     capsys.readouterr()
 
