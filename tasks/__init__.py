@@ -4,6 +4,8 @@ Importing this module is cheap: every spec names its environment by a string, so
 load only when `gymnasium.make` builds one.
 """
 
+from typing import Literal
+
 from gymnasium.envs.registration import WrapperSpec, register, registry
 
 from maniskill_tomato.policies.layout import GENERAL_IDS as GENERAL_IDS
@@ -27,6 +29,10 @@ THESIS_IDS = ("TomatoViewpointGuided-v1", "TomatoViewpointSparse-v1")
 """The thesis's tasks: nine observed numbers, six increments."""
 
 TASK_IDS = (*THESIS_IDS, *GENERAL_IDS)
+
+Scene = Literal["hidden", "thesis"]
+"""Plant, pose and camera of the thesis's tasks: a plant that leaves hide from every start, seen by the D435 as it is;
+or the scene in which the thesis's numbers hold, seen by the D435 of its Gazebo."""
 
 
 def _register(env_id: str, entry_point: str, max_episode_steps: int) -> None:

@@ -10,19 +10,19 @@ import torch
 from maniskill_tomato.errors import InvalidInputError
 from maniskill_tomato.plants.episode_list import Episode, listed_plant
 from maniskill_tomato.plants.spec import PlantPose, PlantSpec
-from maniskill_tomato.robot.d435 import CameraIntrinsics, color_intrinsics
+from maniskill_tomato.robot.d435 import Calibration, CameraIntrinsics, color_intrinsics
 from maniskill_tomato.robot.viewpoint_move import OutsideWorkspace
 from maniskill_tomato.sensing.observation import ObservationLayout
 from maniskill_tomato.sensing.perception_kinds import RENDERED, Perception
 from maniskill_tomato.sensing.sensor_noise import SensorNoise
-from maniskill_tomato.tasks import MAX_EPISODE_STEPS, MAX_GENERAL_STEPS, MAX_ROW_STEPS, TASK_IDS
+from maniskill_tomato.tasks import MAX_EPISODE_STEPS, MAX_GENERAL_STEPS, MAX_ROW_STEPS, TASK_IDS, Scene
 from maniskill_tomato.tasks.arm_moves import ArmMoves, Control
 from maniskill_tomato.tasks.row.episode_selection import EpisodeChoice
 from maniskill_tomato.tasks.row.row_config import GeneralTaskConfig
 from maniskill_tomato.tasks.row.search_game import SearchGame
 from maniskill_tomato.tasks.row.target_sequence import Transits
 from maniskill_tomato.tasks.senses import CameraConfig
-from maniskill_tomato.tasks.thesis.thesis_config import ViewpointTaskConfig, guided_task, sparse_task
+from maniskill_tomato.tasks.thesis.thesis_config import ViewpointTaskConfig, thesis_task
 from maniskill_tomato.tasks.thesis.thesis_game import ThesisGame
 from maniskill_tomato.tasks.world import Game, Pictures, TaskConfig, World
 
@@ -58,8 +58,10 @@ class WorldOptions:
 class ThesisOptions(WorldOptions):
     """Options of the thesis's tasks."""
 
+    scene: Scene = "hidden"
+    """Plant, pose and camera: `hidden` from every start, or the `thesis`'s, in which its numbers hold."""
     task: ViewpointTaskConfig
-    """Which."""
+    """Which, in the scene."""
     other_targets: int = 0
     """How many other ripe fruits are judged at every step as if each were the target."""
 
@@ -116,7 +118,12 @@ def make_options(env_id: str, **options: Any) -> ThesisOptions | SearchOptions:
         if name not in known:
             raise InvalidInputError.choice(f"an option of {env_id}", name, sorted(known))
     if kind is ThesisOptions:
-        options.setdefault("task", guided_task() if env_id == TASK_IDS[0] else sparse_task())
+        scene = options.get("scene", "hidden")
+        if "scene" in options and "task" in options:
+            raise InvalidInputError(
+                f"scene={scene!r} chooses the task's configuration; leave out scene= or task="
+            )
+        options.setdefault("task", thesis_task(env_id, scene))
     if options.get("task", True) is None:
         del options["task"]
     return kind(**options)
@@ -152,9 +159,11 @@ def default_control(env_id: str) -> Control:
     return "viewpoint" if env_id in TASK_IDS[:2] else "look_at"
 
 
-def wrist_intrinsics(width: int = IMAGE_SIZE[0], height: int = IMAGE_SIZE[1]) -> CameraIntrinsics:
+def wrist_intrinsics(
+    width: int = IMAGE_SIZE[0], height: int = IMAGE_SIZE[1], calibration: Calibration = "nominal"
+) -> CameraIntrinsics:
     """The wrist's colour camera at a size in [px]."""
-    fov_y = color_intrinsics(width, height).fov_y
+    fov_y = color_intrinsics(width, height, calibration).fov_y
     return CameraIntrinsics.from_fov(width=width, height=height, fov_y=fov_y)
 
 
@@ -176,6 +185,8 @@ class TaskSetup:
     """Whether a world needs a renderer."""
     follows_list: bool = False
     """Whether episodes come from a fixed list."""
+    calibration: Calibration = "nominal"
+    """Which numbers describe the wrist's colour camera unless somebody says otherwise."""
     neighbour_poses: bool = True
     """As for `ArmMoves`, like the next."""
     outside_workspace: OutsideWorkspace = "stay"
@@ -227,18 +238,19 @@ def make_world(
         num_envs: N.
         device: Where all tensors live.
         control: What an action is; the task's own if None.
-        intrinsics: Of the wrist's camera; the D435's colour camera at `IMAGE_SIZE` if None.
+        intrinsics: Of the wrist's camera; the task's at `IMAGE_SIZE` if None.
         pictures: A renderer, for perception that needs colours.
         options: `ThesisOptions`, `SearchOptions` or `RowOptions`.
 
     Raises:
         InvalidInputError: An option cannot be used.
     """
-    return make_setup(env_id, **options).build(
+    setup = make_setup(env_id, **options)
+    return setup.build(
         num_envs,
         device,
         control=control or default_control(env_id),
-        intrinsics=intrinsics or wrist_intrinsics(),
+        intrinsics=intrinsics or wrist_intrinsics(calibration=setup.calibration),
         pictures=pictures,
     )
 
@@ -267,6 +279,7 @@ def _thesis_setup(options: ThesisOptions) -> TaskSetup:
     return TaskSetup(
         make_game=lambda world: ThesisGame(world, task, others, options.perception, camera),
         needs_pictures=options.perception in RENDERED,
+        calibration=task.calibration,
         neighbour_poses=task.neighbour_poses,
         outside_workspace="home" if task.outside_workspace == "home" else "stay",
         **_standing(options, task, options.plant, (0.0, 0.0, 0.0)),
@@ -333,7 +346,7 @@ def _camera_config(options: WorldOptions) -> CameraConfig:
             f"{named[0]} is for TomatoViewpoint-v1; in a row a robot with a camera chooses its targets itself"
         )
     if isinstance(options, ThesisOptions):
-        given["target"] = "any"
+        given |= {"target": "any", "calibration": options.task.calibration}
     config = CameraConfig(**given)
     if "map_noise" in given and config.target != "map":
         raise InvalidInputError(f"map_noise goes with target='map'; got target={config.target!r}")

@@ -15,6 +15,7 @@ from torch import Tensor
 
 from maniskill_tomato.errors import InvalidInputError
 from maniskill_tomato.raycast.view_rays import ViewRays
+from maniskill_tomato.robot.d435 import Calibration
 from maniskill_tomato.robot.kinematics import link_transforms
 from maniskill_tomato.sensing.camera_perception import CameraPerception
 from maniskill_tomato.sensing.fruit_map import NO_TRACK
@@ -260,6 +261,8 @@ class CameraConfig:
     """With `map`: standard deviation of each coordinate of the place that is given, in [m]."""
     association: Association = "map"
     """Who says which track a detection belongs to; `truth` to tell what identity costs."""
+    calibration: Calibration = "nominal"
+    """Of the colour camera where its images are cast, not rendered."""
 
     def __post_init__(self) -> None:
         for name, value, allowed in (
@@ -300,6 +303,7 @@ class CameraSenses:
             world.intrinsics,
             self._picture,
             true_association=config.association == "truth",
+            calibration=config.calibration,
         )
         assert made is not None
         self._world = world

@@ -11,7 +11,7 @@ import tyro
 from maniskill_tomato.errors import InvalidInputError, did_you_mean
 from maniskill_tomato.plants.seed_splits import SEED_SPLITS
 from maniskill_tomato.sensing.perception_kinds import RENDERED, Naming, Perception
-from maniskill_tomato.tasks import TASK_IDS, THESIS_IDS
+from maniskill_tomato.tasks import TASK_IDS, THESIS_IDS, Scene
 from maniskill_tomato.text_files import parse_json
 
 EnvId = Annotated[
@@ -23,6 +23,8 @@ EnvId = Annotated[
 class PlantOptions:
     """Another plant than the task's own."""
 
+    scene: Scene | None = None
+    """Of the thesis's tasks, plant, pose and camera: hidden from every start, or the thesis's."""
     plant: Literal["one_tomato", "three_tomatoes", "full", "varied", "other_kind"] | None = None
     """Preset of the plant."""
     mesh: Path | None = None
@@ -67,7 +69,9 @@ class PlantOptions:
             plant["seed"] = int(self.plant_seed) if self.plant_seed.isdigit() else self.plant_seed
         if self.plant_pool is not None:
             plant["pool"] = self.plant_pool
-        options: dict[str, Any] = {"plant": plant} if plant else {}
+        options: dict[str, Any] = {} if self.scene is None else {"scene": self.scene}
+        if plant:
+            options["plant"] = plant
         if self.plant_pose is not None:
             options["plant_pose"] = self.plant_pose
         if self.plant_pose_noise is not None:

@@ -13,7 +13,14 @@ from maniskill_tomato.cli.early_checks import check_counts, check_env_id, check_
 from maniskill_tomato.cli.shared_options import PlantOptions, merge_options
 from maniskill_tomato.errors import InvalidInputError, SeedsFailedError
 from maniskill_tomato.learning.rl.config_file import RunFile, parse_seeds, read_run_config, read_run_file
-from maniskill_tomato.learning.rl.presets import MAY_CHANGE, PRESETS, PresetName, TrainConfig, default_preset
+from maniskill_tomato.learning.rl.presets import (
+    MAY_CHANGE,
+    PRESETS,
+    PresetName,
+    TrainConfig,
+    default_preset,
+    preset_options,
+)
 from maniskill_tomato.tasks import TASK_IDS
 
 
@@ -79,6 +86,8 @@ class Train:
         if self.resume is not None:
             self._check_resume(run_file)
         env_options = merge_options(run_file.env_options, self.plants.env_options())
+        if run_file.package_version is None:  # The file of a run says all there is to say.
+            env_options = {**preset_options(self.preset, env_id), **env_options}
         seeds = parse_seeds(self.seeds)
         out = self.resume or self.out
         if out is None:

@@ -6,6 +6,7 @@ from typing import Any, Literal
 
 from maniskill_tomato.errors import InvalidInputError
 from maniskill_tomato.sensing.perception_kinds import Perception
+from maniskill_tomato.tasks import Scene
 
 ExperimentName = Literal["guided", "sparse"]
 
@@ -241,6 +242,8 @@ class ReproductionConfig:
 
     experiment: ExperimentName
     """guided: section 5-1; sparse: section 5-2."""
+    scene: Scene = "thesis"
+    """Plant, pose and camera: the thesis's, or hidden from every start."""
     seeds: tuple[int, ...] = (0, 1, 2, 3, 4)
     """Training seeds."""
     out: Path = Path("runs/thesis")

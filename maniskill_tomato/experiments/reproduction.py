@@ -1,7 +1,7 @@
 """The thesis's experiments over several seeds: trained, judged, drawn; finished parts are kept."""
 
 import logging
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -65,7 +65,7 @@ def run_reproduction(config: ReproductionConfig, report: Callable[[str], None] =
         StudyStoppedError: A signal ended a training.
         CheckpointError: Another process reproduces the experiment in the folder.
     """
-    experiment = experiments()[config.experiment]
+    experiment = experiments(config.scene)[config.experiment]
     with only_writer(config.out / experiment.name, "measures"):
         _run_reproduction(config, experiment, report)
 
@@ -89,7 +89,9 @@ def _run_reproduction(
                 bar.update()
         summaries = [results[seed] for seed in config.seeds]
         folder = trials[0].folder.parent
-        untrained = untrained_first_steps(experiment.env_id, trials[0].config, config.untrained)
+        untrained = untrained_first_steps(
+            experiment.env_id, trials[0].config, config.untrained, experiment.env_options
+        )
         write_json(folder / "untrained.json", untrained)
         write_json(folder / "summary.json", summaries)
         rows.append(_cells(variant.title, summaries, untrained))
@@ -186,6 +188,7 @@ def plan_trials(config: ReproductionConfig, experiment: Experiment, variant: Var
             folder=config.out / experiment.name / variant.name / f"seed-{seed}",
             evaluations=experiment.evaluations[:1] if config.ablate else experiment.evaluations,
             episodes=config.episodes,
+            env_options=experiment.env_options,
             show_progress=config.progress,
         )
         for seed in config.seeds
@@ -209,14 +212,22 @@ def _draw(
     return drawn
 
 
-def untrained_first_steps(env_id: str, config: TrainConfig, actors: int) -> dict[str, float]:
+def untrained_first_steps(
+    env_id: str, config: TrainConfig, actors: int, env_options: Mapping[str, Any] | None = None
+) -> dict[str, float]:
     """What freshly initialised actors do first: each of `actors` takes one step from a start of its own.
+
+    Args:
+        env_id: Id of the task.
+        config: How actors are initialised.
+        actors: How many.
+        env_options: Options of the task.
 
     Returns:
         `mean_move_m` (length of the position increment), `mean_output` and `saturated_output_share` of the
         actor, `unreachable_share` and `neighbour_share` of the poses asked for.
     """
-    env = make_env(env_id)
+    env = make_env(env_id, **(env_options or {}))
     outputs: list[Tensor] = []
     reached: list[int] = []
     scale = torch.tensor(config.action_scale)

@@ -31,7 +31,7 @@ from maniskill_tomato.report_design import CARD, INK, MUTED, TOMATO
 from maniskill_tomato.report_plots import PLOT_STYLE, label_ends, line_style, save_figure
 from maniskill_tomato.segmentation.datasets.picture_files import write_picture
 from maniskill_tomato.tasks.plant_batch import grow
-from maniskill_tomato.tasks.thesis.thesis_config import ViewpointTaskConfig, guided_task, sparse_task
+from maniskill_tomato.tasks.thesis.thesis_config import ViewpointTaskConfig, thesis_task
 
 THESIS_EPISODES = 6
 """Length of the thesis's evaluations, in episodes."""
@@ -232,4 +232,4 @@ def _thesis_marks(experiment: Experiment, unit: str) -> dict[str, float]:
 
 
 def _task(experiment: Experiment) -> ViewpointTaskConfig:
-    return guided_task() if experiment.name == "guided" else sparse_task()
+    return thesis_task(experiment.env_id, experiment.env_options.get("scene", "hidden"))

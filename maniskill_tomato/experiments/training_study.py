@@ -3,7 +3,7 @@
 import logging
 import time
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, cast
 
@@ -85,6 +85,8 @@ class Trial:
     """The first gives the run's metrics.json."""
     episodes: int
     """Of each evaluation."""
+    env_options: dict[str, Any] = field(default_factory=dict)
+    """Options of the task in the training; each evaluation has its own."""
     show_progress: bool = False
 
     def store(self) -> ResultStore:
@@ -93,7 +95,10 @@ class Trial:
         Raises:
             InvalidInputError: The folder holds a trial of other settings.
         """
-        return ResultStore(self.folder, {"env_id": self.env_id, "config": self.config.to_dict()})
+        facts = {"env_id": self.env_id, "config": self.config.to_dict()}
+        return ResultStore(
+            self.folder, {**facts, "env_options": self.env_options} if self.env_options else facts
+        )
 
     def records(self, evaluation: Evaluation) -> list[EpisodeRecord]:
         """The finished episodes of an evaluation."""
@@ -173,10 +178,18 @@ class Trial:
         """Trains, and gives the figures of the training."""
         clear_run(self.folder)
         logger.info("training %s on %s, seed %d", self.variant.name, self.env_id, self.seed)
-        counter = ReachCounter(make_training_env(self.env_id, self.config, {}))
+        counter = ReachCounter(make_training_env(self.env_id, self.config, self.env_options))
         env = cast(LearnerEnv, counter)
         try:
-            trainer = Trainer(env, self.env_id, self.config, self.folder, self.seed, self.show_progress)
+            trainer = Trainer(
+                env,
+                self.env_id,
+                self.config,
+                self.folder,
+                self.seed,
+                self.show_progress,
+                env_options=self.env_options,
+            )
             before = time.process_time()
             trained = trainer.run()
             cpu_seconds = time.process_time() - before

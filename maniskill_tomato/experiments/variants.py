@@ -11,7 +11,7 @@ from maniskill_tomato.errors import InvalidInputError
 from maniskill_tomato.experiments.configs import ExperimentName
 from maniskill_tomato.learning.rl.presets import PRESETS, TrainConfig, get_preset
 from maniskill_tomato.tables import read_table
-from maniskill_tomato.tasks import THESIS_IDS
+from maniskill_tomato.tasks import THESIS_IDS, Scene
 
 TOGETHER = "+"
 WITHOUT = "td3-without-"
@@ -40,7 +40,10 @@ class Experiment:
     windows: tuple[int, int]
     """Moving-average windows of its training curves, in episodes and steps."""
     evaluations: tuple[Evaluation, ...]
-    """The first is on the plant and at the pose of the training; the others are the thesis's."""
+    """The first is on the plant and at the pose of the training; the others are the thesis's. Their options include
+    those of the training."""
+    env_options: dict[str, Any] = field(default_factory=dict)
+    """Options for `gymnasium.make` of the training."""
     total_steps: int | None = None
     """Steps of the thesis's own training, if it says."""
     exploration_ends: tuple[int, int] | None = None
@@ -93,10 +96,19 @@ def learner_variants() -> tuple[Variant, ...]:
 
 
 @cache
-def experiments() -> dict[ExperimentName, Experiment]:
-    """The thesis's two."""
+def experiments(scene: Scene = "thesis") -> dict[ExperimentName, Experiment]:
+    """The thesis's two, in a scene."""
+    # Tasks load PyTorch, which the list of variants need not wait for.
+    from maniskill_tomato.tasks.thesis.thesis_config import thesis_task
+
     found: dict[ExperimentName, Experiment] = {}
     for name, values in _read("thesis_variants.toml")["experiment"].items():
+        yaw = thesis_task(values["env_id"], scene).plant_pose.yaw
+        for one in values["evaluations"]:
+            one["env_options"] = {"scene": scene, **one.get("env_options", {})}
+            if (pose := one["env_options"].get("plant_pose")) is not None:
+                pose[2] = round(yaw + pose[2], 3)
+        values["env_options"] = {"scene": scene}
         found[name] = read_table(Experiment, {"name": name, **values}, f"experiment.{name}")
     return found
 

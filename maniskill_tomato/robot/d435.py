@@ -17,8 +17,8 @@ from maniskill_tomato.errors import InvalidInputError
 
 FloatArray = npt.NDArray[np.float64]
 
-Calibration = Literal["nominal", "measured"]
-"""Which numbers describe the colour camera: the data sheet's or those of one real device."""
+Calibration = Literal["nominal", "measured", "gazebo"]
+"""Which numbers describe the colour camera: the data sheet's, those of one real device, or a D435's in Gazebo."""
 
 Stream = Literal["color", "depth"]
 """The two pictures a D435 takes, each with its own imager, field of view and place."""
@@ -189,6 +189,9 @@ MEASURED_COLOR_IMAGER: Final = CameraIntrinsics(
 """The imager of that device, of which 640 x 480 is the centre, reduced 2.25 times (it reports fx = 918.6 px
 at 1280 x 720, as this gives)."""
 
+COLOR_FOV_X: Final = math.radians(69.4)
+"""Horizontal field of view of the colour imager in its full 16:9 modes, in [rad] (data sheet)."""
+
 DEPTH_IMAGER: Final = CameraIntrinsics(width=1280, height=800, fx=640.0, fy=640.0, cx=640.0, cy=400.0)
 """The whole depth imager, 90 degrees wide (data sheet: 87 +- 3, devices report 89.6 to 90.0). Its crops give
 the focal lengths that devices report: 640 px at 1280 x 720 (reported 638 to 645), 424 px at 848 x 480 (422.8
@@ -217,11 +220,16 @@ def color_intrinsics(
     """The colour stream at `width` x `height` [px].
 
     Pictures of 16:9 and narrower share the vertical field of view (42.5 degrees nominal, 42.9 measured);
-    wider ones lose rows instead of columns.
+    wider ones lose rows instead of columns. In Gazebo a camera has its horizontal field of view whatever its shape: a
+    D435 described with the data sheet's 69.4 degrees keeps them at 640 x 480, where a real one crops to 55, and is 54.9
+    degrees high instead of 42.5.
 
     Raises:
         InvalidInputError: Unknown calibration, or a size below 1 pixel.
     """
+    if calibration == "gazebo":
+        fov_y = 2.0 * math.atan(math.tan(COLOR_FOV_X / 2.0) * height / width)
+        return CameraIntrinsics.from_fov(width=width, height=height, fov_y=fov_y)
     imagers = {"nominal": COLOR_IMAGER, "measured": MEASURED_COLOR_IMAGER}
     if calibration not in imagers:
         raise InvalidInputError.choice("calibration", calibration, get_args(Calibration))

@@ -17,7 +17,7 @@ from maniskill_tomato.raycast.images import (
 )
 from maniskill_tomato.raycast.scene import RayScene
 from maniskill_tomato.raycast.view_rays import DEPTH_MODE
-from maniskill_tomato.robot.d435 import CameraIntrinsics, color_intrinsics
+from maniskill_tomato.robot.d435 import Calibration, CameraIntrinsics, color_intrinsics
 from maniskill_tomato.robot.depth_noise import DepthNoise, measure_depth
 from maniskill_tomato.segmentation.instances import Instances
 from maniskill_tomato.segmentation.segmenter import make_segmenter
@@ -140,6 +140,7 @@ def make_camera(
     picture: Callable[[int], UInt8],
     *,
     true_association: bool = False,
+    calibration: Calibration = "nominal",
 ) -> tuple[SimulatedCamera, CameraPerception] | None:
     """The camera of a kind of perception and what measures its frames; None for ground truth.
 
@@ -149,6 +150,7 @@ def make_camera(
         intrinsics: Of rendered pictures.
         picture: Renders them, by the index of an environment.
         true_association: Whether no fruit is mistaken for another.
+        calibration: Of the colour camera whose images are cast.
     """
     if perception == "ground_truth":
         return None
@@ -161,7 +163,9 @@ def make_camera(
         camera = SimulatedCamera(scene, intrinsics=intrinsics, picture=picture)
     else:
         camera = SimulatedCamera(
-            scene, errors=SegmenterErrors() if perception == "simulated_segmenter" else None
+            scene,
+            intrinsics=color_intrinsics(*IMAGE_SIZE, calibration),
+            errors=SegmenterErrors() if perception == "simulated_segmenter" else None,
         )
     return camera, CameraPerception(
         scene.num_envs, detector, true_association=true_association, device=scene.device

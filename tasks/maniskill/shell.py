@@ -17,7 +17,7 @@ from torch import Tensor
 from maniskill_tomato.errors import InvalidInputError, RenderingUnavailableError
 from maniskill_tomato.plants.episode_list import Episode
 from maniskill_tomato.plants.organs import SemanticClass
-from maniskill_tomato.robot.d435 import CameraIntrinsics
+from maniskill_tomato.robot.d435 import Calibration, CameraIntrinsics
 from maniskill_tomato.sensing.belief import Belief
 from maniskill_tomato.sensing.image_layout import ImageLayout
 from maniskill_tomato.sensing.observation import ObservationLayout
@@ -103,6 +103,8 @@ class TomatoEnv(BaseEnv):  # type: ignore[misc]
                 )
             width, height = RENDERED_SIZE
             kwargs.setdefault("sensor_configs", {"width": width, "height": height})
+        if setup.calibration != "nominal":
+            kwargs["sensor_configs"] = _with_calibration(kwargs.get("sensor_configs"), setup.calibration)
         rendering = shell_options.needs_rendering(obs_mode, render_mode) or setup.needs_pictures
         render_backend = shell_options.pick_render_backend(render_backend, rendering)
         self._renders = render_backend != "none"
@@ -483,3 +485,11 @@ def _stages(plan: Plan) -> list[Tensor]:
             goal[i] = way[min(k, len(way) - 1)]
         stages.append(goal)
     return stages
+
+
+def _with_calibration(sensor_configs: Mapping[str, Any] | None, calibration: Calibration) -> dict[str, Any]:
+    """ManiSkill's `sensor_configs` with the task's calibration of the colour camera, unless the user gave one."""
+    given = dict(sensor_configs or {})
+    if "calibration" not in given:
+        given["d435"] = {"calibration": calibration, **given.get("d435", {})}
+    return given

@@ -4,12 +4,19 @@ workspace."""
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Literal
+from typing import Literal, get_args
 
 from torch import Tensor
 
+from maniskill_tomato.errors import InvalidInputError
 from maniskill_tomato.plants.spec import PlantPose, PlantSpec
+from maniskill_tomato.robot.d435 import Calibration
+from maniskill_tomato.tasks import THESIS_IDS, Scene
 from maniskill_tomato.tasks.thesis import thesis_rewards as rewards
+
+THESIS_POSE = PlantPose(x=0.85, y=0.0, yaw=math.radians(120.0))
+"""Where the plants of the scene `thesis` stand. Episodes of the guided task's random actions (Eq. 5-6) take 5.2 steps
+there, the thesis's 5.3 (1278 in 240 episodes); `tools/choose_thesis_scene.py` chose it."""
 
 Range = tuple[float, float]
 VisualReward = Callable[[Tensor, Tensor, Tensor, Tensor], Tensor]
@@ -24,6 +31,8 @@ class ViewpointTaskConfig:
     """The plant that the task uses unless it is given another."""
     plant_pose: PlantPose
     """Where that plant stands."""
+    calibration: Calibration = "nominal"
+    """Which numbers describe the wrist's colour camera."""
     start_position: tuple[Range, Range, Range]
     """Ranges of the end-effector's x, y, z at the start of an episode, in [m], world frame (Eq. 5-1, 5-7)."""
     start_rpy: tuple[Range, Range, Range]
@@ -52,16 +61,33 @@ class ViewpointTaskConfig:
         return self.reward_bounds[1]
 
 
-def guided_task() -> ViewpointTaskConfig:
+def thesis_task(env_id: str, scene: Scene = "hidden") -> ViewpointTaskConfig:
+    """One of the thesis's two tasks.
+
+    Args:
+        env_id: One of `THESIS_IDS`.
+        scene: Plant, pose and camera.
+
+    Raises:
+        InvalidInputError: There is no such scene.
+    """
+    if scene not in get_args(Scene):
+        raise InvalidInputError.choice("scene", scene, get_args(Scene))
+    return guided_task(scene) if env_id == THESIS_IDS[0] else sparse_task(scene)
+
+
+def guided_task(scene: Scene = "hidden") -> ViewpointTaskConfig:
     """The guided-reward task (section 5-1, Eq. 5-1 ... 5-6, Table 5-1).
 
-    The thesis prints neither its plant nor where it stood. Here the tomato is in reach at y = 0.2 m, where the
-    yaw range of Eq. 5-2 looks from y < 0, and of the first twelve seeds this one hides it from every start (mean
-    V_f 0.15) while a fifth of the views around it are good.
+    The thesis prints neither its plant nor where it stood. In the scene `hidden` the tomato is in reach at y = 0.2 m,
+    where the yaw range of Eq. 5-2 looks from y < 0, and of the first twelve seeds this one hides it from every start
+    (mean V_f 0.15) while a fifth of the views around it are good. `thesis` is that plant at `THESIS_POSE`.
     """
+    thesis = scene == "thesis"
     return ViewpointTaskConfig(
         plant=PlantSpec(preset="one_tomato", seed=1),
-        plant_pose=PlantPose(x=0.85, y=0.2, yaw=0.0),
+        plant_pose=THESIS_POSE if thesis else PlantPose(x=0.85, y=0.2),
+        calibration="gazebo" if thesis else "nominal",
         start_position=((-0.1, 0.2), (-0.35, 0.1), (0.65, 1.15)),
         start_rpy=((0.0, 0.0), (0.45 * math.pi, 0.7 * math.pi), (0.0, 0.25 * math.pi)),
         full_visibility=0.85,
@@ -73,16 +99,18 @@ def guided_task() -> ViewpointTaskConfig:
     )
 
 
-def sparse_task() -> ViewpointTaskConfig:
+def sparse_task(scene: Scene = "hidden") -> ViewpointTaskConfig:
     """The sparse-reward task (section 5-2, Eq. 5-7 ... 5-11, Table 5-2).
 
     Eq. 5-10 has no case for a neighbour pose, so any pose that cannot be reached exactly is outside the
-    workspace. The plant is one of the first twelve seeds that hides all three tomatoes from every start while each
-    can be seen from 15 % or more of the views around it.
+    workspace. The plant of the scene `hidden` is one of the first twelve seeds that hides all three tomatoes from every
+    start while each can be seen from 15 % or more of the views around it.
     """
+    thesis = scene == "thesis"
     return ViewpointTaskConfig(
         plant=PlantSpec(preset="three_tomatoes", seed=4),
-        plant_pose=PlantPose(x=0.85, y=0.0, yaw=0.0),
+        plant_pose=THESIS_POSE if thesis else PlantPose(x=0.85, y=0.0),
+        calibration="gazebo" if thesis else "nominal",
         start_position=((-0.1, 0.2), (-0.25, 0.25), (0.65, 1.15)),
         start_rpy=((0.0, 0.0), (0.45 * math.pi, 0.7 * math.pi), (-math.pi / 8, math.pi / 8)),
         full_visibility=0.8,

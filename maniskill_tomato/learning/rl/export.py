@@ -42,7 +42,7 @@ from maniskill_tomato.policies.trained_actor import load_actor, load_checkpoint,
 from maniskill_tomato.sensing.image_layout import Sight
 from maniskill_tomato.sensing.image_observation import STATE
 from maniskill_tomato.tasks import THESIS_IDS
-from maniskill_tomato.tasks.thesis.thesis_config import ViewpointTaskConfig, guided_task, sparse_task
+from maniskill_tomato.tasks.thesis.thesis_config import thesis_task
 
 OPSET = 17
 """Version of the operators; an old one on purpose, so that old runtimes read the file too."""
@@ -55,10 +55,6 @@ FLOAT32_UNIT_ROUNDOFF = 2.0**-24
 
 ROUNDING_SIGMAS = 10.0
 """Standard deviations of independent roundings that an encoder's features may differ by."""
-
-_TASKS: dict[str, Callable[[], ViewpointTaskConfig]] = dict(
-    zip(THESIS_IDS, (guided_task, sparse_task), strict=True)
-)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -276,8 +272,8 @@ def _add_encoder(graph: "_Graph", encoder: ImageEncoder, sight: Sight) -> str:
 
 def describe_policy(actor: DenseActor, model: bytes) -> PolicyDescription:
     """The description of a policy and its ONNX file."""
-    make_task = _TASKS.get(actor.env_id)
-    task = make_task() if make_task else None
+    scene = (actor.env_options or {}).get("scene", "hidden")
+    task = thesis_task(actor.env_id, scene) if actor.env_id in THESIS_IDS else None
     config = json.dumps(actor.config, sort_keys=True)
     layout = layout_of(actor.env_id, actor.sight)
     for what, given, wanted in (

@@ -9,7 +9,7 @@ from maniskill_tomato.learning.rl.train_config import MAY_CHANGE as MAY_CHANGE
 from maniskill_tomato.learning.rl.train_config import TrainConfig as TrainConfig
 from maniskill_tomato.learning.rl.train_config import modernise as modernise
 from maniskill_tomato.sensing.perception_kinds import STATE_MODE
-from maniskill_tomato.tasks import GENERAL_IDS
+from maniskill_tomato.tasks import GENERAL_IDS, THESIS_IDS
 
 OBSERVATION_CENTRE = (0.2, 0.0, 0.8, 0.0, math.pi / 2, 0.0, 0.7, 0.0, 0.8)
 """What normalisation maps to 0: the middle of the arm's working range in front of the plant, looking along x.
@@ -178,6 +178,12 @@ PRESETS: dict[PresetName, TrainConfig] = {
 general tasks have three actions and take the observation, which is scaled already, as it is. `general-ddpg` has the
 learning rates, tau, gamma and batch size of Lillicrap et al. (2016). Those called pixel observe images: `pixel-td3` and
 `pixel-ddpg` on the thesis's tasks, the others on the general ones."""
+
+
+def preset_options(preset: PresetName, env_id: str) -> dict[str, Any]:
+    """The options of a task that a preset is for: the thesis's settings belong to the thesis's scene."""
+    thesis = preset in ("thesis-guided", "thesis-sparse") and env_id in THESIS_IDS
+    return {"scene": "thesis"} if thesis else {}
 
 
 def default_preset(env_id: str | None, obs_mode: str | None = None) -> PresetName:
