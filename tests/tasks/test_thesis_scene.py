@@ -15,12 +15,13 @@ import maniskill_tomato.tasks as tasks
 from maniskill_tomato.cli import main
 from maniskill_tomato.errors import InvalidInputError
 from maniskill_tomato.experiments.configs import ReproductionConfig
-from maniskill_tomato.experiments.reproduction import plan_trials
+from maniskill_tomato.experiments.reproduction import plan_trials, untrained_first_steps
 from maniskill_tomato.experiments.variants import experiments, find_variant
 from maniskill_tomato.learning.rl.presets import PRESETS, preset_options
 from maniskill_tomato.policies.layout import EPSILON_GREEDY_HIGH, EPSILON_GREEDY_LOW
 from maniskill_tomato.policies.trained_actor import load_actor
 from maniskill_tomato.robot.d435 import CameraIntrinsics
+from maniskill_tomato.robot.inverse_kinematics import Reach
 from maniskill_tomato.sensing.simulated_camera import IMAGE_SIZE, make_camera
 from maniskill_tomato.tasks.making import make_world
 from maniskill_tomato.tasks.vector_env import make_vector_env
@@ -185,3 +186,20 @@ def test_random_actions_take_the_steps_of_the_thesis_in_its_scene_alone() -> Non
     assert passing == pytest.approx(0.625, abs=0.06)
     steps, passing = explored_steps("hidden", 100)
     assert steps > 25.0 and passing == 0.0
+
+
+@pytest.mark.parametrize("scene", ["hidden", "thesis"])
+def test_a_pose_out_of_reach_by_a_centimetre_is_outside_the_sparse_tasks_workspace(scene: str) -> None:
+    env = make_vector_env(SPARSE, auto_reset=False, scene=scene)
+    env.reset(seed=0, options={"viewpoint": [0.55, 0.0, 0.6, 0.0, math.pi / 2, 0.0]})
+    # The wrist is 0.126 m behind the flange and 0.82 m from the shoulder (0, 0, 0.36) at full reach.
+    limit = math.sqrt(0.82**2 - (0.6 - 0.36) ** 2) + 0.126
+    _, _, terminated, _, info = env.step(torch.tensor([[limit + 0.01 - 0.55, 0.0, 0.0, 0.0, 0.0, 0.0]]))
+    assert bool(terminated) and bool(info["fail"]) and int(info["reachability"]) == Reach.UNREACHABLE
+
+
+def test_most_untrained_actors_leave_the_sparse_tasks_workspace_at_once() -> None:
+    share = untrained_first_steps(SPARSE, PRESETS["thesis-sparse"], 60, {"scene": "thesis"})[
+        "unreachable_share"
+    ]
+    assert 0.75 < share < 0.97
