@@ -1,6 +1,7 @@
 """A glasshouse round the plants and the robot, for pictures alone: rays, physics and the games know nothing of it."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 from functools import lru_cache
 from typing import Final
 
@@ -10,6 +11,7 @@ import sapien.render
 from numpy.typing import NDArray
 
 from maniskill_tomato.plants.generator import generate_plant
+from maniskill_tomato.plants.kinds import config_of
 from maniskill_tomato.plants.organs import Plant, SemanticClass
 from maniskill_tomato.plants.row import ROW_SPACING
 from maniskill_tomato.plants.seed_splits import SEED_SPLITS
@@ -182,7 +184,12 @@ def _rows(rng: np.random.Generator, wool: sapien.render.RenderMaterial) -> list[
 
 @lru_cache(maxsize=VARIETY)
 def _neighbour(number: int) -> Plant:
-    return generate_plant("full", SEED_SPLITS["train"][0] + number)
+    """A vine with side shoots, dying leaves and trusses in flower, none of which the plants of the games have."""
+    seed = SEED_SPLITS["train"][0] + number
+    config = replace(
+        config_of("full", seed), leaf_density=1.3, wilted_share=0.12, flowering_trusses=1 + number % 3
+    )
+    return generate_plant(config, seed)
 
 
 def _cart() -> list[sapien.render.RenderShape]:
