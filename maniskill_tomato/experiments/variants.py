@@ -12,6 +12,7 @@ from maniskill_tomato.experiments.configs import ExperimentName
 from maniskill_tomato.learning.rl.presets import PRESETS, TrainConfig, get_preset
 from maniskill_tomato.tables import read_table
 from maniskill_tomato.tasks import THESIS_IDS, Scene
+from maniskill_tomato.tasks.thesis.scenes import plant_pose
 
 TOGETHER = "+"
 WITHOUT = "td3-without-"
@@ -98,12 +99,9 @@ def learner_variants() -> tuple[Variant, ...]:
 @cache
 def experiments(scene: Scene = "thesis") -> dict[ExperimentName, Experiment]:
     """The thesis's two, in a scene."""
-    # Tasks load PyTorch, which the list of variants need not wait for.
-    from maniskill_tomato.tasks.thesis.thesis_config import thesis_task
-
     found: dict[ExperimentName, Experiment] = {}
     for name, values in _read("thesis_variants.toml")["experiment"].items():
-        yaw = thesis_task(values["env_id"], scene).plant_pose.yaw
+        yaw = plant_pose(values["env_id"], scene).yaw
         for one in values["evaluations"]:
             one["env_options"] = {"scene": scene, **one.get("env_options", {})}
             if (pose := one["env_options"].get("plant_pose")) is not None:

@@ -2,6 +2,7 @@ import dataclasses
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 import torch
 
@@ -12,6 +13,7 @@ from maniskill_tomato.learning.rl.agent import Agent, make_agent
 from maniskill_tomato.learning.rl.checkpoint import make_checkpoint
 from maniskill_tomato.learning.rl.presets import PRESETS, TrainConfig, get_preset
 from maniskill_tomato.policies.trained_actor import load_actor, load_checkpoint
+from maniskill_tomato.sensing.image_layout import ImageLayout
 
 ENV_ID = "TomatoViewpointGuided-v1"
 BOUNDS = (-torch.ones(6), torch.ones(6))
@@ -24,6 +26,16 @@ def saved(path: Path, **changes: Any) -> tuple[Agent, dict[str, Any]]:
     return agent, data
 
 
+def seen(config: TrainConfig, count: int) -> Any:
+    """Random observations of the thesis's tasks, with images where they are observed."""
+    state = torch.randn(count, 9)
+    layout = ImageLayout.parse(config.obs_mode, config.image_size)
+    if layout is None:
+        return state
+    drawn = {kind: np.stack([box.sample() for _ in range(count)]) for kind, box in layout.spaces().items()}
+    return {"state": state, **{kind: torch.from_numpy(images) for kind, images in drawn.items()}}
+
+
 @pytest.mark.parametrize("preset", PRESETS)
 def test_a_policy_comes_back_as_it_was(tmp_path: Path, preset: str) -> None:
     actions = len(get_preset(preset).action_scale)
@@ -31,7 +43,7 @@ def test_a_policy_comes_back_as_it_was(tmp_path: Path, preset: str) -> None:
     bounds = (-torch.ones(actions), torch.ones(actions))
     write_tensors(tmp_path / "p.pt", make_checkpoint(agent, ENV_ID, bounds, {"steps": 12, "seed": 3}))
     policy = load_actor(tmp_path / "p.pt", env_id=ENV_ID)
-    observations = torch.randn(8, 9)
+    observations = seen(agent.config, 8)
     scale = torch.tensor(agent.config.action_scale)
     torch.testing.assert_close(
         policy.act(observations), agent.policy(observations) * scale, rtol=0.0, atol=0.0

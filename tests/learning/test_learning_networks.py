@@ -1,5 +1,7 @@
 import math
+from typing import Any
 
+import numpy as np
 import pytest
 import torch
 
@@ -12,6 +14,7 @@ from maniskill_tomato.learning.rl.presets import (
     get_preset,
 )
 from maniskill_tomato.policies.actor import ACTOR_SMALL_OUTPUT_BOUND, Actor, ObservationNormalizer
+from maniskill_tomato.sensing.image_layout import ImageLayout
 
 
 def parameter_count(module: torch.nn.Module) -> int:
@@ -101,6 +104,11 @@ def test_normalisation_maps_the_documented_ranges_to_one() -> None:
 @pytest.mark.parametrize("name", PRESETS)
 def test_every_preset_builds_an_agent(name: str) -> None:
     agent = make_agent(get_preset(name), 9, 6)
-    actions = agent.policy(torch.randn(5, 9))
+    config, observations = agent.config, torch.randn(5, 9)
+    layout = ImageLayout.parse(config.obs_mode, config.image_size)
+    spaces = {} if layout is None else layout.spaces()
+    images = {kind: np.stack([box.sample() for _ in range(5)]) for kind, box in spaces.items()}
+    seen: Any = {"state": observations, **{kind: torch.from_numpy(image) for kind, image in images.items()}}
+    actions = agent.policy(seen if images else observations)
     assert actions.shape == (5, 6)
     assert actions.abs().max() <= 1.0

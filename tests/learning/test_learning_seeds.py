@@ -101,6 +101,7 @@ def test_the_config_of_a_run_repeats_it(tmp_path: Path) -> None:
     main(["train", "--config", file, "--plant-seed", "8", "--out", str(tmp_path / "a")])
     saved = json.loads((tmp_path / "a/config.json").read_text())
     assert saved["env_options"] == {
+        "scene": "thesis",
         "plant": {"preset": "three_tomatoes", "seed": 8},
         "plant_pose_noise": [0.01, 0.01, 0.1],
     }

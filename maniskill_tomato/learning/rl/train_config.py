@@ -2,9 +2,10 @@
 
 import dataclasses
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
 from maniskill_tomato.errors import InvalidInputError
+from maniskill_tomato.sensing.image_layout import ImageLayout
 from maniskill_tomato.sensing.perception_kinds import STATE_MODE, Part
 from maniskill_tomato.tables import read_table
 
@@ -267,13 +268,11 @@ class TrainConfig:
                         f"{name} goes with images; choose obs_mode, such as 'depth+segmentation'"
                     )
             return
-        # These take a second to import, and most configurations observe no images.
-        from maniskill_tomato.sensing.image_layout import ImageLayout
-        from maniskill_tomato.sensing.observation import ObservationLayout
-
         if len(self.image_size) != 2:
             raise InvalidInputError(f"image_size must be a width and a height, got {self.image_size}")
-        ObservationLayout(parts=self.state_parts)
+        for part in self.state_parts:
+            if part not in get_args(Part):
+                raise InvalidInputError.choice("a part of the observation", part, get_args(Part))
         ImageLayout.parse(self.obs_mode, self.image_size)
         if self.hindsight_targets:
             raise InvalidInputError(
