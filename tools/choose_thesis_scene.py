@@ -40,7 +40,7 @@ from maniskill_tomato.policies.layout import EPSILON_GREEDY_HIGH, EPSILON_GREEDY
 from maniskill_tomato.robot.d435 import color_intrinsics
 from maniskill_tomato.tasks import MAX_EPISODE_STEPS, THESIS_IDS
 from maniskill_tomato.tasks.making import make_world
-from maniskill_tomato.tasks.thesis.thesis_config import THESIS_POSE
+from maniskill_tomato.tasks.thesis.scenes import THESIS_POSE
 from maniskill_tomato.tasks.world import World
 
 PICTURE = color_intrinsics(16, 12, "gazebo")
