@@ -11,7 +11,9 @@ THESIS_POSE = PlantPose(x=0.85, y=0.0, yaw=math.radians(120.0))
 """Where the plants of the scene `thesis` stand. Episodes of the guided task's random actions (Eq. 5-6) take 5.2 steps
 there, the thesis's 5.3 (1278 in 240 episodes); `tools/choose_thesis_scene.py` chose it."""
 
-HIDDEN_POSES = dict(zip(THESIS_IDS, (PlantPose(x=0.85, y=0.2), PlantPose(x=0.85, y=0.0)), strict=True))
+HIDDEN_POSES: dict[str, PlantPose] = dict(
+    zip(THESIS_IDS, (PlantPose(x=0.85, y=0.2), PlantPose(x=0.85, y=0.0)), strict=True)
+)
 """Where those of the scene `hidden` stand, by task."""
 
 
