@@ -31,6 +31,7 @@ NAVIGATION: Final[dict[str, tuple[str, ...]]] = {
         "results/index",
         "results/benchmark",
         "results/td3",
+        "results/pixels",
         "results/ppo",
         "results/thesis",
         "results/perception",
