@@ -52,15 +52,25 @@ class ArrayTask(gym.Env[Any, Array]):
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Seen, dict[str, Any]]:
+        """Begins an episode; the seed is that of the task and of `np_random`."""
         super().reset(seed=seed)
         observation, info = self._env.reset(seed=seed, options=options)
         return _row(observation), _row(info)
 
     def step(self, action: Array) -> tuple[Seen, float, bool, bool, dict[str, Any]]:
+        """Makes a move.
+
+        Args:
+            action: Shape (A,).
+
+        Returns:
+            What is seen, the task's reward, whether the episode terminated, whether it was cut off, and the info.
+        """
         observation, reward, terminated, truncated, info = self._env.step(torch.as_tensor(action)[None])
         return _row(observation), float(reward[0]), bool(terminated[0]), bool(truncated[0]), _row(info)
 
     def close(self) -> None:
+        """Frees the simulation, if there is one."""
         self._env.close()
 
 
