@@ -487,6 +487,17 @@ def test_every_task_passes_gymnasiums_check(env_id: str, mode: str) -> None:
     env.close()
 
 
+def test_an_option_of_the_simulator_gives_the_same_environment_over_its_shell() -> None:
+    plain, simulated = make_gymnasium_env(GUIDED), make_gymnasium_env(GUIDED, motion="kinematic")
+    assert plain.observation_space == simulated.observation_space
+    for env in (plain, simulated):
+        env.reset(seed=3)
+    steps = [env.step(np.full(6, 0.1, np.float32)) for env in (plain, simulated)]
+    np.testing.assert_allclose(steps[0][0], steps[1][0], atol=1e-5)
+    assert steps[0][1] == pytest.approx(steps[1][1], abs=1e-5) and steps[0][2:4] == steps[1][2:4]
+    simulated.close()
+
+
 def test_the_potential_reward_is_refused_where_the_task_has_one_already() -> None:
     env = make_gymnasium_env(GENERAL, reward="potential")
     with pytest.raises(InvalidInputError, match="reward='task'"):

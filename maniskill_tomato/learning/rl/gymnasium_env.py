@@ -46,8 +46,10 @@ class ArrayTask(gym.Env[Any, Array]):
         """
         self._env = cast(Any, env)
         self.spec = None  # `gymnasium.make` makes another class of the same id.
-        self.observation_space = self._env.single_observation_space
-        self.action_space = self._env.single_action_space
+        # Gymnasium's wrappers hide what ManiSkill's shell says beside Gymnasium's interface.
+        told = self._env if hasattr(self._env, "single_observation_space") else self._env.unwrapped
+        self.observation_space = told.single_observation_space
+        self.action_space = told.single_action_space
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
