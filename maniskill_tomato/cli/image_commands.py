@@ -145,6 +145,8 @@ class Detect:
     quick: bool = False
     """Let the light segmenter look at each image as often as a robot on its way does: 4.5 times as quick, fewer small
     fruits found."""
+    everything: bool = False
+    """List leaves, stems and the robot too; for weights of Mask R-CNN that were trained on these classes."""
     pictures: Path | None = None
     """Also write each image with its fruits drawn over, into this folder."""
 
@@ -172,13 +174,14 @@ class Detect:
             if name in drawings:
                 write_picture(drawings[name], draw_instances(image, found, 0.3))
 
-        summary = detect(self.images, segmenter, self.out, draw)
+        summary = detect(self.images, segmenter, self.out, draw, self.everything)
         for reason in summary.skipped[:10]:
             print(f"skipped {reason}")
         if len(summary.skipped) > 10:
             print(f"skipped {len(summary.skipped) - 10} more")
         fruits = "tomato" if summary.detections == 1 else "tomatoes"
+        others = f" and {summary.others} other things" if self.everything else ""
         print(
-            f"{summary.detections} {fruits} in {summary.images} images, {len(summary.skipped)} files skipped"
+            f"{summary.detections} {fruits}{others} in {summary.images} images, {len(summary.skipped)} files skipped"
         )
         print(f"list {self.out}")

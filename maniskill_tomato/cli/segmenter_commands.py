@@ -11,7 +11,12 @@ from maniskill_tomato.cli.arguments import Flat
 from maniskill_tomato.cli.early_checks import check_counts, check_file, check_place
 from maniskill_tomato.cli.shared_options import say
 from maniskill_tomato.errors import InvalidInputError
-from maniskill_tomato.segmentation.detector_configs import MASK_RCNN_PRESETS, Backbone, LightTrainConfig
+from maniskill_tomato.segmentation.detector_configs import (
+    MASK_RCNN_PRESETS,
+    Backbone,
+    LightTrainConfig,
+    ThingClass,
+)
 
 if TYPE_CHECKING:
     from maniskill_tomato.segmentation.datasets.annotations import AnnotatedImage
@@ -97,6 +102,8 @@ class TrainMaskRcnn(ImageOptions):
     pretrained: bool = False
     """Start from ImageNet weights of the backbone: of `efficientnet_lite0` those of the extra `pretrained`, of the
     others torchvision's, which are downloaded."""
+    classes: tuple[ThingClass, ...] = ("tomato", "robot")
+    """What is told apart. With leaf or stem, images that name neither, such as photos, are left out."""
     backbone: Backbone | None = None
     """Network under the pyramid, if not that of the preset; `efficientnet_lite0` is small enough for a CPU."""
     epochs: int | None = None
@@ -107,6 +114,8 @@ class TrainMaskRcnn(ImageOptions):
     """Factor on the steps of an epoch in training and validation; epochs and the learning rates of each stay."""
     input_scale: float = 1.0
     """Factor on the sides of the input and of the anchors."""
+    bfloat16: bool | None = None
+    """Train in 16 bits, if not as the preset does; slower where the processor has neither AMX nor AVX-512 BF16."""
     anchors: Literal["preset", "data"] = "preset"
     """Sides of the anchors: those of the preset, or five clusters of the boxes in --data (k-means)."""
     seed: int = 0
@@ -119,6 +128,8 @@ class TrainMaskRcnn(ImageOptions):
         preset = MASK_RCNN_PRESETS[self.preset].scaled(steps=self.step_scale, size=self.input_scale)
         config = replace(
             preset,
+            categories=self.classes,
+            bfloat16=preset.bfloat16 if self.bfloat16 is None else self.bfloat16,
             backbone=self.backbone or preset.backbone,
             epochs=preset.epochs if self.epochs is None else self.epochs,
             steps_per_epoch=preset.steps_per_epoch if self.steps_per_epoch is None else self.steps_per_epoch,
@@ -131,7 +142,19 @@ class TrainMaskRcnn(ImageOptions):
         if self.anchors == "data":
             config = replace(config, anchor_sides=anchor_sides((i for s in images.sets for i in s), config))
             print(f"anchors {', '.join(map(str, config.anchor_sides))} px")
-        _tell_weights(lambda: _train(MaskRcnnTraining(config, images, self.pretrained, self.seed), self.out))
+        training = MaskRcnnTraining(config, images, self.pretrained, self.seed)
+        sets = zip(
+            (*self.data, self.validation),
+            (*images.sets, images.validation),
+            (*training.images.sets, training.images.validation),
+            strict=True,
+        )
+        for place, given, kept in sets:
+            if len(kept) < len(given):
+                print(
+                    f"{place}: {len(given) - len(kept)} of {len(given)} images name no leaf or stem, left out"
+                )
+        _tell_weights(lambda: _train(training, self.out))
 
 
 @dataclass(frozen=True, kw_only=True)

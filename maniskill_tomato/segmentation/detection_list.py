@@ -1,4 +1,4 @@
-"""Fruits in image files, as a JSON list in COCO's form."""
+"""Fruits and other things in image files, as a JSON list in COCO's form."""
 
 import json
 from collections.abc import Callable
@@ -11,7 +11,7 @@ from maniskill_tomato.files import refuse_inputs, write_atomically
 from maniskill_tomato.segmentation.datasets.picture_files import read_picture
 from maniskill_tomato.segmentation.instances import Image, Instances
 from maniskill_tomato.segmentation.masks import EncodedMask
-from maniskill_tomato.segmentation.segmenter import Segmenter
+from maniskill_tomato.segmentation.segmenter import Segmenter, ThingSegmenter
 
 IMAGE_SUFFIXES = (".jpg", ".jpeg", ".png", ".bmp", ".tif", ".tiff", ".webp")
 
@@ -24,6 +24,8 @@ class DetectionSummary:
     """Images that were searched."""
     detections: int
     """Fruits found in them."""
+    others: int
+    """Other things found in them."""
     skipped: tuple[str, ...]
     """Why each of the others was left out."""
 
@@ -76,6 +78,7 @@ def detect(
     segmenter: Segmenter,
     out: Path,
     seen: Callable[[str, Image, Instances], None] | None = None,
+    everything: bool = False,
 ) -> DetectionSummary:
     """Finds the fruits in an image, or in each image of a folder, and writes a JSON list with one object a fruit.
 
@@ -87,17 +90,28 @@ def detect(
         segmenter: Finds the fruits.
         out: The file to write, whole or not at all.
         seen: Called with each name, image and what was found in it.
+        everything: List leaves, stems and the robot too.
 
     Raises:
-        InvalidInputError: There is no image, none can be read, or `out` is a folder, an image, or named as one.
+        InvalidInputError: There is no image, none can be read, or `out` is a folder, an image, or named as one; or
+            the segmenter tells fruits alone, and everything is asked for.
         CheckpointError: The file cannot be written.
     """
     if out.is_dir():
         raise InvalidInputError(f"--out must be a file such as {out / 'detections.json'}; {out} is a folder")
     if out.suffix.lower() in IMAGE_SUFFIXES:
         raise InvalidInputError(f"--out is the list and must be a file such as detections.json; got {out}")
+    finds: Callable[[Image], Instances] = segmenter
+    if everything:
+        if not isinstance(segmenter, ThingSegmenter):
+            raise InvalidInputError(
+                "--everything needs a segmenter that tells more than fruits: weights of `maniskill-tomato "
+                "train-segmenter mask-rcnn --classes tomato leaf stem`"
+            )
+        finds = segmenter.things
     entries: list[dict[str, Any]] = []
     skipped: list[str] = []
+    others = 0
     files = image_files(place)
     refuse_inputs("--out", out, files)
     for path in files:
@@ -108,7 +122,8 @@ def detect(
                 raise
             skipped.append(str(error))
             continue
-        found = segmenter(image)
+        found = finds(image)
+        others += len(found) - len(found.fruits()) if everything else 0
         entries += detection_entries(path.name, found)
         if seen is not None:
             seen(path.name, image, found)
@@ -117,7 +132,12 @@ def detect(
             f"none of the {len(files)} files in {place} can be read as an image; {skipped[0]}"
         )
     write_atomically(out, json.dumps(entries, indent=1).encode())
-    return DetectionSummary(images=len(files) - len(skipped), detections=len(entries), skipped=tuple(skipped))
+    return DetectionSummary(
+        images=len(files) - len(skipped),
+        detections=len(entries) - others,
+        others=others,
+        skipped=tuple(skipped),
+    )
 
 
 def detection_entries(file_name: str, found: Instances) -> list[dict[str, Any]]:

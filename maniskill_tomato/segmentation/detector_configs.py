@@ -114,6 +114,9 @@ class LightTrainConfig:
 
 Backbone = Literal["resnet101", "resnet50", "efficientnet_lite0"]
 
+ThingClass = Literal["tomato", "robot", "leaf", "stem"]
+"""What Mask R-CNN can tell apart; tomatoes of every ripeness are one class."""
+
 
 @dataclass(frozen=True, kw_only=True)
 class ClassicAugmentation:
@@ -183,6 +186,10 @@ class MaskRcnnConfig:
             raise InvalidInputError(f"learning_rates must start with epoch 1, got {self.learning_rates}")
         if not 0 <= self.dropout < 1:
             raise InvalidInputError(f"dropout must be from 0 to below 1, got {self.dropout}")
+        if "tomato" not in self.categories or len(set(self.categories)) < len(self.categories):
+            raise InvalidInputError(
+                f"classes must be different ones and tomato one of them, got {', '.join(self.categories) or 'none'}"
+            )
         for name in ("epochs", "steps_per_epoch", "batch_size"):
             if getattr(self, name) < 1:
                 raise InvalidInputError(f"{name} must be at least 1, got {getattr(self, name)}")

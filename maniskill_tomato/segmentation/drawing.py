@@ -8,6 +8,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from maniskill_tomato.segmentation.datasets.annotations import is_fruit
 from maniskill_tomato.segmentation.instances import Image, Instances
 
 
@@ -29,7 +30,8 @@ def draw_instances(image: Image, found: Instances, least_score: float = 0.0) -> 
         drawn[mask] = (0.55 * drawn[mask] + 0.45 * np.array(colour)).astype(np.uint8)
         left, top, right, bottom = (round(float(v)) for v in found.boxes[index])
         cv2.rectangle(drawn, (left, top), (right - 1, bottom - 1), colour, thickness)
-        label = f"{found.scores[index]:.2f}"
+        kind = found.categories[index]
+        label = f"{'' if is_fruit(kind) else f'{kind} '}{found.scores[index]:.2f}"
         place = left, max(top - 3, 9)
         cv2.putText(drawn, label, place, cv2.FONT_HERSHEY_SIMPLEX, 0.35 * thickness, (0, 0, 0), 2 * thickness)
         cv2.putText(

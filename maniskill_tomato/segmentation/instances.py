@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 
 from maniskill_tomato.errors import InvalidInputError
 from maniskill_tomato.segmentation.datasets.annotations import FRUIT_CATEGORIES as FRUIT_CATEGORIES
+from maniskill_tomato.segmentation.datasets.annotations import is_fruit
 
 Image = NDArray[np.uint8]
 """Colours red, green, blue. Shape (H, W, 3)."""
@@ -94,6 +95,10 @@ class Instances:
             masks=self.masks[indices],
             amodal_boxes=None if self.amodal_boxes is None else self.amodal_boxes[indices],
         )
+
+    def fruits(self) -> "Instances":
+        """Those that are tomatoes, of whichever ripeness."""
+        return self.chosen(np.array([is_fruit(c) for c in self.categories], bool))
 
     def amodal_masks(self) -> NDArray[np.bool_]:
         """Pixels of the whole fruits inside the image: the ellipses in the amodal boxes, and what is visible.

@@ -34,6 +34,9 @@ ASPECT_RATIOS = (0.5, 1.0, 2.0)
 LIGHT_WIDTH = 96
 """Channels of the light pyramid."""
 
+DETECTIONS_PER_CLASS = 50
+"""How many detections a picture may have for each class; all of them may be of one."""
+
 
 class Lite0Pyramid(nn.Module):
     """EfficientNet-Lite0 under a light pyramid; takes colours from 0 to 255."""
@@ -116,6 +119,7 @@ def build_mask_rcnn(config: MaskRcnnConfig, pretrained: bool = False) -> MaskRCN
         box_predictor=FastRCNNPredictor(representation, classes),
         box_score_thresh=config.least_confidence,
         box_batch_size_per_image=config.rois_per_image,
+        box_detections_per_img=DETECTIONS_PER_CLASS * len(config.categories),
         mask_roi_pool=MultiScaleRoIAlign(levels, 14, 2),
         mask_head=MaskRCNNHeads(width, (width,) * (2 if light else 4), 1),
         mask_predictor=MaskRCNNPredictor(width, width, classes),
@@ -165,21 +169,22 @@ class MaskRcnnSegmenter:
 
     def __call__(self, image: Image, depth_m: NDArray[np.float32] | None = None) -> Instances:
         """The fruits in an image; see `Segmenter`. Its other classes, such as the robot, are left out."""
+        return self.things(image, depth_m).fruits()
+
+    def things(self, image: Image, depth_m: NDArray[np.float32] | None = None) -> Instances:
+        """What the network tells apart in an image, of all classes; see `ThingSegmenter`."""
         check_image(image, depth_m)
         height, width = image.shape[:2]
         x = torch.from_numpy(np.ascontiguousarray(image)).permute(2, 0, 1).float() / 255
         with torch.inference_mode():
             (found,) = self.network([x])
         names = [self.categories[k - 1] for k in found["labels"].tolist()]
-        fruit = torch.tensor([name.startswith("tomato") for name in names], dtype=torch.bool)
-        boxes, masks = found["boxes"][fruit], found["masks"][fruit, 0] >= 0.5
+        boxes, masks = found["boxes"], found["masks"][:, 0] >= 0.5
         whole = ((boxes[:, 2:] - boxes[:, :2]) >= 1).all(1)
         return Instances(
             boxes=boxes[whole].numpy(),
-            scores=found["scores"][fruit][whole].numpy(),
-            categories=tuple(
-                n for n, w in zip((n for n in names if n.startswith("tomato")), whole, strict=True) if w
-            ),
+            scores=found["scores"][whole].numpy(),
+            categories=tuple(name for name, w in zip(names, whole.tolist(), strict=True) if w),
             masks=masks[whole].numpy().reshape(-1, height, width),
         )
 

@@ -6,7 +6,7 @@ The segmenter that knows, from a label image that a renderer gives, stands here 
 import importlib
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Any, Protocol, cast
+from typing import Any, Protocol, cast, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
@@ -39,6 +39,18 @@ class Segmenter(Protocol):
         Raises:
             InvalidInputError: The image or the depth has another shape or type.
         """
+        ...
+
+
+@runtime_checkable
+class ThingSegmenter(Segmenter, Protocol):
+    """A segmenter that tells more than fruits: the robot, leaves, stems."""
+
+    categories: tuple[str, ...]
+    """What it tells apart."""
+
+    def things(self, image: Image, depth_m: NDArray[np.float32] | None = None) -> Instances:
+        """The fruits and other things in an image; see `Segmenter`."""
         ...
 
 

@@ -22,6 +22,9 @@ FRUIT_CATEGORIES = ("tomato_ripe", "tomato_turning", "tomato_unripe")
 CATEGORIES = (*FRUIT_CATEGORIES, "leaf", "stem", "robot")
 """Everything that rendered images name."""
 
+PLANT_CATEGORIES = ("leaf", "stem")
+"""What hides fruits. Hardly anyone annotates it in photos: an image that names none of it does not say where it is."""
+
 
 def is_fruit(category: str) -> bool:
     """Whether a category names a tomato, of whichever ripeness."""
@@ -115,6 +118,10 @@ class AnnotatedImage:
     def fruits(self) -> tuple[Instance, ...]:
         """The tomatoes of which something is visible."""
         return tuple(i for i in self.instances if i.fruit and i.box_xywh[2] > 0)
+
+    def named(self, *categories: str) -> tuple[Instance, ...]:
+        """The things of these categories of which something is visible."""
+        return tuple(i for i in self.instances if i.category in categories and i.box_xywh[2] > 0)
 
     def load(self) -> NDArray[np.uint8]:
         """The picture, RGB. Shape (height, width, 3).

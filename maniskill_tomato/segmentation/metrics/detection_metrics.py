@@ -59,7 +59,10 @@ class ImageTruth:
 
 
 def image_truth(
-    image: AnnotatedImage, smallest_share: float = SMALLEST_SHARE, rows_behind: bool = True
+    image: AnnotatedImage,
+    smallest_share: float = SMALLEST_SHARE,
+    rows_behind: bool = True,
+    category: str | None = None,
 ) -> ImageTruth:
     """The visible fruits of an annotated image, ripe or not; see `ignored_fruit` for those set aside.
 
@@ -67,9 +70,10 @@ def image_truth(
         image: Whose fruits.
         smallest_share: What stands for `SMALLEST_SHARE`.
         rows_behind: Whether fruits of the rows behind a rendered row count, or are set aside too.
+        category: Things of this category, such as `leaf`, instead of fruits.
     """
     longer = max(image.width, image.height)
-    fruits = image.fruits
+    fruits = image.fruits if category is None else image.named(category)
     boxes = np.array([f.box_xywh for f in fruits], np.float64).reshape(-1, 4)
     boxes[:, 2:] += boxes[:, :2]
     masks = [f.visible_mask.decode() for f in fruits if f.visible_mask is not None]

@@ -11,7 +11,13 @@ import torch
 from numpy.typing import NDArray
 
 from maniskill_tomato.errors import InvalidInputError
-from maniskill_tomato.segmentation.datasets.annotations import BEHIND, SMALLEST_SHARE, AnnotatedImage
+from maniskill_tomato.segmentation.datasets.annotations import (
+    BEHIND,
+    PLANT_CATEGORIES,
+    SMALLEST_SHARE,
+    AnnotatedImage,
+    is_fruit,
+)
 from maniskill_tomato.segmentation.datasets.picture_files import write_picture
 from maniskill_tomato.segmentation.drawing import contact_sheet, draw_instances, mark_boxes
 from maniskill_tomato.segmentation.instances import Image, Instances
@@ -25,7 +31,7 @@ from maniskill_tomato.segmentation.metrics.detection_metrics import (
     without_narrow,
 )
 from maniskill_tomato.segmentation.metrics.detection_plots import plot_overlaps, plot_precision_recall
-from maniskill_tomato.segmentation.segmenter import Segmenter
+from maniskill_tomato.segmentation.segmenter import Segmenter, ThingSegmenter
 
 PICTURES = 16
 """Images on the sheet of results."""
@@ -73,7 +79,8 @@ def evaluate_segmenter(
     """Runs a segmenter over images and compares with their annotation; all fruits count, ripe or not.
 
     Writes `precision_recall.png` (Fig. 4-20, 4-24), `overlaps.png` (AP over the overlap, by size) and `pictures.jpg`
-    (Fig. 4-21 to 4-27). Masks are compared if every image has them.
+    (Fig. 4-21 to 4-27). Masks are compared if every image has them. Of a `ThingSegmenter` the other classes that are
+    annotated are judged too; leaves and stems only in images that name some.
 
     Args:
         segmenter: What to judge.
@@ -87,7 +94,7 @@ def evaluate_segmenter(
         The worst images, and as metrics `box_AP50` and `mask_AP50` (Eq. 4-3 at an overlap of 0.5), precision and recall
         at `WORKING_SCORE`, COCO's metrics as `coco_box_...` and `coco_mask_...` (`COCO_NAMES`), counts, seconds an
         image; in rendered images with rows behind also `front_box_AP50`, `coco_front_box_...` and so on, of the fruits
-        of the row in front alone.
+        of the row in front alone; `leaf_things`, `leaf_box_AP50`, `coco_leaf_box_...` and so on of the other classes.
 
     Raises:
         InvalidInputError: There is no image, or one cannot be read.
@@ -103,13 +110,26 @@ def evaluate_segmenter(
     scores: dict[Overlap, DetectionScore] = {overlap: DetectionScore(overlap) for overlap in overlaps}
     with_rows = any((f.name or "").startswith(BEHIND) for image in images for f in image.fruits)
     front = {overlap: DetectionScore(overlap) for overlap in overlaps} if with_rows else {}
+    others = {
+        name: {o: DetectionScore(o) for o in kinds} for name, kinds in _other_classes(segmenter, images)
+    }
     seconds = []
     for number, image in enumerate(images):
         picture = image.load()
         depth = image.load_depth()
         start = time.perf_counter()
-        found = segmenter(picture, None if depth is None else depth.astype(np.float32))
+        given = None if depth is None else depth.astype(np.float32)
+        if isinstance(segmenter, ThingSegmenter):
+            things = segmenter.things(picture, given)
+            found = things.fruits()
+        else:
+            things = found = segmenter(picture, given)
         seconds.append(time.perf_counter() - start)
+        for name, by_overlap in others.items():
+            if name not in PLANT_CATEGORIES or image.named(*PLANT_CATEGORIES):
+                own = things.chosen(np.array([category == name for category in things.categories], bool))
+                for score in by_overlap.values():
+                    score.add(own, image_truth(image, smallest_share, category=name))
         truth = image_truth(image, smallest_share)
         counted = without_narrow(found, truth)
         for score in scores.values():
@@ -142,11 +162,30 @@ def evaluate_segmenter(
             f"front_{overlap}_AP50": score.precision_recall().average_precision,
         }
         metrics |= {f"coco_front_{overlap}_{k}": v for k, v in score.coco_metrics().items()}
+    for name, by_overlap in others.items():
+        metrics[f"{name}_things"] = by_overlap["box"].fruits
+        for overlap, score in by_overlap.items():
+            metrics[f"{name}_{overlap}_AP50"] = score.precision_recall().average_precision
+            metrics |= {f"coco_{name}_{overlap}_{k}": v for k, v in score.coco_metrics().items()}
     metrics["median_seconds"] = float(np.median(seconds))
     plot_precision_recall(curves, out / "precision_recall.png")
     plot_overlaps({k: score.precision_by_overlap() for k, score in scores.items()}, out / "overlaps.png")
     write_picture(out / "pictures.jpg", contact_sheet(drawn))
     return SegmenterEvaluation(metrics=metrics, worst=tuple(worst))
+
+
+def _other_classes(
+    segmenter: Segmenter, images: Sequence[AnnotatedImage]
+) -> list[tuple[str, tuple[Overlap, ...]]]:
+    """What a segmenter tells besides fruits and somebody annotated, and by what it can be compared."""
+    told = segmenter.categories if isinstance(segmenter, ThingSegmenter) else ()
+    found: list[tuple[str, tuple[Overlap, ...]]] = []
+    for name in told:
+        things = [] if is_fruit(name) else [thing for image in images for thing in image.named(name)]
+        if things:
+            masks = all(thing.visible_mask is not None for thing in things)
+            found.append((name, ("box", "mask") if masks else ("box",)))
+    return found
 
 
 def chosen_images(images: Sequence[AnnotatedImage], limit: int | None) -> Sequence[AnnotatedImage]:
@@ -180,11 +219,11 @@ def match_boxes(
 
 
 def coco_cells(metrics: Mapping[str, float]) -> tuple[list[str], list[list[str]]]:
-    """COCO's metrics of `evaluate_segmenter` as head and lines of a table: boxes, masks, the front row."""
+    """COCO's metrics of `evaluate_segmenter` as head and lines of a table: boxes, masks, front row, other classes."""
     columns = {"AP50": "AP50", "AP50-95": "AP", "AP75": "AP75", "AR": "AR100"}
     columns |= {f"{kind} {size}": f"{kind}_{size}" for size in COCO_SIZES for kind in ("AP", "AR")}
     rows = []
-    for overlap in ("box", "mask", "front_box", "front_mask"):
+    for overlap in (key[5:-5] for key in metrics if key.startswith("coco_") and key.endswith("_AP50")):
         values = [metrics.get(f"coco_{overlap}_{key}") for key in columns.values()]
         if None not in values:
             # COCO gives -1 where there is no fruit of a size.

@@ -42,6 +42,8 @@ COCO_WORDS: Final = (
 
 FRONT_WORDS: Final = " Lines that begin with front count only the fruits of the row in front of the camera."
 
+OTHER_WORDS: Final = " Lines and columns of a leaf, a stem or a robot count these instead of fruits."
+
 NAMES: Final = {
     "AP50": "AP at an overlap of 0.5 (0 to 1)",
     "precision": f"precision above a score of {WORKING_SCORE:g} (0 to 1)",
@@ -114,7 +116,12 @@ def write_evaluation_page(judged: SegmenterEvaluation, out: Path, described: Map
             section(
                 f"AP and recall by size, as COCO defines them, {of}",
                 table(head, rows),
-                paragraph(COCO_WORDS + (FRONT_WORDS if "front_fruits" in metrics else ""), "caption"),
+                paragraph(
+                    COCO_WORDS
+                    + (FRONT_WORDS if "front_fruits" in metrics else "")
+                    + (OTHER_WORDS if _other_classes(metrics) else ""),
+                    "caption",
+                ),
             ),
             section(f"At an overlap of 0.5, {of}", table(*_plain(metrics))),
         ],
@@ -124,16 +131,27 @@ def write_evaluation_page(judged: SegmenterEvaluation, out: Path, described: Map
 
 def _plain(metrics: Mapping[str, float]) -> tuple[tuple[str, ...], list[tuple[str, ...]]]:
     """Head and lines of a table of the thesis's figures, a column for boxes and one for masks."""
-    kinds = [kind for kind in ("box", "mask", "front_box", "front_mask") if f"{kind}_AP50" in metrics]
+    kinds = [
+        kind
+        for of in ("", "front_", *(f"{name}_" for name in _other_classes(metrics)))
+        for kind in (f"{of}box", f"{of}mask")
+        if f"{kind}_AP50" in metrics
+    ]
     head = ("figure", *(_plural(kind).replace("_", " ") for kind in kinds))
     rows = [
         (text, *("" if (v := metrics.get(f"{kind}_{name}")) is None else f"{v:.4f}" for kind in kinds))
         for name, text in NAMES.items()
     ]
-    if "front_fruits" in metrics:
-        counts = {"front": int(metrics["front_fruits"]), "all": int(metrics["fruits"])}
-        rows.append(("fruits", *(str(counts["front" if "front" in kind else "all"]) for kind in kinds)))
+    counted = {"front": "front_fruits", **{name: f"{name}_things" for name in _other_classes(metrics)}}
+    if any(key in metrics for key in counted.values()):
+        of = [counted.get(kind.split("_")[0], "fruits") for kind in kinds]
+        rows.append(("how many", *(str(int(metrics[key])) for key in of)))
     return head, rows
+
+
+def _other_classes(metrics: Mapping[str, float]) -> list[str]:
+    """Classes besides fruits that were judged."""
+    return [key.removesuffix("_things") for key in metrics if key.endswith("_things")]
 
 
 def _picture(judged: JudgedPicture) -> str:

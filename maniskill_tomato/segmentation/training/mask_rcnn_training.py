@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 from torchvision.models.detection import MaskRCNN
 
-from maniskill_tomato.segmentation.datasets.annotations import CATEGORIES, is_fruit
+from maniskill_tomato.segmentation.datasets.annotations import CATEGORIES, PLANT_CATEGORIES, is_fruit
 from maniskill_tomato.segmentation.detector_configs import MaskRcnnConfig
 from maniskill_tomato.segmentation.instances import TOMATO
 from maniskill_tomato.segmentation.mask_rcnn import build_mask_rcnn
@@ -47,17 +47,20 @@ class MaskRcnnTraining(DetectorTraining[MaskRCNN]):
         Args:
             config: How to train.
             images: What to train on; without masks, a picture does not train the mask head. Its `things` are those of
-                the configuration.
+                the configuration. If leaves or stems are among them, only the images that name some are kept.
             pretrained: Start from ImageNet weights of the backbone.
             seed: Of the weights and the pictures.
             log_every: Steps between two lines of the history.
 
         Raises:
+            InvalidInputError: Leaves or stems are to be learned, and a set has none annotated.
             MissingWeightsError: The backbone's weights cannot be downloaded.
             MissingPackageError: They come from a package that is not installed.
         """
+        plants = [name for name in config.categories if name in PLANT_CATEGORIES]
+        images = replace(images, things=[name for name in config.categories if name != TOMATO])
         super().__init__(
-            replace(images, things=[name for name in config.categories if name != TOMATO]),
+            images.naming(plants) if plants else images,
             steps=config.epochs * config.steps_per_epoch,
             batch_size=config.batch_size,
             log_every=min(log_every, config.steps_per_epoch),

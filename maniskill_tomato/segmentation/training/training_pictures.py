@@ -1,7 +1,7 @@
 """Pictures that detectors are trained on, drawn from sets of annotated images."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -99,6 +99,32 @@ class TrainingImages:
         if unknown := [name for name in self.things if name not in CATEGORIES]:
             raise InvalidInputError.choice("a thing to learn", unknown[0], CATEGORIES)
         self._drawn: dict[tuple[int, int], TrainingPicture] = {}
+
+    def naming(self, categories: Sequence[str]) -> "TrainingImages":
+        """The images that name a thing of one of these categories.
+
+        An image that names none, such as a photo in which somebody framed the fruits alone, would teach that its leaves
+        are background.
+
+        Args:
+            categories: Such as `PLANT_CATEGORIES`.
+
+        Raises:
+            InvalidInputError: A set has none of a category.
+        """
+        for number, images in enumerate(self.sets):
+            for name in categories:
+                if not any(image.named(name) for image in images):
+                    raise InvalidInputError(
+                        f"none of the {len(images)} images in set {number + 1} of {len(self.sets)} has a {name} "
+                        "annotated, so that it would be learned as background; train on rendered images "
+                        f"(`maniskill-tomato dataset`), or leave {name} out of the classes"
+                    )
+
+        def kept(images: Sequence[AnnotatedImage]) -> tuple[AnnotatedImage, ...]:
+            return tuple(image for image in images if image.named(*categories))
+
+        return replace(self, sets=[kept(images) for images in self.sets], validation=kept(self.validation))
 
     @property
     def with_masks(self) -> bool:
