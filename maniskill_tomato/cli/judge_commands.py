@@ -18,7 +18,9 @@ from maniskill_tomato.cli.early_checks import (
 from maniskill_tomato.cli.shared_options import say
 from maniskill_tomato.experiments.configs import PerceptionComparisonConfig, TwinConfig
 
-OcclusionModelName = Literal["thesis", "improved", "sphere", "amodal"]
+OcclusionModelName = Literal[
+    "thesis", "thesis_watershed", "thesis_classifier", "improved", "sphere", "amodal"
+]
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -43,6 +43,8 @@ ABOUT: Final = (
 
 MODELS: Final = {
     "thesis": "thesis: the thesis's ten steps of image processing, which look for red behind the leaves.",
+    "thesis_watershed": "thesis_watershed: the same, and a watershed divides outlines with several tomatoes in them.",
+    "thesis_classifier": "thesis_classifier: the same with a polynomial classifier of pixel coordinates.",
     "improved": "improved: what the thesis proposes for later work; steps scaled with the size of the tomato.",
     "sphere": "sphere: fits a sphere to the visible outline and the depth; what the robot uses.",
     "amodal": "amodal: the light segmenter's guess at the box of the whole tomato, without depth.",

@@ -21,6 +21,7 @@ from maniskill_tomato.sensing.visible_fraction.estimate import (
     filled_depth,
     fruit_depth,
 )
+from maniskill_tomato.sensing.visible_fraction.separation import Separation, check_separation, separated
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -35,8 +36,11 @@ class ImprovedConfig:
     """The window reaches so many diameters beyond the mask."""
     behind_share: float = 0.5
     """How far behind the tomato's own depth a pixel is background, in diameters."""
+    separation: Separation = "watershed"
+    """What tells touching tomatoes apart."""
 
     def __post_init__(self) -> None:
+        check_separation(self.separation)
         for name in ("diameter_m", "kernel_share", "margin", "behind_share"):
             if not getattr(self, name) > 0:
                 raise InvalidInputError(f"{name} must be positive, got {getattr(self, name)}")
@@ -71,8 +75,12 @@ class ImprovedModel:
         in_front = (z > 0) & (z < own + 0.1 * c.diameter_m) & ~here
         allowed = here | in_front
         grown = self._bridged(here, allowed, size)
-        if others:
-            grown = _separated(view.rgb[window], grown, here, others)
+        beside = cv2.dilate(grown, np.ones((3, 3), np.uint8)) > 0
+        touching = [other for other in others if (other & beside).any()]
+        if touching:
+            region = np.any([grown > 0, *touching], axis=0)
+            told = separated(c.separation, region, [here, *touching])
+            grown = np.asarray(((told == 0) | here).astype(np.uint8) * 255)
         pieces = operations.outlines(grown, 1.0)
         if not pieces:
             return Estimate.failed()
@@ -96,16 +104,3 @@ class ImprovedModel:
         )
         closed = cv2.morphologyEx(padded, cv2.MORPH_CLOSE, kernel)[width:-width, width:-width]
         return np.asarray(np.where(allowed, closed, 0), dtype=np.uint8)
-
-
-def _separated(rgb: UInt8, grown: UInt8, here: BinaryMask, others: list[BinaryMask]) -> UInt8:
-    """The part of a grown mask that a watershed gives to its own seed and not to other tomatoes."""
-    markers = np.zeros(here.shape, dtype=np.int32)
-    reached = grown > 0
-    for other in others:
-        markers[other] = 2
-        reached = reached | other
-    markers[~reached] = 3
-    markers[here] = 1
-    cv2.watershed(np.ascontiguousarray(rgb), markers)
-    return np.asarray(((markers == 1) | here).astype(np.uint8) * 255)

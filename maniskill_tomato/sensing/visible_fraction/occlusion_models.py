@@ -8,10 +8,12 @@ from maniskill_tomato.sensing.visible_fraction.amodal import AmodalModel
 from maniskill_tomato.sensing.visible_fraction.estimate import OcclusionModel
 from maniskill_tomato.sensing.visible_fraction.improved import ImprovedModel
 from maniskill_tomato.sensing.visible_fraction.sphere import SphereModel
-from maniskill_tomato.sensing.visible_fraction.thesis import ThesisModel
+from maniskill_tomato.sensing.visible_fraction.thesis import ThesisConfig, ThesisModel
 
 OCCLUSION_MODELS: Final[dict[str, Callable[[], OcclusionModel]]] = {
     "thesis": ThesisModel,
+    "thesis_watershed": lambda: ThesisModel(ThesisConfig(separation="watershed")),
+    "thesis_classifier": lambda: ThesisModel(ThesisConfig(separation="polynomial")),
     "improved": ImprovedModel,
     "sphere": SphereModel,
     "amodal": AmodalModel,

@@ -1,11 +1,13 @@
 """The thesis's occlusion model: the ten steps of 4-2-4, with constants for all images."""
 
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import cv2
 import numpy as np
 
 from maniskill_tomato.errors import InvalidInputError
+from maniskill_tomato.segmentation.masks import BinaryMask
 from maniskill_tomato.sensing.visible_fraction import image_operations as operations
 from maniskill_tomato.sensing.visible_fraction.estimate import (
     Estimate,
@@ -15,6 +17,7 @@ from maniskill_tomato.sensing.visible_fraction.estimate import (
     fruit_depth,
 )
 from maniskill_tomato.sensing.visible_fraction.image_operations import Contour, Ellipse
+from maniskill_tomato.sensing.visible_fraction.separation import Separation, check_separation, separated
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -34,8 +37,12 @@ class ThesisConfig:
     """How far behind the tomatoes' own depth a pixel is taken for background, in [m]."""
     smallest: float = 60.0
     """Smallest contour, in [px]."""
+    separation: Separation | None = None
+    """What divides a contour with several tomatoes in it (6-2); None leaves it whole, as section 4-2-4 does."""
 
     def __post_init__(self) -> None:
+        if self.separation is not None:
+            check_separation(self.separation)
         if not 0 <= self.leaf_threshold < 255:
             raise InvalidInputError(f"leaf_threshold must be from 0 to 254, got {self.leaf_threshold}")
         for name in ("inpaint_radius", "erosion", "dilation", "behind_m", "smallest"):
@@ -56,7 +63,9 @@ class ThesisSteps:
     binary: UInt8
     """(e) I_bin."""
     contours: tuple[Contour, ...]
-    """(f) of I_bin."""
+    """(f) of I_bin, divided if that is asked for."""
+    seen: tuple[BinaryMask, ...]
+    """Which visible pixels count for each: those of all tomatoes, or of its own if it was divided."""
     ellipses: tuple[Ellipse, ...]
     """(g) fitted to them."""
     whole: tuple[UInt8, ...]
@@ -85,13 +94,13 @@ class ThesisModel:
         # A camera's holes lie beside what is near and show what is behind it; the thesis's simulated one had none.
         depth_m = filled_depth(view.depth_m)
         binary = operations.remove_deeper(binary, depth_m, farthest)
-        contours, ellipses, whole, fractions = [], [], [], []
-        for contour in operations.outlines(binary, c.smallest):
+        contours, visible, ellipses, whole, fractions = [], [], [], [], []
+        for contour, seen in self._divided(operations.outlines(binary, c.smallest), view):
             ellipse = operations.fit_ellipse(contour)
             if ellipse is None:
                 continue
             inside = operations.fill_ellipse(ellipse, shape)
-            own = fruit_depth(view.depth_m, (inside > 0) & (tomatoes > 0))
+            own = fruit_depth(view.depth_m, (inside > 0) & seen)
             if not np.isfinite(own):
                 continue
             # Only the largest of the new contours is the tomato; the depth filter leaves crumbs.
@@ -103,26 +112,54 @@ class ThesisModel:
             cv2.drawContours(new, [max(pieces, key=cv2.contourArea)], -1, 255, -1)
             total = int(np.count_nonzero(new))
             contours.append(contour)
+            visible.append(seen)
             ellipses.append(ellipse)
             whole.append(new)
-            fractions.append(int(np.count_nonzero((new > 0) & (tomatoes > 0))) / total)
+            fractions.append(int(np.count_nonzero((new > 0) & seen)) / total)
         return ThesisSteps(
             tomatoes=tomatoes,
             leaves=leaves,
             inpainted=inpainted,
             binary=binary,
             contours=tuple(contours),
+            seen=tuple(visible),
             ellipses=tuple(ellipses),
             whole=tuple(whole),
             fractions=tuple(fractions),
         )
+
+    def _divided(
+        self, contours: Sequence[Contour], view: SegmentedImage
+    ) -> Iterator[tuple[Contour, BinaryMask]]:
+        """Each contour with the pixels that count as visible in it; one that holds several tomatoes gives several."""
+        how = self.config.separation
+        tomatoes = operations.combine_masks(view.masks, view.rgb.shape[:2]) > 0
+        for contour in contours:
+            left, top, width, height = cv2.boundingRect(contour)
+            window = (slice(top, top + height), slice(left, left + width))
+            filled = np.zeros((height, width), np.uint8)
+            cv2.drawContours(filled, [contour], -1, 255, -1, offset=(-left, -top))
+            groups = [(mask, own) for mask in view.masks if (own := mask[window] & (filled > 0)).any()]
+            if how is None or len(groups) < 2:
+                yield contour, tomatoes
+                continue
+            told = separated(how, filled > 0, [own for _, own in groups])
+            for k, (mask, _) in enumerate(groups):
+                part = np.zeros(tomatoes.shape, np.uint8)
+                part[window] = (told == k) * 255
+                pieces = operations.outlines(part, self.config.smallest)
+                if pieces:
+                    yield max(pieces, key=cv2.contourArea), mask
 
     def __call__(self, view: SegmentedImage) -> list[Estimate]:
         """Each mask gets V and T of the contour that holds most of it; masks that no contour holds have failed."""
         result = self.run(view)
         estimates = []
         for mask in view.masks:
-            shares = [int(np.count_nonzero(whole[mask])) for whole in result.whole]
+            shares = [
+                int(np.count_nonzero(whole[mask & seen]))
+                for whole, seen in zip(result.whole, result.seen, strict=True)
+            ]
             if not shares or max(shares) < 0.25 * np.count_nonzero(mask):
                 estimates.append(Estimate.failed())
                 continue
