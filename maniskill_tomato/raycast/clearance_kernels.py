@@ -7,14 +7,14 @@
 
 import warp as wp
 
-from maniskill_tomato.raycast.kernels import Scene, rotation, translation
+from maniskill_tomato.raycast.kernels import rotation, translation
 
 wp.set_module_options({"enable_backward": False})
 
 
 @wp.kernel
 def sphere_clearance(
-    scene: Scene,
+    plant_meshes: wp.array[wp.uint64],
     environments: wp.array[wp.int32],
     plant_poses: wp.array[wp.mat44],
     link_poses: wp.array3d[wp.mat44],
@@ -30,7 +30,7 @@ def sphere_clearance(
     centre_w = rotation(link) * wp.vec3(sphere[0], sphere[1], sphere[2]) + translation(link)
     pose = plant_poses[path]
     centre = wp.transpose(rotation(pose)) * (centre_w - translation(pose))
-    mesh = scene.plant_meshes[environments[path]]
+    mesh = plant_meshes[environments[path]]
     # Only what can make the result smaller is looked for.
     within = sphere[3] + wp.min(furthest, clearance[path])
     if within <= 0.0:

@@ -12,6 +12,7 @@ lengths of that direction, so it is a distance for a unit direction and a depth 
 
 import warp as wp
 
+from maniskill_tomato.raycast.mesh_rays import Tracer, any_hit, closest_hit
 from maniskill_tomato.robot.d435 import CAMERA_NEAR
 
 wp.set_module_options({"enable_backward": False})
@@ -32,6 +33,8 @@ LINK = wp.constant(2)
 class Scene:
     """The plants of N environments with at most F fruits, and the L links that have a mesh."""
 
+    tracer: Tracer
+    """What traces rays through the meshes."""
     plant_meshes: wp.array[wp.uint64]
     """All triangles of each plant. Shape (N,)."""
     fruit_counts: wp.array[wp.int32]
@@ -245,10 +248,10 @@ def first_hit(
     direction = views.plant_rotations[view] * direction_c
     origin = views.plant_positions[view] + start * direction
     mesh = scene.plant_meshes[views.environments[view]]
-    met = wp.mesh_query_ray(mesh, origin, direction, farthest - start)
-    if met.result:
+    met = closest_hit(scene.tracer, mesh, origin, direction, farthest - start)
+    if met.found:
         hit.kind = PLANT
-        hit.distance = met.t + start
+        hit.distance = met.distance + start
         hit.face = met.face
         hit.facing = wp.abs(wp.dot(wp.normalize(met.normal), wp.normalize(direction)))
     remaining = views.links_in_front[view]
@@ -259,10 +262,11 @@ def first_hit(
             first = views.link_positions[view, link] + start * ray
             last = views.link_positions[view, link] + hit.distance * ray
             if segment_meets_box(first, last, scene.link_lows[link], scene.link_highs[link]):
-                touched = wp.mesh_query_ray(scene.link_meshes[link], first, ray, hit.distance - start)
-                if touched.result:
+                length = hit.distance - start
+                touched = closest_hit(scene.tracer, scene.link_meshes[link], first, ray, length)
+                if touched.found:
                     hit.kind = LINK
-                    hit.distance = touched.t + start
+                    hit.distance = touched.distance + start
                     hit.facing = wp.abs(wp.dot(wp.normalize(touched.normal), wp.normalize(ray)))
         remaining = remaining >> 1
         link += 1
@@ -280,14 +284,14 @@ def is_hidden(
         if remaining & 1:
             ray = views.link_rotations[view, link] * direction_c
             first = views.link_positions[view, link] + start * ray
-            if wp.mesh_query_ray_anyhit(scene.link_meshes[link], first, ray, length):
+            if any_hit(scene.tracer, scene.link_meshes[link], first, ray, length):
                 return True
         remaining = remaining >> 1
         link += 1
     direction = views.plant_rotations[view] * direction_c
     origin = views.plant_positions[view] + start * direction
     mesh = scene.plant_meshes[views.environments[view]]
-    return wp.mesh_query_ray_anyhit(mesh, origin, direction, length)
+    return any_hit(scene.tracer, mesh, origin, direction, length)
 
 
 @wp.func
@@ -298,9 +302,9 @@ def fruit_distance(
     direction = views.plant_rotations[view] * direction_c
     origin = views.plant_positions[view] + start * direction
     mesh = scene.fruit_meshes[views.environments[view], fruit]
-    met = wp.mesh_query_ray(mesh, origin, direction, farthest)
-    if met.result:
-        return met.t + start
+    met = closest_hit(scene.tracer, mesh, origin, direction, farthest)
+    if met.found:
+        return met.distance + start
     return -1.0
 
 
@@ -319,4 +323,4 @@ def is_target(
     if wp.length(wp.cross(offset, wp.normalize(direction))) > sphere[3]:
         return False
     mesh = scene.fruit_meshes[env, views.targets[view]]
-    return wp.mesh_query_ray_anyhit(mesh, origin, direction, distance - start + SURFACE_GAP)
+    return any_hit(scene.tracer, mesh, origin, direction, distance - start + SURFACE_GAP)

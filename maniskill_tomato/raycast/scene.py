@@ -14,10 +14,11 @@ from torch import Tensor
 
 from maniskill_tomato.errors import InvalidInputError
 from maniskill_tomato.plants.organs import Plant
+from maniskill_tomato.raycast.embree import Backend, choose_backend
 from maniskill_tomato.raycast.images import CastImages, Picture
+from maniskill_tomato.raycast.meshes import LinkTriangles
 from maniskill_tomato.raycast.view_rays import ViewRays
 from maniskill_tomato.raycast.visibility import Visibility
-from maniskill_tomato.raycast.warp_meshes import LinkTriangles
 from maniskill_tomato.raycast.warp_scene import WarpScene
 from maniskill_tomato.robot.d435 import CameraIntrinsics
 from maniskill_tomato.robot.iiwa14 import LINK_NAMES, NUM_JOINTS
@@ -41,6 +42,7 @@ class RayScene:
         robot_meshes: LinkTriangles | None = None,
         rays_per_side: int = 16,
         device: str | torch.device = "cpu",
+        backend: Backend | None = None,
     ) -> None:
         """Builds the meshes.
 
@@ -50,9 +52,11 @@ class RayScene:
             robot_meshes: Links that can hide something, keyed by `iiwa14.LINK_NAMES`; None for no robot.
             rays_per_side: A visible fraction is counted with the square of this number of rays.
             device: Where the rays are cast and all tensors live: "cpu" or a CUDA device.
+            backend: What traces the rays, with the same answers; None for Embree on a CPU that has it, and else Warp.
 
         Raises:
-            InvalidInputError: No plants, a plant without fruits, an unknown link, or a number out of range.
+            InvalidInputError: No plants, a plant without fruits, an unknown link, a number out of range, or a backend
+                that is not to be had here.
         """
         if len(plants) == 0:
             raise InvalidInputError("plants must name the plant of at least one environment, got none")
@@ -64,7 +68,10 @@ class RayScene:
         self._intrinsics = intrinsics
         self._device = torch.device(device)
         self._plants = list(plants)
-        self._rays = WarpScene(plants, intrinsics, robot_meshes or {}, rays_per_side, self._device)
+        self._backend: Backend = choose_backend(self._device, backend)
+        self._rays = WarpScene(
+            plants, intrinsics, robot_meshes or {}, rays_per_side, self._device, self._backend
+        )
         n = len(plants)
         self._poses_shape, self._row_shape = (n, 4, 4), (n,)
         self._links_shape = (n, len(LINK_NAMES), 4, 4)
@@ -80,6 +87,11 @@ class RayScene:
     def device(self) -> torch.device:
         """Where the rays are cast."""
         return self._device
+
+    @property
+    def backend(self) -> Backend:
+        """What traces the rays."""
+        return self._backend
 
     @property
     def intrinsics(self) -> CameraIntrinsics:

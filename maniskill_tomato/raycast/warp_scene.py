@@ -1,7 +1,7 @@
-"""Rays traced by NVIDIA Warp, on the CPU or on CUDA: the triangles of a `RayScene` and the launches of its queries.
+"""The queries of a `RayScene` as kernels of NVIDIA Warp, on the CPU or on CUDA, with its triangles and their launches.
 
 `RayScene` checks shapes and ranges before it asks, and its methods say what the arguments mean. Only tensors pass
-between the two, all on the scene's device, so that another library can stand in Warp's place.
+between the two, all on the scene's device. The kernels have their rays traced by Embree or by Warp (`mesh_rays`).
 
 A query copies its arguments into tensors that recorded kernels read in place, runs them in torch's current stream and
 clones what they wrote. Each kind of query is recorded when it is first made.
@@ -25,6 +25,7 @@ from maniskill_tomato.raycast import (
     view_ray_kernels,
     visibility_kernels,
 )
+from maniskill_tomato.raycast.embree import Backend, load_embree
 from maniskill_tomato.raycast.images import (
     BACKGROUND_DEPTH,
     FIRST_ORGAN_LABEL,
@@ -33,9 +34,9 @@ from maniskill_tomato.raycast.images import (
     CastImages,
     Picture,
 )
+from maniskill_tomato.raycast.meshes import LinkMeshes, LinkTriangles, PlantMeshes, plant_meshes
 from maniskill_tomato.raycast.view_rays import NEAREST_DEPTH, RANGE, RAYS_PER_SIDE, ViewRays, ray_pattern
 from maniskill_tomato.raycast.visibility import Visibility, ray_lattice
-from maniskill_tomato.raycast.warp_meshes import LinkMeshes, LinkTriangles, PlantMeshes, plant_meshes
 from maniskill_tomato.robot.d435 import CAMERA_FAR, CameraIntrinsics
 from maniskill_tomato.robot.iiwa14 import LINK_NAMES
 from maniskill_tomato.robot.spheres import sphere_table
@@ -60,10 +61,12 @@ class WarpScene:
         robot_meshes: LinkTriangles,
         rays_per_side: int,
         device: torch.device,
+        backend: Backend,
     ) -> None:
         """Builds the meshes; the arguments are those of `RayScene`."""
         start_warp()
         self._device = device
+        self._backend: Backend = backend
         self._warp_device = str(wp.device_from_torch(str(device)))
         self._camera: Any = kernels.FieldOfView()
         self._camera.left = -intrinsics.cx / intrinsics.fx
@@ -75,10 +78,14 @@ class WarpScene:
         self._pattern = self._points(ray_lattice(rays_per_side))
         self._coarse_pattern = self._points(ray_lattice(_COARSE_RAYS_PER_SIDE))
 
-        self._shown = [plant_meshes(plant, self._warp_device) for plant in plants]
+        self._shown = [plant_meshes(plant, self._warp_device, backend) for plant in plants]
         self._roles: _RoleTable | None = None
-        self._links = LinkMeshes(robot_meshes, self._warp_device)
+        self._tells_distances = False
+        self._links = LinkMeshes(robot_meshes, self._warp_device, backend)
         self._scene: Any = kernels.Scene()
+        embree = load_embree() if backend == "embree" else None
+        if embree is not None:
+            self._scene.tracer.closest_hit, self._scene.tracer.any_hit = embree.closest_hit, embree.any_hit
         self._links.describe(self._scene, device)
         self._allocate_tables()
         self._views = _Views(len(plants), self._links.count, device)
@@ -91,7 +98,7 @@ class WarpScene:
         """Shows other plants in some environments, once all queries under way are done."""
         if not plants:
             return
-        meshes = {env: plant_meshes(plant, self._warp_device) for env, plant in plants.items()}
+        meshes = {env: plant_meshes(plant, self._warp_device, self._backend) for env, plant in plants.items()}
         # A new mesh is built in Warp's stream, and an old one must outlive the casts still under way with it.
         self._finish_work()
         for env, shown in meshes.items():
@@ -203,6 +210,9 @@ class WarpScene:
             In [m], negative where a triangle cuts a sphere. Shape (P,).
         """
         paths, samples = T_w_links.shape[:2]
+        if not self._tells_distances:
+            self._tells_distances = True
+            self._write_rows(range(len(self._shown)))
         recorded = self._recorded(self._record_clearance, paths, samples, farthest)
         environments, plants, links, every = recorded.inputs
         links.copy_(T_w_links)
@@ -229,6 +239,7 @@ class WarpScene:
         """Makes the tables of all plants, with room for the fruits of any of them, and forgets what read other ones."""
         n, fruits, device = len(self._shown), max(len(meshes.fruits) for meshes in self._shown), self._device
         self._plant_meshes = torch.zeros(n, dtype=torch.int64, device=device)
+        self._distance_meshes = torch.zeros(n, dtype=torch.int64, device=device)
         self._fruit_counts = torch.zeros(n, dtype=torch.int32, device=device)
         self._fruit_meshes = torch.zeros((n, fruits), dtype=torch.int64, device=device)
         self._fruit_spheres = torch.zeros((n, fruits, 4), device=device)
@@ -251,6 +262,9 @@ class WarpScene:
             ids[k, :count] = [mesh.id for mesh in meshes.fruits]
             spheres[k, :count], is_ripe[k, :count] = meshes.spheres, meshes.is_ripe
         rows = torch.tensor(list(envs), device=self._device)
+        if self._tells_distances:
+            nearby = torch.tensor([meshes.for_distances.id for meshes in shown])
+            self._distance_meshes[rows] = nearby.to(self._device)
         for table, values in (
             (self._plant_meshes, torch.tensor([meshes.whole.id for meshes in shown])),
             (self._fruit_counts, torch.tensor([len(meshes.fruits) for meshes in shown], dtype=torch.int32)),
@@ -349,7 +363,7 @@ class WarpScene:
         clearance = self._zeros(paths)
         sphere_links, spheres = (torch.tensor(table, device=self._device) for table in sphere_table())
         arguments = [
-            self._scene,
+            wp.from_torch(self._distance_meshes, dtype=wp.uint64),
             wp.from_torch(environments),
             wp.from_torch(plants, dtype=wp.mat44),
             wp.from_torch(links, dtype=wp.mat44),

@@ -18,6 +18,8 @@ from maniskill_tomato.robot.robot_description import link_meshes
 from maniskill_tomato.robot.spheres import CAMERA_SPHERES, sphere_table
 from maniskill_tomato.tasks.maniskill.iiwa14_agent import READY_QPOS
 
+pytestmark = pytest.mark.usefixtures("backend")
+
 PLANT_POSES = ((0.3, 0.1, 0.3), (0.4, -0.1, 0.0))
 
 

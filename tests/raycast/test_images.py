@@ -15,6 +15,8 @@ from maniskill_tomato.robot.d435 import CameraIntrinsics
 from maniskill_tomato.robot.iiwa14 import LINK_NAMES
 from maniskill_tomato.sensing.view_pattern import sample_view
 
+pytestmark = pytest.mark.usefixtures("backend")
+
 INTRINSICS = CameraIntrinsics.from_fov(width=160, height=120, fov_y=np.deg2rad(42.5))
 
 

@@ -27,6 +27,8 @@ from maniskill_tomato.robot.iiwa14 import LINK_NAMES
 from maniskill_tomato.robot.look_at import look_at_pose, look_frame
 from maniskill_tomato.robot.robot_description import link_meshes
 
+pytestmark = pytest.mark.usefixtures("backend")
+
 RAYS = RAYS_PER_SIDE**2
 RADIUS = 0.035
 WIDE = CameraIntrinsics(width=640, height=480, fx=250.0, fy=250.0, cx=320.0, cy=240.0)

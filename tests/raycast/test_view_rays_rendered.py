@@ -13,7 +13,7 @@ from maniskill_tomato.robot.look_at import camera_to_viewpoint, look_at_pose
 from maniskill_tomato.sensing.observation import ViewpointObserver
 from maniskill_tomato.sensing.view_pattern import sample_view
 
-pytestmark = pytest.mark.render
+pytestmark = [pytest.mark.render, pytest.mark.usefixtures("backend")]
 
 PLANTS = 8
 VIEWS = 3

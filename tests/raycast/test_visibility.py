@@ -13,9 +13,10 @@ from maniskill_tomato.errors import InvalidInputError
 from maniskill_tomato.plants.generator import generate_plant
 from maniskill_tomato.plants.organs import Fruit, MeshPart, Organ, Plant, Ripeness, SemanticClass
 from maniskill_tomato.plants.plant_store import PLANT_STORE
+from maniskill_tomato.raycast.embree import Backend
+from maniskill_tomato.raycast.meshes import LinkTriangles, PlantMeshes
 from maniskill_tomato.raycast.scene import RayScene
 from maniskill_tomato.raycast.visibility import Visibility
-from maniskill_tomato.raycast.warp_meshes import LinkTriangles, PlantMeshes
 from maniskill_tomato.robot.d435 import (
     CAMERA_NEAR,
     CameraIntrinsics,
@@ -25,6 +26,8 @@ from maniskill_tomato.robot.d435 import (
 from maniskill_tomato.robot.iiwa14 import LINK_NAMES
 from maniskill_tomato.robot.kinematics import link_transforms
 from maniskill_tomato.robot.robot_description import link_meshes
+
+pytestmark = pytest.mark.usefixtures("backend")
 
 Float = NDArray[np.float64]
 FRUIT_CLASS: dict[Ripeness, SemanticClass] = {
@@ -477,10 +480,10 @@ def test_a_replaced_plant_is_seen_in_its_environment_only(device: str) -> None:
     assert fractions(0, 0) == [0.0, 1.0]
 
 
-def test_plants_no_longer_shown_are_let_go(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_plants_no_longer_shown_are_let_go(monkeypatch: pytest.MonkeyPatch, backend: Backend) -> None:
     first = make_plant([(ahead(), "ripe")])
     room = 9
-    monkeypatch.setattr(PLANT_STORE, "_limit", lambda: room * PlantMeshes(first, "cpu").size)
+    monkeypatch.setattr(PLANT_STORE, "_limit", lambda: room * PlantMeshes(first, "cpu", backend).size)
     scene = RayScene([first], CAMERA)
     shown = []
     for _ in range(room + 7):

@@ -41,7 +41,7 @@ NAVIGATION: Final[dict[str, tuple[str, ...]]] = {
         "results/stopping",
         "results/mutation",
     ),
-    "About": ("compatibility", "security", "licences", "changelog"),
+    "About": ("performance", "compatibility", "security", "licences", "changelog"),
 }
 """The pages by their names on the site, as its side bar shows them; `api/` is written from docstrings."""
 
