@@ -28,8 +28,7 @@ from maniskill_tomato.deploy.real_agent import IiwaRealAgent
 from maniskill_tomato.deploy.robot_perception import RobotBelief, Sighting
 from maniskill_tomato.robot.inverse_kinematics import Reach
 from maniskill_tomato.robot.viewpoint_move import viewpoint_of
-from maniskill_tomato.tasks.arm_moves import ACTION_SIZES
-from maniskill_tomato.tasks.maniskill.controllers import CONTROL_MODES
+from maniskill_tomato.tasks.arm_moves import ACTION_SIZES, CONTROL_MODES
 from maniskill_tomato.tasks.row.row_config import GeneralTaskConfig
 from maniskill_tomato.tasks.world import World, check_action
 

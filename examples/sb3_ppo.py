@@ -1,22 +1,19 @@
-"""Stable-Baselines3's PPO on several viewpoint environments at once, in one process or in one process each.
+"""Stable-Baselines3's PPO on many viewpoint environments at once, all in this process.
 
 Needs the extra `sb3`. Example:
-    python examples/sb3_ppo.py --num-envs 2 --subprocesses --total-timesteps 15000
+    python examples/sb3_ppo.py --num-envs 16 --total-timesteps 100000
 """
 
-import functools
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
-import gymnasium as gym
 import torch
 import tyro
 from stable_baselines3 import PPO
-from stable_baselines3.common.monitor import Monitor
-from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecEnv
+from stable_baselines3.common.vec_env import VecEnv, VecMonitor
 
-from maniskill_tomato.learning.rl.gymnasium_env import Array, make_gymnasium_env
+from maniskill_tomato.learning.rl.gymnasium_vec import make_gymnasium_vec
+from maniskill_tomato.learning.rl.sb3_vec import GymnasiumVecEnv
 
 GAMMA = 0.9
 
@@ -27,13 +24,11 @@ class Args:
 
     env_id: str = "TomatoViewpointGuided-v1"
     """Id of the task."""
-    total_timesteps: int = 15_000
+    total_timesteps: int = 60_000
     """Environment steps over all environments."""
-    num_envs: int = 2
+    num_envs: int = 16
     """Environments at once."""
-    subprocesses: bool = False
-    """Give each environment a process of its own."""
-    n_steps: int = 250
+    n_steps: int = 64
     """Steps of a rollout in each environment."""
     seed: int = 0
     """Seed of weights, exploration and environments."""
@@ -41,18 +36,10 @@ class Args:
     """Evaluation episodes."""
 
 
-def make_monitored(env_id: str) -> Monitor[Array, Array]:
-    """One environment; at the top level of the module, so that another process can import it."""
-    torch.set_num_threads(1)
-    return Monitor(make_gymnasium_env(env_id, gamma=GAMMA))
-
-
-def make_vec_env(args: Args, count: int) -> VecEnv:
-    """`count` environments; `forkserver`, because a forked copy of a running simulator is not safe."""
-    makers: list[Callable[[], gym.Env[Any, Any]]] = [functools.partial(make_monitored, args.env_id)] * count
-    if args.subprocesses and count > 1:
-        return SubprocVecEnv(makers, start_method="forkserver")
-    return DummyVecEnv(makers)
+def make_vec_env(env_id: str, num_envs: int) -> VecEnv:
+    """`num_envs` environments in Stable-Baselines3's form."""
+    env = make_gymnasium_vec(env_id, num_envs, gamma=GAMMA, autoreset_mode="SameStep")
+    return VecMonitor(GymnasiumVecEnv(env))
 
 
 def evaluate(model: PPO, env: VecEnv, episodes: int) -> tuple[float, float]:
@@ -73,12 +60,12 @@ def evaluate(model: PPO, env: VecEnv, episodes: int) -> tuple[float, float]:
 def main(args: Args) -> None:
     """Trains, evaluates, prints."""
     torch.set_num_threads(1)  # These networks are too small to gain from more.
-    env = make_vec_env(args, args.num_envs)
+    env = make_vec_env(args.env_id, args.num_envs)
     model = PPO(
         "MlpPolicy",
         env,
         n_steps=args.n_steps,
-        batch_size=100,
+        batch_size=128,
         gamma=GAMMA,
         policy_kwargs={"net_arch": [128, 128], "log_std_init": -1.2},
         seed=args.seed,
@@ -86,7 +73,7 @@ def main(args: Args) -> None:
     )
     model.learn(args.total_timesteps)
     env.close()
-    test_env = make_vec_env(args, 1)
+    test_env = make_vec_env(args.env_id, 1)
     success, steps = evaluate(model, test_env, args.eval_episodes)
     print(f"success {success:.0%} of {args.eval_episodes} episodes, {steps:.1f} steps on average")
     test_env.close()

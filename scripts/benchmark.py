@@ -50,6 +50,10 @@ GUIDED = "TomatoViewpointGuided-v1"
 GENERAL = "TomatoViewpoint-v1"
 EMPTY = "TomatoBenchmarkEmpty-v1"
 MIB = 2**20
+VECTOR_SIZES = (1, 64, 256)
+"""Environments at once that `gymnasium.make_vec` is measured with."""
+POOL: dict[str, Any] = {"pool": 16}
+"""Plants of the general task where growing them is not what is measured."""
 IMAGE_SIZES = ((64, 48), (84, 63), (128, 96))
 """Of policies' images, in [px]."""
 
@@ -137,6 +141,56 @@ def growth(work: Callable[[], object], times: int) -> dict[str, float]:
 def small_actions(size: int) -> np.ndarray[Any, Any]:
     """Increments of up to 5 cm and 0.05 rad, which keep the arm in its workspace."""
     return np.random.default_rng(0).uniform(-0.05, 0.05, (512, size)).astype(np.float32)
+
+
+def vector_steps_per_second(env: Any, steps: int) -> float:
+    """Rate of single environments' steps in a vector of them, with moves as of `small_actions`."""
+    rng = np.random.default_rng(0)
+    moves = iter(rng.uniform(-0.05, 0.05, (steps + 1, *env.action_space.shape)).astype(np.float32))
+    return float(env.num_envs * per_second(lambda: env.step(next(moves)), steps))
+
+
+def vector_rates(repeats: int, singles: dict[str, Any]) -> dict[str, Any]:
+    """Environments' steps and resets a second of `gymnasium.make_vec`, by task and number of environments.
+
+    Steps are taken without resets, as by `steps_per_second`; a reset begins an episode in every environment at once,
+    with plants that were grown before.
+
+    Args:
+        repeats: Of which each rate is the median, taken in turns.
+        singles: By the task's name, ManiSkill's environment of it, for the ratios.
+    """
+    rates: dict[str, list[float]] = {}
+    kinds: dict[str, tuple[str, dict[str, Any]]] = {
+        "guided": (GUIDED, {}),
+        "general": (GENERAL, {"plant": POOL}),
+    }
+    plain: dict[str, Any] = {"arrays": "torch", "autoreset_mode": "Disabled"}
+    envs: dict[tuple[str, int], Any] = {
+        (name, n): gym.make_vec(env_id, n, "vector_entry_point", **plain, **options)
+        for name, (env_id, options) in kinds.items()
+        for n in VECTOR_SIZES
+    }
+    for env in envs.values():
+        env.reset(seed=0)
+    for _ in range(repeats):
+        for name, env in singles.items():
+            actions = small_actions(env.action_space.shape[-1])
+            rates.setdefault(f"{name}_simulated_steps", []).append(steps_per_second(env, 120, actions))
+        for (name, n), env in envs.items():
+            rates.setdefault(f"{name}_resets_{n}", []).append(n * per_second(env.reset, max(1, 16 // n)))
+            rates.setdefault(f"{name}_steps_{n}", []).append(vector_steps_per_second(env, 20))
+    medians = {name: statistics.median(values) for name, values in rates.items()}
+    most = VECTOR_SIZES[-1]
+    return {
+        "per_second": {name: round(value, 1) for name, value in medians.items()},
+        "ratios": {
+            f"{name}_steps_{most}_over_simulated": round(
+                medians[f"{name}_steps_{most}"] / medians[f"{name}_simulated_steps"], 2
+            )
+            for name in singles
+        },
+    }
 
 
 def inverse_kinematics_rate(batch: int) -> float:
@@ -249,6 +303,7 @@ def main(args: Args) -> int:
     )
     guided = gym.make(GUIDED, **plain)
     new_plants = gym.make(GUIDED, plant={"seed": "train"}, **plain)
+    general = gym.make(GENERAL, plant=POOL, **plain)
     rendered = None
     if rendering_available():
         rendered = gym.make(
@@ -310,6 +365,7 @@ def main(args: Args) -> int:
             "steps": growth(step_or_reset, args.memory_steps),
             "resets_with_new_plants": growth(new_plants.reset, args.memory_resets),
         },
+        "vector": vector_rates(args.repeats, {"guided": guided, "general": general}),
         "images_per_second": image_rates(args.repeats, rendered is not None),
         "look": look_times(args.look_episodes, 4) if rendered else None,
         "left_out": []
@@ -318,7 +374,7 @@ def main(args: Args) -> int:
             "guided_rendered_128_steps, rendered images, look: no Vulkan device; `make vulkan` installs one"
         ],
     }
-    for env in (empty, guided, new_plants, rendered):
+    for env in (empty, guided, new_plants, general, rendered):
         if env is not None:
             env.close()
     text = json.dumps(result, indent=2)

@@ -35,28 +35,41 @@ Scene = Literal["hidden", "thesis"]
 or the scene in which the thesis's numbers hold, seen by the D435 of its Gazebo."""
 
 
-def _register(env_id: str, entry_point: str, max_episode_steps: int) -> None:
+class _SingleWrappers(tuple[WrapperSpec, ...]):
+    """Wrappers that `gymnasium.make` puts on, as it goes through them, and that count as none.
+
+    `gymnasium.make_vec` counts a specification's wrappers and refuses any, because it would not put them on.
+    """
+
+    def __len__(self) -> int:
+        return 0
+
+
+def _register(env_id: str, entry_point: str, vector_entry_point: str, max_episode_steps: int) -> None:
     if env_id in registry:
         return
     register(
         id=env_id,
-        entry_point=entry_point,
+        entry_point=f"maniskill_tomato.tasks.maniskill.registered_envs:{entry_point}",
+        vector_entry_point=f"maniskill_tomato.tasks.registered_vectors:{vector_entry_point}",
         max_episode_steps=max_episode_steps,
         disable_env_checker=True,  # ManiSkill batches observations and rewards.
-        additional_wrappers=(
-            WrapperSpec(
-                name="MSTimeLimit",
-                entry_point="mani_skill.utils.registration:TimeLimitWrapper",
-                kwargs={"max_episode_steps": max_episode_steps},
-            ),
+        additional_wrappers=_SingleWrappers(
+            [
+                WrapperSpec(
+                    name="MSTimeLimit",
+                    entry_point="mani_skill.utils.registration:TimeLimitWrapper",
+                    kwargs={"max_episode_steps": max_episode_steps},
+                )
+            ]
         ),
     )
 
 
-for _env_id, _env_class, _steps in (
-    ("TomatoViewpointGuided-v1", "TomatoViewpointGuidedEnv", MAX_EPISODE_STEPS),
-    ("TomatoViewpointSparse-v1", "TomatoViewpointSparseEnv", MAX_EPISODE_STEPS),
-    ("TomatoViewpoint-v1", "TomatoViewpointGeneralEnv", MAX_GENERAL_STEPS),
-    ("TomatoViewpointRow-v1", "TomatoViewpointRowEnv", MAX_ROW_STEPS),
+for _env_id, _env_class, _vector, _steps in (
+    ("TomatoViewpointGuided-v1", "TomatoViewpointGuidedEnv", "make_guided", MAX_EPISODE_STEPS),
+    ("TomatoViewpointSparse-v1", "TomatoViewpointSparseEnv", "make_sparse", MAX_EPISODE_STEPS),
+    ("TomatoViewpoint-v1", "TomatoViewpointGeneralEnv", "make_general", MAX_GENERAL_STEPS),
+    ("TomatoViewpointRow-v1", "TomatoViewpointRowEnv", "make_row", MAX_ROW_STEPS),
 ):
-    _register(_env_id, f"maniskill_tomato.tasks.maniskill.registered_envs:{_env_class}", _steps)
+    _register(_env_id, _env_class, _vector, _steps)

@@ -20,6 +20,9 @@ Control = Literal["viewpoint", "look_at"]
 ACTION_SIZES: Mapping[Control, int] = {"viewpoint": 6, "look_at": 3}
 """Numbers of an action."""
 
+CONTROL_MODES: Mapping[str, Control] = {"pd_viewpoint": "viewpoint", "pd_look_at": "look_at"}
+"""The same in ManiSkill's words."""
+
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Plan:

@@ -101,6 +101,16 @@ class RowOptions(SearchOptions):
         check_choice("transits", self.transits, get_args(Transits))
 
 
+def check_env_id(env_id: str) -> None:
+    """Accepts the ids of this package's tasks.
+
+    Raises:
+        InvalidInputError: Another id; the message lists the allowed ones.
+    """
+    if env_id not in TASK_IDS:
+        raise InvalidInputError.choice("the environment id", env_id, TASK_IDS)
+
+
 def make_options(env_id: str, **options: Any) -> ThesisOptions | SearchOptions:
     """The options of a task, checked for their names.
 
@@ -110,8 +120,7 @@ def make_options(env_id: str, **options: Any) -> ThesisOptions | SearchOptions:
     kinds: dict[str, type[ThesisOptions] | type[SearchOptions]] = dict(
         zip(TASK_IDS, (ThesisOptions, ThesisOptions, SearchOptions, RowOptions), strict=True)
     )
-    if env_id not in kinds:
-        raise InvalidInputError.choice("the environment id", env_id, TASK_IDS)
+    check_env_id(env_id)
     kind = kinds[env_id]
     known = option_names(env_id)
     for name in options:
@@ -262,13 +271,13 @@ def make_setup(env_id: str, **options: Any) -> TaskSetup:
         InvalidInputError: The id or an option cannot be used.
     """
     checked = make_options(env_id, **options)
-    _check_integer("rays_per_side", checked.rays_per_side, 4, 256)
+    check_integer("rays_per_side", checked.rays_per_side, 4, 256)
     return _thesis_setup(checked) if isinstance(checked, ThesisOptions) else _search_setup(checked)
 
 
 def _thesis_setup(options: ThesisOptions) -> TaskSetup:
     task, others = options.task, options.other_targets
-    _check_integer("other_targets", others, 0)
+    check_integer("other_targets", others, 0)
     check_choice("perception", options.perception, get_args(Perception))
     camera = _camera_config(options)
     if others and options.perception != "ground_truth":
@@ -382,7 +391,12 @@ def check_choice(name: str, value: str | None, allowed: Iterable[str]) -> None:
         raise InvalidInputError.choice(name, value, allowed)
 
 
-def _check_integer(name: str, value: object, least: int, most: float = math.inf) -> None:
+def check_integer(name: str, value: object, least: int, most: float = math.inf) -> None:
+    """Accepts an integer of the option `name` in a range, ends included.
+
+    Raises:
+        InvalidInputError: It is none, or outside.
+    """
     if isinstance(value, bool) or not isinstance(value, int) or not least <= value <= most:
         allowed = f"of {least} or more" if most == math.inf else f"from {least} to {most}"
         raise InvalidInputError(f"{name} must be an integer {allowed}; got {value!r}")

@@ -57,11 +57,12 @@ class ObservedWorld:
                 spaces[PRIVILEGED] = _vector(whole)
             self.space = gym.spaces.Dict(spaces)
 
-    def observe(self, begun: Tensor | None) -> Observation:
+    def observe(self, begun: Tensor | None, *, moved: bool = False) -> Observation:
         """The present observation.
 
         Args:
             begun: The environments whose episode begins with it, none if None. Shape (b,).
+            moved: Whether the others have moved since the last observation; else they see what they saw.
         """
         world, eyes = self._world, self._eyes
         if eyes is None:
@@ -72,7 +73,7 @@ class ObservedWorld:
         if begun is not None:
             fresh[begun] = True
         seen = {STATE: torch.cat([parts[name] for name in names], dim=-1)}
-        seen |= self.frames.push(world.images(eyes.images), fresh)
+        seen |= self.frames.push(world.images(eyes.images), fresh, others_moved=moved)
         if eyes.privileged:
             seen[PRIVILEGED] = world.observation()
         return seen

@@ -219,9 +219,13 @@ class World:
         rows = self.env_rows(env_idx)
         if seed is not None:
             indices = rows.tolist()
-            for i, s in zip(indices, spread_seed(seed, len(indices)), strict=True):
-                self.rngs[i], self.seeds[i] = np.random.RandomState(s), s
+            self.seed(dict(zip(indices, spread_seed(seed, len(indices)), strict=True)))
         self.begin(rows, options or {})
+
+    def seed(self, seeds: Mapping[int, int]) -> None:
+        """Seeds the generators of some environments, by their index."""
+        for i, seed in seeds.items():
+            self.rngs[i], self.seeds[i] = np.random.RandomState(seed), seed
 
     def env_rows(self, env_idx: Tensor | Sequence[int] | None) -> Tensor:
         """Indices of environments as a tensor, all for None. Shape (b,).

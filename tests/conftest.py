@@ -92,7 +92,7 @@ def stored() -> "dict[str, list[EpisodeRecord]]":
     from maniskill_tomato.policies.opening import open_policy
     from maniskill_tomato.tasks.vector_env import make_vector_env
 
-    env = make_vector_env(STORED_ID, auto_reset=False, **STORED_OPTIONS)
+    env: Any = make_vector_env(STORED_ID, arrays="torch", autoreset_mode="Disabled", **STORED_OPTIONS)
     return {
         name: [run_episode(env, open_policy(name, env_id=STORED_ID), seed) for seed in (0, 1)]
         for name in ("nbv", "random_step")

@@ -6,7 +6,7 @@ import subprocess
 import sys
 from pathlib import Path
 from types import ModuleType
-from typing import Any
+from typing import Any, Literal
 
 import gymnasium as gym
 import numpy as np
@@ -21,6 +21,7 @@ from maniskill_tomato.learning.rl.gymnasium_env import (
     LearnableTask,
     make_gymnasium_env,
 )
+from maniskill_tomato.learning.rl.gymnasium_vec import make_gymnasium_vec
 from maniskill_tomato.tasks import THESIS_IDS
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -182,19 +183,89 @@ def test_stable_baselines_bootstraps_an_episode_that_ran_out_of_time_and_no_othe
     assert timeouts.any() and (ends & ~timeouts).any()
 
 
+@pytest.mark.parametrize("reward", ["task", "potential"])
+@pytest.mark.parametrize("mode", list(AutoresetMode)[:2])
+def test_many_prepared_environments_are_those_that_are_prepared_alone(
+    mode: AutoresetMode, reward: Literal["task", "potential"]
+) -> None:
+    options: dict[str, Any] = {"plant": {"seed": "train", "pool": 2}, "reward": reward, "gamma": 0.8}
+    envs = make_gymnasium_vec(THESIS_IDS[1], 3, autoreset_mode=mode, max_episode_steps=3, **options)
+
+    def alone() -> gym.Env[Any, Any]:
+        return gym.wrappers.TimeLimit(make_gymnasium_env(THESIS_IDS[1], **options), 3)
+
+    reference: Any = SyncVectorEnv([alone] * 3, autoreset_mode=mode)
+    assert envs.action_space == reference.action_space
+    np.testing.assert_allclose(envs.reset(seed=2)[0], reference.reset(seed=2)[0], atol=1e-4)
+    rng, ends = np.random.default_rng(0), 0
+    for _ in range(12):
+        actions = 0.7 * rng.standard_normal((3, 6)).astype(np.float32)
+        found, expected = envs.step(actions), reference.step(actions)
+        for one, two in zip(found[:4], expected[:4], strict=True):
+            np.testing.assert_allclose(one, two, atol=1e-4)
+        np.testing.assert_allclose(found[4]["task_reward"], expected[4]["task_reward"], atol=1e-4)
+        for i in np.flatnonzero(expected[4].get("_final_obs", ())):
+            ends += 1
+            np.testing.assert_allclose(found[4]["final_obs"][i], expected[4]["final_obs"][i], atol=1e-4)
+            told, wanted = found[4]["final_info"], expected[4]["final_info"]
+            np.testing.assert_allclose(told["task_reward"][i], wanted["task_reward"][i], atol=1e-4)
+    assert (ends > 5) == (mode == AutoresetMode.SAME_STEP)
+    reference.close()
+
+
+def test_stable_baselines_is_told_where_an_episode_ended_and_why() -> None:
+    pytest.importorskip("stable_baselines3")
+    from stable_baselines3.common.vec_env import VecMonitor
+
+    from maniskill_tomato.learning.rl.sb3_vec import GymnasiumVecEnv
+
+    options: dict[str, Any] = {"max_episode_steps": 3, "autoreset_mode": "SameStep"}
+    own = make_gymnasium_vec(THESIS_IDS[1], 4, **options)
+    theirs: Any = VecMonitor(GymnasiumVecEnv(make_gymnasium_vec(THESIS_IDS[1], 4, **options)))
+    theirs.seed(7)
+    np.testing.assert_array_equal(theirs.reset(), own.reset(seed=7)[0])
+    rng, kinds = np.random.default_rng(1), set()
+    for _ in range(9):
+        actions = 0.7 * rng.standard_normal((4, 6)).astype(np.float32)
+        observations, rewards, dones, infos = theirs.step(actions)
+        expected, rewards_own, terminated, truncated, told = own.step(actions)
+        np.testing.assert_array_equal(observations, expected)
+        np.testing.assert_array_equal(rewards, rewards_own)
+        np.testing.assert_array_equal(dones, terminated | truncated)
+        for i, info in enumerate(infos):
+            assert bool(info) == dones[i]
+            if dones[i]:
+                np.testing.assert_array_equal(info["terminal_observation"], told["final_obs"][i])
+                assert info["is_success"] == told["final_info"]["success"][i]
+                assert info["TimeLimit.truncated"] == (truncated[i] and not terminated[i])
+                assert info["episode"]["l"] <= 3
+                kinds.add(info["TimeLimit.truncated"])
+    assert kinds == {True, False}
+    assert (
+        theirs.get_attr("max_steps", [1, 2]) == [3, 3] and theirs.env_is_wrapped(gym.Wrapper) == [False] * 4
+    )
+    with pytest.raises(InvalidInputError, match="autoreset_mode='SameStep'"):
+        GymnasiumVecEnv(make_gymnasium_vec(THESIS_IDS[1], 2))
+
+
+def test_a_vector_of_tensors_is_not_prepared_for_learners_of_arrays() -> None:
+    with pytest.raises(InvalidInputError, match="arrays='numpy'"):
+        make_gymnasium_vec(THESIS_IDS[0], 2, arrays="torch")
+    with pytest.raises(InvalidInputError, match="environment id"):
+        make_gymnasium_vec("CartPole-v1", 2)
+
+
 @pytest.mark.parametrize(
     "arguments",
     [
         ("sb3_td3.py", "--total-timesteps", "300", "--learning-starts", "150"),
-        pytest.param(
-            ("sb3_ppo.py", "--total-timesteps", "400", "--n-steps", "100", "--num-envs", "2"),
-            marks=pytest.mark.slow,
-        ),
+        ("sb3_ppo.py", "--total-timesteps", "400", "--n-steps", "50", "--num-envs", "4"),
+        ("cleanrl_style.py", "--total-timesteps", "400", "--learning-starts", "256", "--num-envs", "8"),
         pytest.param(
             (
                 "cleanrl_style.py",
                 *("--total-timesteps", "400", "--learning-starts", "256"),
-                *("--vectorization", "async", "--autoreset", "next-step", "--env-id", THESIS_IDS[1]),
+                *("--autoreset-mode", "NextStep", "--env-id", "TomatoViewpoint-v1"),
             ),
             marks=pytest.mark.slow,
         ),

@@ -158,12 +158,15 @@ class FrameStack:
         self.frames = frames
         self._held: dict[str, Tensor] = {}
 
-    def push(self, images: dict[str, Tensor], fresh: Tensor | None = None) -> dict[str, Tensor]:
+    def push(
+        self, images: dict[str, Tensor], fresh: Tensor | None = None, *, others_moved: bool = True
+    ) -> dict[str, Tensor]:
         """Takes new views in.
 
         Args:
             images: By kind, each of shape (B, H, W, C).
             fresh: The environments whose episode begins with this view, all the first time. Shape (B,), bool.
+            others_moved: Whether the view is new to the others as well; else they keep what they hold.
 
         Returns:
             The stacked views, each of shape (B, H, W, C x frames).
@@ -177,7 +180,7 @@ class FrameStack:
             if held is None:
                 stacked[kind] = first
                 continue
-            moved = torch.cat([held[..., new.shape[-1] :], new], dim=-1)
+            moved = torch.cat([held[..., new.shape[-1] :], new], dim=-1) if others_moved else held
             stacked[kind] = moved if fresh is None else torch.where(fresh[:, None, None, None], first, moved)
         self._held = stacked
         return dict(stacked)

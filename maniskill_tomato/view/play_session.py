@@ -52,7 +52,9 @@ class PlaySession:
             PolicyError: The policy cannot be used.
         """
         self.settings = settings
-        self._env = make_vector_env(settings.env_id, auto_reset=False, **settings.world_options())
+        self._env = make_vector_env(
+            settings.env_id, arrays="torch", autoreset_mode="Disabled", **settings.world_options()
+        )
         self._world = self._env.world
         self._camera = WorldCamera(self._world)
         self._action: Tensor | None = None

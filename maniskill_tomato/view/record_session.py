@@ -175,7 +175,7 @@ class RecordSession:
         if self._made is None or self._made[0] != self.condition:
             known = option_names(stored.env_id) - set(CAMERA_OPTIONS)
             options = {name: value for name, value in stored.env_options.items() if name in known}
-            env = make_vector_env(stored.env_id, auto_reset=False, **options)
+            env = make_vector_env(stored.env_id, arrays="torch", autoreset_mode="Disabled", **options)
             self._made = self.condition, env, WorldCamera(env.world)
         return self._made[1], self._made[2]
 

@@ -89,7 +89,3 @@ class ArmMoveControllerConfig(ControllerConfig):  # type: ignore[misc]
     control: Control
     """What an action is."""
     controller_cls = ArmMoveController
-
-
-CONTROL_MODES: dict[str, Control] = {"pd_viewpoint": "viewpoint", "pd_look_at": "look_at"}
-"""The control modes that the world plans."""

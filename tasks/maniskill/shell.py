@@ -22,7 +22,7 @@ from maniskill_tomato.sensing.belief import Belief
 from maniskill_tomato.sensing.image_layout import ImageLayout
 from maniskill_tomato.sensing.observation import ObservationLayout
 from maniskill_tomato.sensing.simulated_camera import RENDERED_SIZE
-from maniskill_tomato.tasks.arm_moves import Plan
+from maniskill_tomato.tasks.arm_moves import CONTROL_MODES, Plan
 from maniskill_tomato.tasks.ground_truth import WorldTruth
 from maniskill_tomato.tasks.making import (
     check_choice,
@@ -32,7 +32,6 @@ from maniskill_tomato.tasks.making import (
     option_names,
 )
 from maniskill_tomato.tasks.maniskill import scenery, shell_options
-from maniskill_tomato.tasks.maniskill.controllers import CONTROL_MODES
 from maniskill_tomato.tasks.maniskill.flat_state import checked_rows, unflatten
 from maniskill_tomato.tasks.maniskill.iiwa14_agent import Iiwa14D435
 from maniskill_tomato.tasks.maniskill.motion import drive_to

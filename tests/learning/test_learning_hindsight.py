@@ -58,7 +58,7 @@ def walk(env: LearnerEnv, config: TrainConfig, steps: int) -> tuple[Any, list[di
         before, own = (world.saved_rows(), world.qpos), int(world.target_fruit)
         next_observations, rewards, terminations, _, next_info = env.step(actions * scale)
         step_info = next_info.get("final_info", next_info)
-        reached = next_info.get("final_observation", next_observations)
+        reached = next_info.get("final_obs", next_observations)
         learned = learned_reward(config, rewards, terminations, visible, step_info)
         experience.add(
             Batch(observations, actions, learned, reached, terminations.float()),

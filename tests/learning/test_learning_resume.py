@@ -58,8 +58,8 @@ class Walk:
         self._elapsed = torch.zeros(num_envs, dtype=torch.long)
 
     def reset(self, *, seed: int | list[int] | None = None) -> tuple[Tensor, dict[str, Any]]:
-        assert isinstance(seed, int)
-        self._generator.manual_seed(seed)
+        assert seed is not None
+        self._generator.manual_seed(seed if isinstance(seed, int) else seed[0])
         self._begin(torch.ones(self.num_envs, dtype=torch.bool))
         return self._place.clone(), self._info()
 
@@ -79,7 +79,7 @@ class Walk:
         if bool(done.any()):
             final = self._place.clone()
             self._begin(done)
-            info = self._info() | {"final_observation": final, "final_info": info}
+            info = self._info() | {"final_obs": final, "final_info": info}
         return self._place.clone(), reward, terminated, truncated, info
 
     def close(self) -> None:

@@ -39,8 +39,8 @@ class ReachTask:
         self._steps = 0
 
     def reset(self, *, seed: int | list[int] | None = None) -> tuple[Tensor, dict[str, Any]]:
-        assert isinstance(seed, int)
-        self._generator = torch.Generator().manual_seed(seed)
+        assert seed is not None
+        self._generator = torch.Generator().manual_seed(seed if isinstance(seed, int) else seed[0])
         self._observation = torch.zeros(self.num_envs, 9)
         self._elapsed = torch.zeros(self.num_envs, dtype=torch.long)
         self._begin(torch.ones(self.num_envs, dtype=torch.bool))
@@ -64,7 +64,7 @@ class ReachTask:
         if done.any():
             final, final_info = self._observation.clone(), info
             self._begin(done)
-            info = self._info() | {"final_observation": final, "final_info": final_info}
+            info = self._info() | {"final_obs": final, "final_info": final_info}
         return self._observation.clone(), reward, terminated, truncated, info
 
     def close(self) -> None:

@@ -26,7 +26,7 @@ OPTIONS: dict[str, dict[str, Any]] = {
 @pytest.mark.parametrize("env_id", TASK_IDS)
 def test_the_shell_and_the_world_give_the_same_for_the_same_seeds_and_actions(env_id: str) -> None:
     shell: Any = gym.make(env_id, obs_mode="state", render_backend="none", **OPTIONS[env_id])
-    world = make_vector_env(env_id, auto_reset=False, **OPTIONS[env_id])
+    world = make_vector_env(env_id, arrays="torch", autoreset_mode="Disabled", **OPTIONS[env_id])
     size = shell.action_space.shape[0]
     generator = torch.Generator().manual_seed(0)
     for seed in (3, 4, None):

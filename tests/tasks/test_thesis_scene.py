@@ -166,7 +166,7 @@ def test_a_reproduction_trains_and_judges_in_the_scene_of_the_thesis(tmp_path: P
 
 def explored_steps(scene: str, episodes: int) -> tuple[float, float]:
     """Mean steps of episodes of Eq. 5-6 alone, and the share of starts that fulfil the task."""
-    env = make_vector_env(GUIDED, episodes, auto_reset=False, scene=scene)
+    env = make_vector_env(GUIDED, episodes, arrays="torch", autoreset_mode="Disabled", scene=scene)
     _, info = env.reset(seed=list(range(5000, 5000 + episodes)))
     passing = float(info["success"].float().mean())
     generator = torch.Generator().manual_seed(1)
@@ -190,7 +190,7 @@ def test_random_actions_take_the_steps_of_the_thesis_in_its_scene_alone() -> Non
 
 @pytest.mark.parametrize("scene", ["hidden", "thesis"])
 def test_a_pose_out_of_reach_by_a_centimetre_is_outside_the_sparse_tasks_workspace(scene: str) -> None:
-    env = make_vector_env(SPARSE, auto_reset=False, scene=scene)
+    env = make_vector_env(SPARSE, arrays="torch", autoreset_mode="Disabled", scene=scene)
     env.reset(seed=0, options={"viewpoint": [0.55, 0.0, 0.6, 0.0, math.pi / 2, 0.0]})
     # The wrist is 0.126 m behind the flange and 0.82 m from the shoulder (0, 0, 0.36) at full reach.
     limit = math.sqrt(0.82**2 - (0.6 - 0.36) ** 2) + 0.126

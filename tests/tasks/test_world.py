@@ -9,6 +9,7 @@ from typing import Any
 
 import pytest
 import torch
+from gymnasium.vector import AutoresetMode
 from torch import Tensor
 
 from maniskill_tomato.errors import InvalidInputError
@@ -208,8 +209,10 @@ def test_a_camera_measures_every_view_once() -> None:
 @pytest.mark.parametrize("env_id", [GUIDED, GENERAL, ROW])
 def test_finished_environments_begin_anew_and_hand_out_what_the_step_gave(env_id: str) -> None:
     options: dict[str, Any] = {} if env_id == GUIDED else POOL
-    env = VectorEnv(make_world(env_id, 3, **options), max_steps=4)
-    alone = VectorEnv(make_world(env_id, 3, **options), max_steps=4, auto_reset=False)
+    kind: Any = {"max_steps": 4, "arrays": "torch"}
+    same_step, disabled = AutoresetMode.SAME_STEP, AutoresetMode.DISABLED
+    env = VectorEnv(make_world(env_id, 3, **options), **kind, autoreset_mode=same_step)
+    alone = VectorEnv(make_world(env_id, 3, **options), **kind, autoreset_mode=disabled)
     observation, _ = env.reset(seed=[1, 2, 3])
     alone.reset(seed=[1, 2, 3])
     assert observation.shape == (3, *env.single_observation_space.shape)  # type: ignore[misc]
@@ -225,20 +228,23 @@ def test_finished_environments_begin_anew_and_hand_out_what_the_step_gave(env_id
             assert torch.equal(observation, expected) and "final_info" not in info
             continue
         ends += len(done)
-        assert torch.equal(info["final_observation"], expected)
+        assert torch.equal(info["final_obs"], expected)
         assert torch.equal(info["final_info"]["visible_fraction"], info_alone["visible_fraction"])
         again, _ = alone.reset(options={"env_idx": done})
         assert torch.equal(observation, again)
+        assert torch.equal(info["_final_obs"].nonzero()[:, 0], done)
         assert bool((info["elapsed_steps"][done] == 0).all())
     assert ends >= 6
 
 
 def test_one_seed_begins_other_episodes_in_other_environments_and_the_same_ones_again() -> None:
-    env = make_vector_env(SPARSE, 4)
+    env = make_vector_env(SPARSE, 4, arrays="torch")
     first, _ = env.reset(seed=6)
     assert len({tuple(row) for row in first.tolist()}) == 4
     assert torch.equal(env.reset(seed=6)[0], first)
-    torch.testing.assert_close(make_vector_env(SPARSE).reset(seed=6)[0], first[:1], atol=ROUNDING, rtol=0)
+    torch.testing.assert_close(
+        make_vector_env(SPARSE, arrays="torch").reset(seed=6)[0], first[:1], atol=ROUNDING, rtol=0
+    )
 
 
 @pytest.mark.parametrize(

@@ -43,7 +43,7 @@ def test_an_episode_is_that_of_an_evaluation_with_the_same_seed(
     env_id: str, policy: str, options: dict[str, Any]
 ) -> None:
     recording = played(PlaySettings(env_id=env_id, policy=policy, seed=3))
-    env = make_vector_env(env_id, auto_reset=False, **options)
+    env: Any = make_vector_env(env_id, arrays="torch", autoreset_mode="Disabled", **options)
     record = run_episode(env, open_policy(policy, env_id=env_id, seed=3), 3)
     assert recording.moves == record.steps > 0
     np.testing.assert_allclose(recording.visible_fractions, record.visible_fraction, atol=1e-6)

@@ -104,6 +104,8 @@ PUBLIC: Final[dict[str, tuple[str, ...]]] = {
     ),
     "learning": (
         "rl.gymnasium_env",
+        "rl.gymnasium_vec",
+        "rl.sb3_vec",
         "rl.train_config",
         "rl.presets",
         "rl.trainer",

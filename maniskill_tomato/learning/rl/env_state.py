@@ -15,7 +15,7 @@ logger = logging.getLogger(__name__)
 
 @runtime_checkable
 class KeepsState(Protocol):
-    """An environment that describes its own state; others than ManiSkill's can offer it."""
+    """An environment that describes its own state."""
 
     def get_run_state(self) -> dict[str, Any]:
         """Everything that decides how it goes on: tensors, numbers, text, lists and dictionaries."""
@@ -27,19 +27,16 @@ class KeepsState(Protocol):
 
 
 def env_state(env: object) -> dict[str, Any] | None:
-    """The state of `env` as plain data, or None where it cannot be known.
-
-    That of ManiSkill's shell is the world's, completed by the joints' speeds, step counters, and the seeds and
-    generators that the world's follow from.
-    """
-    if isinstance(env, KeepsState):
-        return env.get_run_state()
-    shell: Any = getattr(env, "base_env", None)
-    return None if shell is None else shell_state(shell)
+    """The state of `env` as plain data, or None where it cannot be known."""
+    return env.get_run_state() if isinstance(env, KeepsState) else None
 
 
 def shell_state(shell: Any) -> dict[str, Any]:
-    """The state of ManiSkill's shell as plain data."""
+    """The state of ManiSkill's shell as plain data.
+
+    It is the world's, completed by the joints' speeds, step counters, and the seeds and generators that the world's
+    follow from.
+    """
     return {
         "world": shell.world.save(),
         "qvel": shell.agent.robot.get_qvel().cpu().clone(),
@@ -58,16 +55,12 @@ def set_env_state(env: object, state: dict[str, Any] | None) -> None:
     Raises:
         CheckpointError: The environment's state was not saved.
     """
-    if state is None:
+    if state is None or not isinstance(env, KeepsState):
         raise CheckpointError(
             "this run's environment does not tell its state, so that the run cannot be continued; "
             "give it get_run_state and set_run_state"
         )
-    if isinstance(env, KeepsState):
-        env.set_run_state(state)
-        return
-    anything: Any = env
-    set_shell_state(anything.base_env, state, anything.reset)
+    env.set_run_state(state)
 
 
 def set_shell_state(shell: Any, state: dict[str, Any], reset: Callable[..., Any]) -> None:

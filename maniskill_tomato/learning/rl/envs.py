@@ -1,27 +1,27 @@
 """The environments a learner steps: many at once, reset when done, with the last observation of an episode
 kept."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any, Protocol, cast
 
 import gymnasium as gym
 import torch
+from gymnasium.vector import AutoresetMode
 from torch import Tensor
 
 from maniskill_tomato.errors import InvalidInputError
 from maniskill_tomato.learning.rl.env_state import set_shell_state, shell_state
 from maniskill_tomato.sensing.perception_kinds import RENDERED
-from maniskill_tomato.tasks import TASK_IDS
-from maniskill_tomato.tasks.making import MAX_STEPS, option_names
-from maniskill_tomato.tasks.observed_world import LearnerEyes, ObservedWorld
-from maniskill_tomato.tasks.vector_env import make_vector_env
+from maniskill_tomato.tasks.making import MAX_STEPS, check_env_id, option_names
+from maniskill_tomato.tasks.observed_world import LearnerEyes
+from maniskill_tomato.tasks.vector_env import VectorEnv, make_vector_env
 
 
 class LearnerEnv(Protocol):
-    """What a learner needs of an environment; `tasks.vector_env.VectorEnv` offers it, and ManiSkill's wrapper.
+    """What a learner needs of an environment; `tasks.vector_env.VectorEnv` of tensors offers it.
 
     Environments that are done are reset within `step`: the returned observation is the first of the new
-    episode and `info["final_observation"]`, `info["final_info"]` are what the step itself gave.
+    episode and `info["final_obs"]`, `info["final_info"]` are what the step itself gave, in all environments.
     """
 
     num_envs: int
@@ -49,16 +49,6 @@ class LearnerEnv(Protocol):
         ...
 
 
-def check_env_id(env_id: str) -> None:
-    """Accepts the ids of this package's tasks.
-
-    Raises:
-        InvalidInputError: Another id; the message lists the allowed ones.
-    """
-    if env_id not in TASK_IDS:
-        raise InvalidInputError.choice("the environment id", env_id, TASK_IDS)
-
-
 def make_env(
     env_id: str,
     num_envs: int = 1,
@@ -84,12 +74,14 @@ def make_env(
     """
     check_env_id(env_id)
     colours = colours or (eyes is not None and eyes.images.needs_colours)
+    mode = AutoresetMode.DISABLED
     if not colours and not needs_simulator(env_id, options):
-        return make_vector_env(env_id, num_envs, _device(num_envs), auto_reset=False, eyes=eyes, **options)
+        return _as_env(_make_world_env(env_id, num_envs, eyes, mode, options))
     if colours:
         options = {"render_backend": _renderer(), **options}
     if eyes is not None:
-        return SimulatedVectorEnv(make_simulated_env(env_id, num_envs, **options), eyes, auto_reset=False)
+        env = make_simulated_env(env_id, num_envs, **options)
+        return _as_env(SimulatedVectorEnv(env, eyes, autoreset_mode=mode))
     return make_simulated_env(env_id, num_envs, **options)
 
 
@@ -123,100 +115,93 @@ def make_learner_env(
     check_env_id(env_id)
     colours = eyes is not None and eyes.images.needs_colours
     if not colours and not needs_simulator(env_id, options):
-        return make_vector_env(env_id, num_envs, _device(num_envs), eyes=eyes, **options)
-    if eyes is not None:
-        renderer = {"render_backend": _renderer() if colours else "none"}
-        return SimulatedVectorEnv(make_simulated_env(env_id, num_envs, **{**renderer, **options}), eyes)
-    env = make_simulated_env(env_id, num_envs, **options)
-    # ManiSkill takes seconds to import; commands that do not simulate need not wait for it.
-    from mani_skill.vector.wrappers.gymnasium import ManiSkillVectorEnv
-
-    return cast(LearnerEnv, ManiSkillVectorEnv(env, auto_reset=True))
+        return _make_world_env(env_id, num_envs, eyes, AutoresetMode.SAME_STEP, options)
+    renderer = {"render_backend": _renderer()} if colours else {}
+    return SimulatedVectorEnv(make_simulated_env(env_id, num_envs, **{**renderer, **options}), eyes)
 
 
-class SimulatedVectorEnv(gym.Env[Any, Any]):
-    """ManiSkill's shell for a learner that observes images, with resets as in `VectorEnv`.
+def _make_world_env(
+    env_id: str, num_envs: int, eyes: LearnerEyes | None, mode: AutoresetMode, options: Mapping[str, Any]
+) -> VectorEnv:
+    device = "cuda" if num_envs > 1 and torch.cuda.is_available() else "cpu"
+    return make_vector_env(
+        env_id, num_envs, device, autoreset_mode=mode, arrays="torch", eyes=eyes, **options
+    )
+
+
+def _as_env(env: VectorEnv) -> gym.Env[Any, Any]:
+    """The same: it is reset and stepped as ManiSkill's shell, whose base class is this one."""
+    return cast(gym.Env[Any, Any], env)
+
+
+class SimulatedVectorEnv(VectorEnv):
+    """ManiSkill's shell as a `VectorEnv`, which takes from the shell what it does not have itself.
 
     ManiSkill's own wrapper refuses environments whose scene is built anew for every plant.
     """
 
-    def __init__(self, env: gym.Env[Any, Any], eyes: LearnerEyes, *, auto_reset: bool = True) -> None:
+    def __init__(
+        self,
+        env: gym.Env[Any, Any],
+        eyes: LearnerEyes | None = None,
+        *,
+        autoreset_mode: AutoresetMode = AutoresetMode.SAME_STEP,
+    ) -> None:
         """Takes an environment that does not reset itself.
 
         Args:
             env: One of this package's, with a renderer where colours are observed.
             eyes: What is observed.
-            auto_reset: Whether `step` resets environments that are done.
+            autoreset_mode: When environments that are done are reset.
         """
         self._env = env
-        self.spec = env.spec
-        self.auto_reset = auto_reset
         self.base_env = cast(Any, env.unwrapped)
         """ManiSkill's environment."""
-        self._observed = ObservedWorld(self.base_env.world, eyes)
-        self.num_envs = int(self.base_env.num_envs)
-        self.single_observation_space: gym.Space[Any] = self._observed.space
-        self.single_action_space: gym.Space[Any] = self.base_env.single_action_space
-        self.observation_space = gym.vector.utils.batch_space(self._observed.space, self.num_envs)
+        env_id = self.base_env.env_id
+        super().__init__(
+            self.base_env.world,
+            MAX_STEPS[env_id],
+            autoreset_mode=autoreset_mode,
+            arrays="torch",
+            env_id=env_id,
+            eyes=eyes,
+        )
+        self.single_action_space = self.base_env.single_action_space
         self.action_space = gym.vector.utils.batch_space(self.single_action_space, self.num_envs)
-        self._max_steps = MAX_STEPS[self.base_env.env_id]
-        self._elapsed = torch.zeros(self.num_envs, dtype=torch.int32, device=self.base_env.device)
 
     @property
-    def unwrapped(self) -> Any:
-        """ManiSkill's environment."""
+    def _told_by(self) -> Any:
         return self.base_env
 
-    def reset(
-        self, *, seed: int | list[int] | None = None, options: dict[str, Any] | None = None
-    ) -> tuple[Any, dict[str, Any]]:
-        """Begins episodes; the option `env_idx` says where, everywhere if it is missing."""
-        rows = self.base_env.world.env_rows((options or {}).get("env_idx"))
-        _, info = self._env.reset(seed=seed, options=options)  # type: ignore[arg-type]
-        self._elapsed[rows] = 0
-        return self._observed.observe(rows), info
+    def _begin(self, seeds: Sequence[int | None] | None, rows: Tensor, options: Mapping[str, Any]) -> None:
+        where = {"env_idx": rows} if len(rows) < self.num_envs else {}
+        self._env.reset(seed=cast(Any, seeds), options={**options, **where})
 
-    def step(  # type: ignore[override]
-        self, actions: Tensor
-    ) -> tuple[Any, Tensor, Tensor, Tensor, dict[str, Any]]:
-        """Makes a move in every environment; see `VectorEnv.step`."""
+    def _play(self, actions: Any) -> tuple[Tensor, Tensor, dict[str, Any]]:
         _, reward, terminated, _, info = self._env.step(actions)
         self._elapsed += 1
-        observation, truncated = self._observed.observe(None), self._elapsed >= self._max_steps
-        done = torch.as_tensor(terminated) | truncated
-        if self.auto_reset and bool(done.any()):
-            final = {"final_observation": observation, "final_info": info}
-            partial = {"env_idx": done.nonzero()[:, 0]} if self.num_envs > 1 else None
-            observation, info = self.reset(options=partial)
-            info = {**info, **final}
-        return observation, torch.as_tensor(reward), torch.as_tensor(terminated), truncated, info
+        return torch.as_tensor(reward), torch.as_tensor(terminated), dict(info)
 
-    def close(self) -> None:
+    def _info(self) -> dict[str, Any]:
+        return dict(self.base_env.get_info())
+
+    def close_extras(self, **kwargs: Any) -> None:
         """Frees the simulation."""
         self._env.close()
 
     def get_run_state(self) -> dict[str, Any]:
         """Everything that decides how the environments go on."""
-        return {
-            "shell": shell_state(self.base_env),
-            "elapsed": self._elapsed.cpu().clone(),
-            "frames": self._observed.frames.state_dict(),
-        }
+        return {"shell": shell_state(self.base_env), **self._progress()}
 
-    def set_run_state(self, state: dict[str, Any]) -> None:
+    def set_run_state(self, state: Mapping[str, Any]) -> None:
         """Takes back what `get_run_state` of an environment made with the same options gave."""
         set_shell_state(self.base_env, state["shell"], self._env.reset)
-        self._elapsed = state["elapsed"].to(self._elapsed)
-        self._observed.frames.load_state_dict(state["frames"], self.base_env.device)
+        self._set_progress(state)
 
 
 def needs_simulator(env_id: str, options: Mapping[str, Any]) -> bool:
     """Whether options ask for what a world does not have."""
     return bool(set(options) - option_names(env_id)) or options.get("perception") in RENDERED
-
-
-def _device(num_envs: int) -> str:
-    return "cuda" if num_envs > 1 and torch.cuda.is_available() else "cpu"
 
 
 def _renderer() -> str:

@@ -9,7 +9,7 @@ import torch
 from numpy.typing import NDArray
 
 from maniskill_tomato.errors import InvalidInputError
-from maniskill_tomato.learning.rl.envs import check_env_id, make_env
+from maniskill_tomato.learning.rl.envs import make_env
 from maniskill_tomato.learning.rl.presets import (
     OBSERVATION_CENTRE,
     OBSERVATION_HALF_RANGE,
@@ -20,6 +20,7 @@ from maniskill_tomato.learning.rl.rewards import potential_reward
 from maniskill_tomato.sensing.image_layout import ImageLayout
 from maniskill_tomato.sensing.image_observation import STATE
 from maniskill_tomato.sensing.perception_kinds import STATE_MODE
+from maniskill_tomato.tasks.making import check_env_id
 from maniskill_tomato.tasks.observed_world import LearnerEyes
 
 Array = NDArray[np.float32]
@@ -117,13 +118,7 @@ class LearnableTask(gym.Wrapper[Any, Array, Any, Array]):
                 unknown.
         """
         super().__init__(env)
-        if env.action_space.shape != (len(action_scale),) or not all(0.0 < s <= 1.0 for s in action_scale):
-            raise InvalidInputError(
-                f"action_scale must hold one value in (0, 1] for each action of {env.action_space}, "
-                f"got {tuple(action_scale)}"
-            )
-        if reward not in ("task", "potential"):
-            raise InvalidInputError.choice("reward", reward, ("task", "potential"))
+        check_learnable(env.action_space, action_scale, reward)
         self.action_space = gym.spaces.Box(-1.0, 1.0, (len(action_scale),), np.float32)
         self._scale = np.array(action_scale, dtype=np.float32)
         self._reward = reward
@@ -165,6 +160,20 @@ class LearnableTask(gym.Wrapper[Any, Array, Any, Array]):
                 step_cost=self._step_cost,
             )
         )
+
+
+def check_learnable(actions: gym.Space[Any], action_scale: Sequence[float], reward: str) -> None:
+    """Accepts a scale for each action, and the rewards that there are.
+
+    Raises:
+        InvalidInputError: The scale has another length or values outside (0, 1], or the reward is unknown.
+    """
+    if actions.shape != (len(action_scale),) or not all(0.0 < s <= 1.0 for s in action_scale):
+        raise InvalidInputError(
+            f"action_scale must hold one value in (0, 1] for each action of {actions}, got {tuple(action_scale)}"
+        )
+    if reward not in ("task", "potential"):
+        raise InvalidInputError.choice("reward", reward, ("task", "potential"))
 
 
 def normalize_observation(observation: Any) -> Any:

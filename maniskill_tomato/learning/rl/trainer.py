@@ -19,7 +19,7 @@ from maniskill_tomato.folder_lock import only_writer
 from maniskill_tomato.learning.interrupt import StopRequest, stop_on_signals
 from maniskill_tomato.learning.rl.agent import begin_with, check_fits, update
 from maniskill_tomato.learning.rl.checkpoint import make_checkpoint
-from maniskill_tomato.learning.rl.envs import LearnerEnv, check_env_id, make_learner_env
+from maniskill_tomato.learning.rl.envs import LearnerEnv, make_learner_env
 from maniskill_tomato.learning.rl.observations import columns_of, device_of, eyes_of
 from maniskill_tomato.learning.rl.presets import TrainConfig
 from maniskill_tomato.learning.rl.progress import Progress, TrainingLog
@@ -38,6 +38,8 @@ from maniskill_tomato.learning.rl.training_state import TrainingState, seed_glob
 from maniskill_tomato.learning.rl.wandb_log import import_wandb
 from maniskill_tomato.policies.trained_actor import TrainedActor, load_actor
 from maniskill_tomato.sensing.image_observation import STATE, state_of
+from maniskill_tomato.tasks.making import check_env_id
+from maniskill_tomato.tasks.numpy_streams import spread_seed
 
 logger = logging.getLogger(__name__)
 
@@ -165,7 +167,8 @@ class Trainer:
         torch.set_num_threads(self._config.torch_threads)
         seed_global_random_state(self._seed)
         saved = self._saved_run()
-        observations, info = self._env.reset(seed=self._seed)
+        seeds = spread_seed(self._seed, self._env.num_envs)
+        observations, info = self._env.reset(seed=self._seed if len(seeds) == 1 else seeds)
         self._state = state = TrainingState(
             self._env, self._config, self._dims, self._seed, observations, info, self._run_dir
         )
@@ -221,7 +224,7 @@ class Trainer:
             state.step += self._env.num_envs
             # At the end of an episode `next_observations` is already the start of the next one.
             step_info = info.get("final_info", info)
-            reached = info["final_observation"] if "final_observation" in info else next_observations
+            reached = info.get("final_obs", next_observations)
             learned = learned_reward(self._config, rewards, terminations, state.visible_fraction, step_info)
             self._check_finite(reward=learned, observation=state_of(reached))
             batch = Batch(observations, actions, learned, reached, terminations.float())
