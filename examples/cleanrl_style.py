@@ -145,7 +145,9 @@ def train(args: Args, envs: LearnableVector) -> Learner:
     while step < args.total_timesteps:
         actions = random.uniform(-1.0, 1.0, (n, action_dim)).astype(np.float32)
         if step >= args.learning_starts:
-            noise = args.exploration_noise * random.standard_normal((n, action_dim), np.float32)
+            # It fades, so that the policy learns to do without: what succeeds with noise may stand still without it.
+            amount = args.exploration_noise * (1.0 - 0.9 * step / args.total_timesteps)
+            noise = amount * random.standard_normal((n, action_dim), np.float32)
             actions = (learner.act(observations) + noise).clip(-1.0, 1.0)
         following, rewards, terminations, truncations, infos = envs.step(actions)
         real, reached = learnable_steps(following, infos, done, envs.metadata["autoreset_mode"])

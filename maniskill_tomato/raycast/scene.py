@@ -297,7 +297,12 @@ class RayScene:
 
     def clearance_at(self, qpos: Tensor, T_w_plant: Tensor, env_idx: Tensor | None = None) -> Tensor:
         """The clearance where the arm stands; as `clearance_along` a path that goes nowhere. Shape (P,)."""
-        return self.clearance_along(qpos, qpos, T_w_plant, env_idx)
+        paths = self.num_envs if env_idx is None else len(env_idx)
+        _check_shape("qpos", qpos, (paths, NUM_JOINTS))
+        _check_shape("T_w_plant", T_w_plant, (paths, 4, 4))
+        if paths == 0:
+            return qpos.new_zeros(0)
+        return self._rays.clearance(link_transforms(qpos)[:, None], T_w_plant, env_idx, CLEARANCE_RANGE)
 
     def _check_views(
         self, T_w_camera: Tensor, target_fruit: Tensor, T_w_plant: Tensor, T_w_links: Tensor | None

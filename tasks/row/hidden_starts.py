@@ -20,7 +20,10 @@ CANDIDATES = 64
 """Camera positions drawn at a time for each target."""
 
 AT_ONCE = 8
-"""Candidates that are looked from at a time; the first good one is taken."""
+"""Candidates that are looked from at a time, shared out among the environments; the first good one is taken."""
+
+FEWEST_AT_ONCE = 2
+"""The fewest of one environment."""
 
 MAX_DRAWS = 4
 """Draws of `CANDIDATES` positions over all targets of a plant before the best start so far is taken."""
@@ -163,20 +166,20 @@ class HardStarts:
         positions = torch.as_tensor(np.stack(draws), device=self._device) + base[:, None]
         targets = torch.stack(target_positions).double()[:, None].expand_as(positions)
         far_enough = (positions - targets).norm(dim=-1) >= self._task.start_distance
-        owner = far_enough.nonzero()[:, 0]
-        look = self._look(positions[far_enough], targets[far_enough], 1)
-        good = look.reach == int(Reach.REACHABLE)
-        qpos, poses = look.qpos[good].float(), look.T_world_camera[good].float()
-        counts = torch.bincount(owner[good], minlength=len(searches)).tolist()
-        ends = np.cumsum(counts).tolist()
-        left = {
-            k: list(range(end - count, end)) for k, (end, count) in enumerate(zip(ends, counts, strict=True))
-        }
-        while left := {k: rows for k, rows in left.items() if rows and searches[k].cost > 0.0}:
-            rows = [(k, row) for k, own in left.items() for row in own[:AT_ONCE]]
-            chosen = torch.tensor([row for _, row in rows], device=self._device)
-            self._try([searches[k] for k, _ in rows], qpos[chosen], poses[chosen], T_world_plant)
-            left = {k: own[AT_ONCE:] for k, own in left.items()}
+        left = {k: np.flatnonzero(own).tolist() for k, own in enumerate(far_enough.cpu().numpy())}
+        while left := {k: own for k, own in left.items() if own and searches[k].cost > 0.0}:
+            at_once = max(FEWEST_AT_ONCE, AT_ONCE // len(left))
+            rows = [(k, candidate) for k, own in left.items() for candidate in own[:at_once]]
+            owner, candidate = (
+                torch.tensor(column, device=self._device) for column in zip(*rows, strict=True)
+            )
+            look = self._look(positions[owner, candidate], targets[owner, candidate], 1)
+            good = (look.reach == int(Reach.REACHABLE)).nonzero()[:, 0]
+            if len(good):
+                owners = [searches[rows[row][0]] for row in good.tolist()]
+                qpos, poses = look.qpos[good].float(), look.T_world_camera[good].float()
+                self._try(owners, qpos, poses, T_world_plant)
+            left = {k: own[at_once:] for k, own in left.items()}
 
     def _try(self, owners: Sequence[_Search], qpos: Tensor, poses: Tensor, T_world_plant: Tensor) -> None:
         """Looks from candidates, and keeps for each search the first in range or the one nearest to it.
