@@ -116,6 +116,8 @@ class TrainMaskRcnn(ImageOptions):
     """Factor on the sides of the input and of the anchors."""
     bfloat16: bool | None = None
     """Train in 16 bits, if not as the preset does; slower where the processor has neither AMX nor AVX-512 BF16."""
+    rate_scale: float = 1.0
+    """Factor on the learning rates, from 1 to 10: makes up for a part of the steps that --step-scale leaves out."""
     anchors: Literal["preset", "data"] = "preset"
     """Sides of the anchors: those of the preset, or five clusters of the boxes in --data (k-means)."""
     seed: int = 0
@@ -125,7 +127,9 @@ class TrainMaskRcnn(ImageOptions):
         """Trains and says where the weights are."""
         self.check()
         check_counts(epochs=self.epochs, steps_per_epoch=self.steps_per_epoch)
-        preset = MASK_RCNN_PRESETS[self.preset].scaled(steps=self.step_scale, size=self.input_scale)
+        preset = MASK_RCNN_PRESETS[self.preset].scaled(
+            steps=self.step_scale, size=self.input_scale, rates=self.rate_scale
+        )
         config = replace(
             preset,
             categories=self.classes,

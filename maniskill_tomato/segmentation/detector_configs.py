@@ -198,7 +198,7 @@ class MaskRcnnConfig:
         """The learning rate of an epoch, counted from 1."""
         return [rate for first, rate in self.learning_rates if first <= epoch][-1]
 
-    def scaled(self, *, steps: float = 1.0, size: float = 1.0) -> "MaskRcnnConfig":
+    def scaled(self, *, steps: float = 1.0, size: float = 1.0, rates: float = 1.0) -> "MaskRcnnConfig":
         """The same training with fewer steps in each epoch, on smaller pictures.
 
         Epochs, and with them the places where the learning rate falls, stay. So does the size of the anchors over that
@@ -207,15 +207,20 @@ class MaskRcnnConfig:
         Args:
             steps: Factor on the steps of an epoch, in training and in validation; at least one of each is left.
             size: Factor on the sides of the input and of the anchors.
+            rates: Factor on the learning rates, which makes up for a part of the steps that are left out.
 
         Raises:
-            InvalidInputError: A factor is not above 0 and at most 1.
+            InvalidInputError: A factor on steps or size is not above 0 and at most 1, or that on the learning rates
+                not from 1 to 10.
         """
         for name, factor in (("steps", steps), ("size", size)):
             if not 0 < factor <= 1:
                 raise InvalidInputError(f"the factor on {name} must be above 0 and at most 1, got {factor}")
+        if not 1 <= rates <= 10:
+            raise InvalidInputError(f"the factor on the learning rates must be from 1 to 10, got {rates}")
         return replace(
             self,
+            learning_rates=tuple((first, rate * rates) for first, rate in self.learning_rates),
             steps_per_epoch=max(1, round(self.steps_per_epoch * steps)),
             validation_steps=max(1, round(self.validation_steps * steps)),
             longest_side=round(self.longest_side * size),

@@ -110,6 +110,10 @@ def test_a_scaled_training_keeps_its_schedule_and_the_anchors_size_over_the_pict
     same = ("learning_rates", "dropout", "proposal_nms", "rois_per_image", "augmentation", "batch_size")
     assert [getattr(small, name) for name in same] == [getattr(whole, name) for name in same]
     assert whole.scaled() == whole
+    assert whole.scaled(rates=5).learning_rates == ((1, 5e-3), (21, 5e-4))
+    for rate in (0.5, 20.0):
+        with pytest.raises(InvalidInputError, match="learning rates must be from 1 to 10"):
+            whole.scaled(rates=rate)
     for factor in (0.0, 1.5):
         with pytest.raises(InvalidInputError, match="above 0 and at most 1"):
             whole.scaled(steps=factor)
