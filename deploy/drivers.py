@@ -10,17 +10,16 @@ model of its arm by another, by which the twin and recordings find it:
     "camera.zed" = "my_package.zed:make_camera"
 """
 
-import importlib
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from importlib.metadata import entry_points
 from typing import Any, Final, Literal, TypeVar
 
 from maniskill_tomato.deploy.arm_shapes import check_arm_shapes
 from maniskill_tomato.deploy.clock import Clock
 from maniskill_tomato.deploy.deploy_errors import ProfileError
 from maniskill_tomato.deploy.interface import Arm, Camera, declared_model
-from maniskill_tomato.errors import InvalidInputError
+from maniskill_tomato.errors import InvalidInputError, did_you_mean
+from maniskill_tomato.extension_points import ExtensionPoint
 from maniskill_tomato.robot.arm_model import ArmModel
 
 Kind = Literal["arm", "camera", "model"]
@@ -28,19 +27,34 @@ T = TypeVar("T")
 
 ENTRY_POINT_GROUP: Final = "maniskill_tomato.drivers"
 
-BUILT_IN: Final[dict[Kind, dict[str, str]]] = {
-    "arm": {
-        "libiiwa": "maniskill_tomato.deploy.libiiwa.libiiwa_arm:make_arm",
-        "mock": "maniskill_tomato.deploy.mock.mock_arm:make_arm",
-        "sunrise": "maniskill_tomato.deploy.sunrise.sunrise_arm:make_arm",
-    },
-    "camera": {
-        "mock": "maniskill_tomato.deploy.mock.mock_camera:make_camera",
-        "realsense": "maniskill_tomato.deploy.realsense.realsense_camera:make_camera",
-    },
-    "model": {"iiwa14": "maniskill_tomato.robot.iiwa14:IIWA14"},
+DRIVERS: Final[dict[Kind, ExtensionPoint]] = {
+    "arm": ExtensionPoint(
+        "driver of an arm",
+        ENTRY_POINT_GROUP,
+        {
+            "libiiwa": "maniskill_tomato.deploy.libiiwa.libiiwa_arm:make_arm",
+            "mock": "maniskill_tomato.deploy.mock.mock_arm:make_arm",
+            "sunrise": "maniskill_tomato.deploy.sunrise.sunrise_arm:make_arm",
+        },
+        prefix="arm.",
+    ),
+    "camera": ExtensionPoint(
+        "driver of a camera",
+        ENTRY_POINT_GROUP,
+        {
+            "mock": "maniskill_tomato.deploy.mock.mock_camera:make_camera",
+            "realsense": "maniskill_tomato.deploy.realsense.realsense_camera:make_camera",
+        },
+        prefix="camera.",
+    ),
+    "model": ExtensionPoint(
+        "model of an arm",
+        ENTRY_POINT_GROUP,
+        {"iiwa14": "maniskill_tomato.robot.iiwa14:IIWA14"},
+        prefix="model.",
+    ),
 }
-"""Module and callable of each driver, and module and name of each model, of this package."""
+"""Drivers, and models of arms, by name."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -63,9 +77,7 @@ class DriverContext:
 
 def driver_names(kind: Kind) -> tuple[str, ...]:
     """All names that a profile may give, ours first."""
-    prefix = f"{kind}."
-    others = (e.name for e in entry_points(group=ENTRY_POINT_GROUP) if e.name.startswith(prefix))
-    return (*BUILT_IN[kind], *sorted(name.removeprefix(prefix) for name in others))
+    return DRIVERS[kind].names()
 
 
 def make_arm(name: str, options: Mapping[str, Any], context: DriverContext) -> Arm:
@@ -121,17 +133,14 @@ def _made(kind: Kind, device: type[T], name: str, options: Mapping[str, Any], co
 
 def _load(kind: Kind, name: str) -> Any:
     what = f"the entry point {kind}.{name}" if kind == "model" else f"the driver {kind}.{name}"
+    if not DRIVERS[kind].has(name):
+        names = ", ".join(driver_names(kind))
+        if kind == "model":
+            raise ProfileError(f"no package registers a model of the arm {name!r}; there are {names}")
+        raise ProfileError(
+            f"{kind}.driver must be one of {names}; got {name!r}{did_you_mean(name, driver_names(kind))}"
+        )
     try:
-        if name in BUILT_IN[kind]:
-            module, _, attribute = BUILT_IN[kind][name].partition(":")
-            return getattr(importlib.import_module(module), attribute)
-        for entry in entry_points(group=ENTRY_POINT_GROUP, name=f"{kind}.{name}"):
-            return entry.load()
-    except (ImportError, AttributeError) as error:
-        raise ProfileError(f"{what} cannot be loaded: {error}; is its package installed?") from error
+        return DRIVERS[kind].load(name)
     except InvalidInputError as error:
         raise ProfileError(f"{what} cannot be used: {error}") from error
-    names = ", ".join(driver_names(kind))
-    if kind == "model":
-        raise ProfileError(f"no package registers a model of the arm {name!r}; there are {names}")
-    raise ProfileError(f"{kind}.driver must be one of {names}; got {name!r}")

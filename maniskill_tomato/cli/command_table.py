@@ -36,6 +36,7 @@ class CommandEntry:
 COMMANDS: Final[dict[str, CommandEntry]] = {
     "doctor": CommandEntry("doctor_command:Doctor", "Say what this machine lacks, and what mends it"),
     "demo": CommandEntry("demo_command:Demo", "Train, evaluate and report in one go"),
+    "list": CommandEntry("list_command:List", "List policies, segmenters, plants and drivers by name"),
     "play": CommandEntry("play_command:Play", "Watch a policy look for tomatoes, in a browser"),
     "train": CommandEntry("train_command:Train", "Train a policy by reinforcement learning"),
     "train-imitation": CommandEntry(
@@ -100,7 +101,7 @@ FAMILIES: Final[dict[str, str]] = {
 """Commands that have commands, and what the list says of them."""
 
 GROUPS: Final[dict[str, tuple[str, ...]]] = {
-    "Begin": ("doctor", "demo", "play"),
+    "Begin": ("doctor", "demo", "play", "list"),
     "Learn": (
         "train",
         "train-imitation",

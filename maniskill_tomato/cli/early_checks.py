@@ -104,15 +104,15 @@ def check_place(flag: str, place: str) -> None:
 
 def check_segmenter(flag: str, text: str) -> None:
     """Accepts the name of a segmenter of image files, or an existing file of weights."""
-    from maniskill_tomato.segmentation.segmenter import SEGMENTERS
+    from maniskill_tomato.segmentation.segmenter import SEGMENTERS, segmenter_choices
 
     if text == "ground_truth":
         raise InvalidInputError(f"{flag}: ground_truth knows rendered views only, no image files")
-    if Path(text).is_file():
+    if Path(text).is_file() or SEGMENTERS.has(text):
         return
     if Path(text).suffix:
         raise InvalidInputError(f"{flag}: no weights at {text}{_neighbour(Path(text))}")
-    check_choice(flag, text, (*(name for name in SEGMENTERS if name != "ground_truth"), "FILE.pt"))
+    check_choice(flag, text, segmenter_choices())
 
 
 def check_profile(flag: str, text: str) -> None:

@@ -1,7 +1,7 @@
 """The named objects of a mesh file: GLB, glTF, OBJ and PLY by trimesh, and `.npz` with an array an object."""
 
 import re
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
@@ -59,24 +59,47 @@ def read_objects(path: Path) -> list[MeshObject]:
         raise
     except Exception as error:  # What a broken file makes trimesh and NumPy raise has no common base.
         raise InvalidInputError(f"{path} cannot be read as {suffix[1:].upper()}: {error}") from error
+    return _checked(str(path), objects)
+
+
+def objects_of_arrays(source: str, arrays: Mapping[str, NDArray[Any]]) -> list[MeshObject]:
+    """The objects of named triangles, as an `.npz` file holds them.
+
+    Args:
+        source: Where they come from, for messages.
+        arrays: Triangles of each object by its name. Shapes (F, 3, 3).
+
+    Raises:
+        InvalidInputError: One has another shape or type, or numbers that are not finite, or there is no triangle.
+    """
+    return _checked(source, list(_objects_of(source, arrays)))
+
+
+def _checked(source: str, objects: list[MeshObject]) -> list[MeshObject]:
     for found in objects:
         if found.faces.size and not 0 <= found.faces.min() <= found.faces.max() < len(found.vertices):
             raise InvalidInputError(
-                f"{path}: object {found.name!r} has triangles between corners that are not there"
+                f"{source}: object {found.name!r} has triangles between corners that are not there"
             )
         if not np.isfinite(found.vertices).all():
-            raise InvalidInputError(f"{path}: object {found.name!r} has corners that are not finite numbers")
+            raise InvalidInputError(
+                f"{source}: object {found.name!r} has corners that are not finite numbers"
+            )
     if not objects:
-        raise InvalidInputError(f"{path} holds no triangles")
+        raise InvalidInputError(f"{source} holds no triangles")
     # Not in the file's order, which its reader does not keep: the number of a fruit must always be the same.
     return sorted(objects, key=lambda found: (found.name, found.material))
 
 
 def _read_npz(path: Path) -> Iterator[MeshObject]:
-    for name, corners in read_arrays(path).items():
+    return _objects_of(str(path), read_arrays(path))
+
+
+def _objects_of(source: str, arrays: Mapping[str, NDArray[Any]]) -> Iterator[MeshObject]:
+    for name, corners in arrays.items():
         if corners.ndim != 3 or corners.shape[1:] != (3, 3) or corners.dtype.kind not in "fiu":
             raise InvalidInputError(
-                f"{path}: object {name!r} must be an array of triangles of shape (F, 3, 3), got "
+                f"{source}: object {name!r} must be an array of triangles of shape (F, 3, 3), got "
                 f"{corners.dtype} of shape {corners.shape}"
             )
         if len(corners):

@@ -1,8 +1,8 @@
 """A plant of somebody else's making: the objects of a mesh file as organs and fruits."""
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,7 +11,7 @@ from maniskill_tomato.errors import InvalidInputError
 from maniskill_tomato.plants.fruit import SKIN_VARIANTS
 from maniskill_tomato.plants.generator import FRUIT_CLASS
 from maniskill_tomato.plants.leaf import LEAF_VARIANTS
-from maniskill_tomato.plants.mesh_files import MeshObject, read_objects
+from maniskill_tomato.plants.mesh_files import MeshObject, objects_of_arrays, read_objects
 from maniskill_tomato.plants.mesh_rules import METRES, MeshRules, OrganKind
 from maniskill_tomato.plants.mesh_surface import (
     Surface,
@@ -59,8 +59,28 @@ def plant_from_mesh(path: Path, rules: MeshRules, seed: int = 0) -> Plant:
             fruit's or the plant's size is impossible, no fruit is ripe, or so few triangles would not do. The message
             names the object.
     """
-    T = rules.T_plant_file(path.suffix)
-    kinds = _sorted_by_kind(path, read_objects(path), rules)
+    return _plant(path, path.stem, read_objects(path), rules, rules.T_plant_file(path.suffix), seed)
+
+
+def plant_from_triangles(source: str, arrays: Mapping[str, NDArray[Any]], seed: int = 0) -> Plant:
+    """A plant from named triangles, which a generator of plants made; see `plant_from_mesh`.
+
+    Args:
+        source: The generator's name, kept in `Plant.preset`.
+        arrays: Triangles of each object in the plant's frame (origin at the foot of the stem, z up), in [m], by names
+            that begin as `MeshRules` has them: `leaf_...`, `stem...`, `fruit_...`. Shapes (F, 3, 3).
+        seed: Which plant, kept in `Plant.seed`.
+
+    Raises:
+        InvalidInputError: As for `plant_from_mesh`.
+    """
+    return _plant(source, source, objects_of_arrays(source, arrays), MeshRules(), np.eye(4), seed)
+
+
+def _plant(
+    path: Path | str, preset: str, objects: Sequence[MeshObject], rules: MeshRules, T: Float64, seed: int
+) -> Plant:
+    kinds = _sorted_by_kind(path, objects, rules)
     surfaces = [placed(joined(parts), T) for _, _, parts in kinds]
     if rules.triangles is not None:
         surfaces = within_budget(path, surfaces, [name for _, name, _ in kinds], rules.triangles)
@@ -78,13 +98,13 @@ def plant_from_mesh(path: Path, rules: MeshRules, seed: int = 0) -> Plant:
             meshes = _mesh_parts(own, _round_uvs(own.vertices, centre), material)
             fruits.append(Fruit(len(organs), centre.astype(np.float32), radius, ripeness))
             organs.append(Organ(called, FRUIT_CLASS[ripeness], meshes))
-    plant = Plant(preset=path.stem, seed=seed, detail="training", organs=tuple(organs), fruits=tuple(fruits))
+    plant = Plant(preset=preset, seed=seed, detail="training", organs=tuple(organs), fruits=tuple(fruits))
     _check_plant(path, plant, rules)
     return plant
 
 
 def _sorted_by_kind(
-    path: Path, objects: Sequence[MeshObject], rules: MeshRules
+    path: Path | str, objects: Sequence[MeshObject], rules: MeshRules
 ) -> list[tuple[OrganKind, str, list[MeshObject]]]:
     """Kind, unique name and parts of each object in the order of names; parts of one name and kind are one object."""
     grouped: dict[tuple[OrganKind, str], list[MeshObject]] = {}
@@ -199,7 +219,7 @@ def _fruit_surfaces(surface: Surface, fruits: str) -> Iterable[Surface]:
 
 
 def _fitted(
-    path: Path, name: str, vertices: Float64, faces: Int64, rules: MeshRules
+    path: Path | str, name: str, vertices: Float64, faces: Int64, rules: MeshRules
 ) -> tuple[Float64, float]:
     """Centre of a fruit's surface and the radius of the sphere about it that holds every vertex, in [m]."""
     corners = vertices[faces]
@@ -228,7 +248,7 @@ def _unit_hint(rules: MeshRules) -> str:
     return f"the file is read with units={rules.units!r} and scale={rules.scale:g}; units may be {', '.join(METRES)}"
 
 
-def _check_plant(path: Path, plant: Plant, rules: MeshRules) -> None:
+def _check_plant(path: Path | str, plant: Plant, rules: MeshRules) -> None:
     ripe = [fruit for fruit in plant.fruits if fruit.ripeness == "ripe"]
     if not plant.fruits:
         names = ", ".join(repr(organ.name) for organ in plant.organs[:5])

@@ -72,7 +72,7 @@ def placed(surface: Surface, T: Float64) -> Surface:
 
 
 def within_budget(
-    path: Path, surfaces: Sequence[Surface], names: Sequence[str], triangles: int
+    path: Path | str, surfaces: Sequence[Surface], names: Sequence[str], triangles: int
 ) -> list[Surface]:
     """The surfaces with no more than so many triangles in all; what matters least to their shapes goes first.
 

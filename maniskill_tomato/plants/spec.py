@@ -13,6 +13,7 @@ from maniskill_tomato.plants.generator import generate_plant
 from maniskill_tomato.plants.kinds import KINDS, PLANT_NAMES
 from maniskill_tomato.plants.mesh_set import ALL, RULE_NAMES, MeshSource
 from maniskill_tomato.plants.organs import Plant
+from maniskill_tomato.plants.plant_generators import PLANT_GENERATORS, generated_plant
 from maniskill_tomato.plants.row import generate_row, leaf_density_of, neighbour_seeds, stand_in_row
 from maniskill_tomato.plants.seed_splits import SEED_SPLITS
 
@@ -45,12 +46,22 @@ class PlantSpec:
     mesh: MeshSource | None = None
     """Mesh files to take the plants from instead of growing them; preset, leaf density and detail then say nothing,
     seeds are those of `MeshSet`, and the split `all` has every plant."""
+    generator: str | None = None
+    """Another package's generator to take the plants from (`plants.plant_generators`); preset, leaf density and detail
+    then say nothing."""
 
     def __post_init__(self) -> None:
         if self.mesh is not None:
             self._check_mesh(self.mesh)
             return
-        if self.preset not in PLANT_NAMES:
+        if self.generator is not None:
+            if not PLANT_GENERATORS.has(self.generator):
+                raise InvalidInputError.choice(
+                    "the plant generator",
+                    self.generator,
+                    (*PLANT_GENERATORS.names(), "package.module:callable"),
+                )
+        elif self.preset not in PLANT_NAMES:
             raise InvalidInputError.choice("plant preset", self.preset, PLANT_NAMES)
         if isinstance(self.seed, str):
             if self.seed not in SEED_SPLITS:
@@ -122,11 +133,19 @@ class PlantSpec:
             beside = plants.seeds(plants.split_of(seed))[:ROW_NEIGHBOURS]
             left, right = (plants.grow(beside[k]) for k in neighbour_seeds(seed, (0, len(beside))))
             return stand_in_row(plants.grow(seed), left, right)
+        if self.generator is not None:
+            return self._generated(self.generator, seed)
         if not self.row:
             return generate_plant(self.preset, seed, self.detail, leaf_density_of(self.leaf_density, seed))
-        low = next((low for low, high in SEED_SPLITS.values() if low <= seed < high), 0)
-        neighbours = (low, low + ROW_NEIGHBOURS)
-        return generate_row(self.preset, seed, self.detail, self.leaf_density, seeds=neighbours)
+        beside = _neighbours(seed)
+        return generate_row(self.preset, seed, self.detail, self.leaf_density, seeds=beside)
+
+    def _generated(self, generator: str, seed: int) -> Plant:
+        plant = generated_plant(generator, seed)
+        if not self.row:
+            return plant
+        left, right = (generated_plant(generator, k) for k in neighbour_seeds(seed, _neighbours(seed)))
+        return stand_in_row(plant, left, right)
 
     def draw_seed(self, rng: np.random.RandomState) -> int:
         """The seed itself, or one drawn from the split with `rng`."""
@@ -150,10 +169,10 @@ class PlantSpec:
         """A choice from what a user may write.
 
         Args:
-            value: None for the default; a preset's name; a mapping with any of this class's fields, which
-                replace the default's. With `mesh`, the path of a mesh file or of a folder of them, it may also hold
-                values of `MeshRules`, and the default's fields do not count: the plant is alone, and drawn from the
-                training plants of a folder.
+            value: None for the default; the name of a preset or of a generator; a mapping with any of this class's
+                fields, which replace the default's. With `mesh`, the path of a mesh file or of a folder of them, it may
+                also hold values of `MeshRules`, and the default's fields do not count: the plant is alone, and drawn
+                from the training plants of a folder.
             default: The task's own plant.
 
         Raises:
@@ -163,12 +182,16 @@ class PlantSpec:
             return default
         if isinstance(value, PlantSpec):
             return value
+        if isinstance(value, str) and value not in PLANT_NAMES and PLANT_GENERATORS.has(value):
+            return cls._of_generator({"generator": value}, default)
         if isinstance(value, str):
             density = None if value in KINDS else default.leaf_density  # Each kind has its own.
             return replace(default, preset=value, leaf_density=density)
         if isinstance(value, Mapping):
             if value.get("mesh") is not None:
                 return cls._parse_mesh(value)
+            if value.get("generator") is not None:
+                return cls._of_generator(value, default)
             names = [f.name for f in fields(cls)]
             unknown = sorted(set(value) - set(names))
             if unknown:
@@ -188,6 +211,24 @@ class PlantSpec:
         )
 
     @classmethod
+    def _of_generator(cls, value: Mapping[str, Any], default: "PlantSpec") -> "PlantSpec":
+        allowed = ("generator", "seed", "pool", "row")
+        for name in value:
+            if name not in allowed:
+                raise InvalidInputError(
+                    f"plant has no field {name!r} beside generator; the fields are {', '.join(allowed)}"
+                    f"{did_you_mean(name, allowed)}"
+                )
+        if not isinstance(value["generator"], str):
+            raise InvalidInputError(
+                f"plant generator must be a name or package.module:callable; got {value['generator']!r}"
+            )
+        own = {"seed": default.seed if default.mesh is None else 0, "pool": default.pool, "row": default.row}
+        if not isinstance(value.get("seed", ""), str):
+            own["pool"] = None
+        return cls(**{**own, **value})
+
+    @classmethod
     def _parse_mesh(cls, value: Mapping[str, Any]) -> "PlantSpec":
         own = ("seed", "pool", "row")
         allowed = ("mesh", *own, *RULE_NAMES)
@@ -202,6 +243,12 @@ class PlantSpec:
         return cls(
             mesh=mesh, **{"seed": 0 if is_file else "train", **{n: value[n] for n in own if n in value}}
         )
+
+
+def _neighbours(seed: int) -> tuple[int, int]:
+    """Half-open range of the seeds of which the neighbours of a plant are drawn: the first ones of its split."""
+    low = next((low for low, high in SEED_SPLITS.values() if low <= seed < high), 0)
+    return low, low + ROW_NEIGHBOURS
 
 
 def _is_density(value: object) -> bool:

@@ -5,8 +5,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 from maniskill_tomato.errors import PolicyError, TomatoError, did_you_mean
+from maniskill_tomato.extension_points import is_import_path
 from maniskill_tomato.policies.layout import GENERAL_IDS, has_belief
 from maniskill_tomato.policies.registry import (
+    PLANNERS,
     PRIVILEGED,
     SHIPPED_FILES,
     PolicyContext,
@@ -37,8 +39,10 @@ def find_policy(name_or_file: str | Path, env_id: str | None = None) -> str | Pa
     names = policy_names()
     if text == RANDOM:
         return text
+    if is_import_path(text):
+        return text
     if text in names:
-        if env_id is not None and not has_belief(env_id):
+        if text in PLANNERS and env_id is not None and not has_belief(env_id):
             raise PolicyError(
                 f"{text} plans on a belief, which {', '.join(GENERAL_IDS)} have and {env_id} has not; give a policy "
                 f"that was trained on {env_id}, or {RANDOM!r}"
@@ -49,7 +53,8 @@ def find_policy(name_or_file: str | Path, env_id: str | None = None) -> str | Pa
         known = (RANDOM, *names) if env_id is None or has_belief(env_id) else (RANDOM,)
         beside = [p.name for p in path.parent.iterdir()] if path.parent.is_dir() else []
         raise PolicyError(
-            f"no policy at {text!r}; give a .pt or .onnx file, or one of {', '.join(known)}"
+            f"no policy at {text!r}; give a .pt or .onnx file, or one of {', '.join(known)}, "
+            "or package.module:callable"
             f"{did_you_mean(text, known) or did_you_mean(path.name, beside)}"
         )
     return path
@@ -97,8 +102,8 @@ def open_policy(
     """A policy, ready to act.
 
     Args:
-        name_or_file: A name of `registry.policy_names`, `random`, or a file of a policy that was trained (.pt) or
-            exported (.onnx, with its .json).
+        name_or_file: A name of `registry.policy_names`, `random`, `package.module:callable`, or a file of a policy that
+            was trained (.pt) or exported (.onnx, with its .json).
         env_id: The task that it must fit; None accepts any.
         ground_truth: The environment's knowledge, for policies with `needs_truth`.
         contact_free: Whether the oracle touches no plant.

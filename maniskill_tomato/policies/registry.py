@@ -2,17 +2,15 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from importlib.metadata import EntryPoint, entry_points
-from typing import TYPE_CHECKING, Final, Literal
+from typing import TYPE_CHECKING, Any, Final, Literal
+
+from maniskill_tomato.errors import PolicyError
+from maniskill_tomato.extension_points import ExtensionPoint
 
 if TYPE_CHECKING:
     import torch
 
     from maniskill_tomato.policies.protocol import GroundTruth, Policy
-
-ENTRY_POINT_GROUP: Final = "maniskill_tomato.policies"
-"""Other packages add policies with entry points of this group: a name, and a callable that takes a `PolicyContext` and
-returns a `Policy`."""
 
 Need = Literal["seed", "device", "ground_truth", "contact_free"]
 
@@ -36,7 +34,7 @@ class PolicyEntry:
     """A policy of this package that no file is needed for."""
 
     made_by: str
-    """Module of this package, and a callable in it."""
+    """Module of this folder, and a callable in it."""
     needs: tuple[Need, ...] = ()
     """What it is called with."""
 
@@ -70,26 +68,41 @@ PLANNERS: Final = (*(n for n in _PLANNERS if n not in PRIVILEGED), *SHIPPED_FILE
 """All names of this package."""
 
 
+POLICIES: Final = ExtensionPoint(
+    "policy",
+    "maniskill_tomato.policies",
+    {
+        name: f"maniskill_tomato.policies.{_PLANNERS[name].made_by}"
+        if name in _PLANNERS
+        else SHIPPED_FILES[name]
+        for name in PLANNERS
+    },
+)
+"""What another package adds is called with a `PolicyContext` and returns a `Policy`, or a `StatePolicy`."""
+
+
 def policy_names() -> tuple[str, ...]:
     """All names, those of this package first."""
-    return (*PLANNERS, *sorted(entry.name for entry in _entry_points() if entry.name not in PLANNERS))
+    return POLICIES.names()
 
 
 def make_planner(name: str, context: PolicyContext) -> "Policy":
     """The policy of a name that is not among `SHIPPED_FILES`.
 
     Raises:
-        KeyError: There is none.
+        InvalidInputError: There is none, or it cannot be imported.
+        PolicyError: Another package's is no policy.
     """
-    if name not in _PLANNERS:
-        others = {entry.name: entry for entry in _entry_points()}
-        made: Policy = others[name].load()(context)
-        return made
-    planner = _PLANNERS[name]
-    made_by = EntryPoint(name, f"maniskill_tomato.policies.{planner.made_by}", ENTRY_POINT_GROUP).load()
-    policy: Policy = made_by(**{need: getattr(context, need) for need in planner.needs})
-    return policy
+    made_by = POLICIES.load(name)
+    if name in _PLANNERS:
+        policy: Policy = made_by(**{need: getattr(context, need) for need in _PLANNERS[name].needs})
+        return policy
+    from maniskill_tomato.policies.adapters import as_policy
 
-
-def _entry_points() -> tuple[EntryPoint, ...]:
-    return tuple(entry_points(group=ENTRY_POINT_GROUP))
+    made: Any = made_by(context)
+    if not callable(getattr(made, "act", None)):
+        raise PolicyError(
+            f"{name} must make a policy, an object with a method act(belief) or act(observations); "
+            f"it made a {type(made).__name__}"
+        )
+    return as_policy(made)

@@ -3,25 +3,31 @@
 The segmenter that knows, from a label image that a renderer gives, stands here too.
 """
 
-import importlib
+import inspect
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Any, Protocol, cast, runtime_checkable
+from typing import Any, Final, Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
 
 from maniskill_tomato.errors import CheckpointError, InvalidInputError
+from maniskill_tomato.extension_points import ExtensionPoint
 from maniskill_tomato.segmentation.instances import Image, Instances, check_image
 
-SEGMENTERS = {
-    "light": "maniskill_tomato.segmentation.light_segmenter:open_light",
-    "colour": "maniskill_tomato.segmentation.colour_segmenter:ColourSegmenter",
-    "ground_truth": "maniskill_tomato.segmentation.segmenter:GroundTruthSegmenter",
-    "mask_rcnn": "maniskill_tomato.segmentation.mask_rcnn:open_mask_rcnn",
-    "yolo": "maniskill_tomato.segmentation.yolo:open_yolo",
-}
-"""Name of each kind of segmenter, and what opens it."""
+SEGMENTERS: Final = ExtensionPoint(
+    "segmenter",
+    "maniskill_tomato.segmenters",
+    {
+        "light": "maniskill_tomato.segmentation.light_segmenter:open_light",
+        "colour": "maniskill_tomato.segmentation.colour_segmenter:ColourSegmenter",
+        "ground_truth": "maniskill_tomato.segmentation.segmenter:GroundTruthSegmenter",
+        "mask_rcnn": "maniskill_tomato.segmentation.mask_rcnn:open_mask_rcnn",
+        "yolo": "maniskill_tomato.segmentation.yolo:open_yolo",
+    },
+)
+"""Each kind of segmenter by name, and what opens it. What another package adds is a callable that returns a
+`Segmenter`; if it takes `score_threshold`, it leaves out detections below."""
 
 DEFAULT_SEGMENTER = "light"
 
@@ -84,7 +90,8 @@ def make_segmenter(name_or_path: str | Path = DEFAULT_SEGMENTER, **options: Any)
     """Opens a segmenter.
 
     Args:
-        name_or_path: A name from `SEGMENTERS`, or a file of weights (`.pt`), which names its segmenter.
+        name_or_path: A name from `SEGMENTERS`, `package.module:callable`, or a file of weights (`.pt`), which names its
+            segmenter.
         **options: Options of this kind of segmenter, for instance `score_threshold`.
 
     Raises:
@@ -94,24 +101,29 @@ def make_segmenter(name_or_path: str | Path = DEFAULT_SEGMENTER, **options: Any)
         MissingPackageError: It needs a package that is not installed.
     """
     name = str(name_or_path)
-    if name not in SEGMENTERS:
+    if not SEGMENTERS.has(name):
         path = Path(name)
         if not path.suffix and not path.exists():
-            raise InvalidInputError.choice("segmenter", name, [*SEGMENTERS, "FILE.pt"])
+            raise InvalidInputError.choice("segmenter", name, segmenter_choices())
         from maniskill_tomato.segmentation.weights import read_kind
 
         options["weights"] = path
         name = read_kind(path)
-        if name not in SEGMENTERS:
+        if name not in SEGMENTERS.names():
             raise CheckpointError(f"{path} is for a segmenter {name!r}, which this version does not know")
-    module, opens = SEGMENTERS[name].split(":")
-    opener = cast(Callable[..., Segmenter], getattr(importlib.import_module(module), opens))
+    opener: Callable[..., Segmenter] = SEGMENTERS.load(name)
     try:
         return opener(**options)
     except TypeError as error:
         if "unexpected keyword" not in str(error) and "required" not in str(error):
             raise
         raise InvalidInputError(f"segmenter {name!r}: {str(error).split('() ', 1)[-1]}") from error
+
+
+def segmenter_choices() -> tuple[str, ...]:
+    """What a user may write for a segmenter of image files."""
+    names = (name for name in SEGMENTERS.names() if name != "ground_truth")
+    return (*names, "FILE.pt", "package.module:callable")
 
 
 def open_for_files(name: str, score_threshold: float, thorough: bool) -> Segmenter:
@@ -127,7 +139,8 @@ def open_for_files(name: str, score_threshold: float, thorough: bool) -> Segment
         CheckpointError: The weights are missing or damaged.
         MissingPackageError: The segmenter needs a package that is not installed.
     """
-    options: dict[str, Any] = {} if name == "colour" else {"score_threshold": score_threshold}
+    scored = not SEGMENTERS.has(name) or _takes_threshold(SEGMENTERS.load(name))
+    options: dict[str, Any] = {"score_threshold": score_threshold} if scored else {}
     if thorough:
         from maniskill_tomato.segmentation.light_segmenter import THOROUGH
         from maniskill_tomato.segmentation.weights import read_kind
@@ -135,3 +148,7 @@ def open_for_files(name: str, score_threshold: float, thorough: bool) -> Segment
         if name == "light" or (Path(name).is_file() and read_kind(Path(name)) == "light"):
             options |= THOROUGH
     return make_segmenter(name, **options)
+
+
+def _takes_threshold(opener: Callable[..., Segmenter]) -> bool:
+    return "score_threshold" in inspect.signature(opener).parameters

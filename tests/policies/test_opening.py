@@ -13,6 +13,7 @@ import pytest
 import torch
 from torch import Tensor
 
+from maniskill_tomato import extension_points
 from maniskill_tomato.assets import asset_path
 from maniskill_tomato.errors import PolicyError
 from maniskill_tomato.learning.rl.export import export_policy
@@ -95,8 +96,10 @@ def test_random_actions_are_those_of_the_task_and_their_seed_repeats_them() -> N
 
 
 def test_another_package_adds_a_policy_by_an_entry_point(monkeypatch: pytest.MonkeyPatch) -> None:
-    entry = EntryPoint("mine", f"{__name__}:make_mine", registry.ENTRY_POINT_GROUP)
-    monkeypatch.setattr(registry, "entry_points", lambda group: [entry] if group == entry.group else [])
+    entry = EntryPoint("mine", f"{__name__}:make_mine", registry.POLICIES.group)
+    monkeypatch.setattr(
+        extension_points, "entry_points", lambda group: [entry] if group == entry.group else []
+    )
     assert "mine" in registry.policy_names() and find_policy("mine", GENERAL) == "mine"
     policy = open_policy("mine", env_id=GENERAL, seed=3)
     assert policy.act(belief(torch.zeros(2, 786))).tolist() == [[3.0] * 3] * 2

@@ -12,7 +12,7 @@ HOME: Final = "index"
 NAVIGATION: Final[dict[str, tuple[str, ...]]] = {
     "Begin": ("start", "how_it_works"),
     "Tutorials": ("tutorials/train", "tutorials/judge", "tutorials/your_own", "tutorials/robot"),
-    "How to": ("viewer", "hardware", "examples", "thesis", "export", "troubleshooting", "contributing"),
+    "How to": ("viewer", "hardware", "examples", "extending", "thesis", "export", "troubleshooting", "contributing"),
     "Reference": (
         "tasks",
         "observation",
@@ -41,7 +41,7 @@ NAVIGATION: Final[dict[str, tuple[str, ...]]] = {
         "results/stopping",
         "results/mutation",
     ),
-    "About": ("performance", "compatibility", "security", "licences", "changelog"),
+    "About": ("field", "performance", "compatibility", "security", "licences", "changelog"),
 }
 """The pages by their names on the site, as its side bar shows them; `api/` is written from docstrings."""
 
