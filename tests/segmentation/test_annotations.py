@@ -309,7 +309,7 @@ def test_a_file_that_is_not_coco_is_refused(tmp_path: Path, text: str) -> None:
 def test_missing_places_are_named(tmp_path: Path) -> None:
     with pytest.raises(InvalidInputError, match="nowhere"):
         read_annotated(tmp_path / "nowhere")
-    with pytest.raises(InvalidInputError, match="neither"):
+    with pytest.raises(InvalidInputError, match="holds no annotations that are known"):
         read_annotated(tmp_path)
 
 

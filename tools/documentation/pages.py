@@ -12,7 +12,16 @@ HOME: Final = "index"
 NAVIGATION: Final[dict[str, tuple[str, ...]]] = {
     "Begin": ("start", "how_it_works"),
     "Tutorials": ("tutorials/train", "tutorials/judge", "tutorials/your_own", "tutorials/robot"),
-    "How to": ("viewer", "hardware", "examples", "extending", "thesis", "export", "troubleshooting", "contributing"),
+    "How to": (
+        "viewer",
+        "hardware",
+        "examples",
+        "extending",
+        "thesis",
+        "export",
+        "troubleshooting",
+        "contributing",
+    ),
     "Reference": (
         "tasks",
         "observation",

@@ -17,9 +17,8 @@ from maniskill_tomato.segmentation.datasets.annotations import (
     counted_clip,
     leaves_image,
 )
-from maniskill_tomato.segmentation.datasets.picture_files import LARGEST_PICTURE, read_picture
+from maniskill_tomato.segmentation.datasets.pictures_of_folder import find_picture, picture_size
 
-IMAGE_SUFFIXES = (".jpg", ".jpeg", ".png", ".bmp")
 IMAGE_FOLDERS = ("JPEGImages", "images", ".")
 ANNOTATION_FOLDERS = ("Annotations", "annotations", ".")
 
@@ -135,20 +134,11 @@ def _read_image(folder: Path, path: Path, skipped: Counter[str]) -> AnnotatedIma
     except (ElementTree.ParseError, OSError, ValueError, LookupError):
         # An encoding that Python does not know, or that the parser does not take, is the last two.
         raise InvalidInputError("images with broken XML") from None
-    picture = _find_picture(folder, root.findtext("filename") or "", path.stem)
+    name = root.findtext("filename") or ""
+    picture = find_picture(folder, name, IMAGE_FOLDERS) or find_picture(folder, path.stem, IMAGE_FOLDERS)
     if picture is None:
         raise InvalidInputError("images without their file")
-    try:
-        width, height = (int(float(root.findtext(f"size/{key}") or 0)) for key in ("width", "height"))
-    except (ValueError, OverflowError):
-        width = height = 0
-    if width * height > LARGEST_PICTURE:
-        raise InvalidInputError(f"images of more than {LARGEST_PICTURE} pixels")
-    if width < 1 or height < 1:
-        try:
-            height, width = read_picture(picture).shape[:2]
-        except InvalidInputError:
-            raise InvalidInputError("images that cannot be read") from None
+    width, height = picture_size(picture, [root.findtext(f"size/{key}") or 0 for key in ("width", "height")])
     instances = []
     for thing in root.iter("object"):
         category = (thing.findtext("name") or "").strip()
@@ -171,15 +161,3 @@ def _read_image(folder: Path, path: Path, skipped: Counter[str]) -> AnnotatedIma
         height=height,
         instances=tuple(instances),
     )
-
-
-def _find_picture(folder: Path, file_name: str, stem: str) -> Path | None:
-    # Only the last part of the name counts: annotation files must not point out of their data set.
-    wanted = Path(file_name.replace("\\", "/")).name
-    names = ([wanted] if wanted else []) + [stem + suffix for suffix in IMAGE_SUFFIXES]
-    for name in names:
-        for place in IMAGE_FOLDERS:
-            candidate = folder / place / name
-            if candidate.is_file():
-                return candidate
-    return None
