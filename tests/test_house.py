@@ -16,6 +16,7 @@ FOUNDATION = frozenset(
         "array_files",
         "assets",
         "errors",
+        "extension_points",
         "files",
         "folder_lock",
         "network_weights",
