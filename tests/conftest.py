@@ -18,7 +18,10 @@ from typing import TYPE_CHECKING, Any
 import pytest
 
 if TYPE_CHECKING:
+    import torch
+
     from maniskill_tomato.experiments.episode_record import EpisodeRecord
+    from maniskill_tomato.raycast.embree import Backend
 
 ROOT = Path(__file__).resolve().parent.parent
 PROBE_SECONDS = 300
@@ -193,6 +196,21 @@ def pytest_runtest_setup(item: pytest.Item) -> None:
         if os.environ.get("CI") == "true":
             pytest.fail(NO_BROWSER, pytrace=False)
         pytest.skip(NO_BROWSER)
+
+
+@pytest.fixture(params=("embree", "warp"))
+def backend(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> "Backend":
+    """What traces the rays of scenes on a CPU that name no backend; tests that use it run once with each."""
+    from maniskill_tomato.raycast import scene
+    from maniskill_tomato.raycast.embree import choose_backend
+
+    name: Backend = request.param
+
+    def choose(device: "torch.device", wanted: "Backend | None") -> "Backend":
+        return choose_backend(device, wanted or (name if device.type == "cpu" else "warp"))
+
+    monkeypatch.setattr(scene, "choose_backend", choose)
+    return name
 
 
 @pytest.hookimpl(wrapper=True)
