@@ -137,8 +137,7 @@ class PlantSpec:
             return self._generated(self.generator, seed)
         if not self.row:
             return generate_plant(self.preset, seed, self.detail, leaf_density_of(self.leaf_density, seed))
-        beside = _neighbours(seed)
-        return generate_row(self.preset, seed, self.detail, self.leaf_density, seeds=beside)
+        return generate_row(self.preset, seed, self.detail, self.leaf_density, seeds=_neighbours(seed))
 
     def _generated(self, generator: str, seed: int) -> Plant:
         plant = generated_plant(generator, seed)

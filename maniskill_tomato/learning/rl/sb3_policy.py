@@ -7,10 +7,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from maniskill_tomato.learning.rl.envs import check_env_id
 from maniskill_tomato.learning.rl.gymnasium_env import normalize_observation
 from maniskill_tomato.learning.rl.presets import default_preset, get_preset
 from maniskill_tomato.policies.adapters import ObservationPolicy
+from maniskill_tomato.tasks.making import check_env_id
 
 
 class Predictor(Protocol):
