@@ -50,7 +50,7 @@ COMMANDS: Final[dict[str, CommandEntry]] = {
         "learn_commands:TrainDeepMoveToSee", "Train the network of the planner deep_3dmts"
     ),
     "demonstrations": CommandEntry(
-        "learn_commands:RecordDemonstrations", "Record a planner's episodes for other learners"
+        "learn_commands:RecordDemonstrations", "Record a policy's episodes for other learners"
     ),
     "export": CommandEntry("learn_commands:Export", "Write a policy as ONNX, which runs without PyTorch"),
     "eval": CommandEntry("eval_command:Eval", "Evaluate a policy and write a report"),

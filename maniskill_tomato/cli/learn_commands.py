@@ -9,13 +9,15 @@ import tyro
 
 from maniskill_tomato.cli.arguments import Flat
 from maniskill_tomato.cli.early_checks import check_counts, check_env_id, check_file, check_policy
-from maniskill_tomato.cli.shared_options import EnvId, parse_env_options, tell_policy
+from maniskill_tomato.cli.shared_options import EnvId, PlantOptions, parse_env_options, tell_policy
 from maniskill_tomato.errors import InvalidInputError
 from maniskill_tomato.learning.imitation.imitation_config import ImitationConfig, RegressionConfig
 from maniskill_tomato.learning.rl.ppo_config import PpoConfig, default_ppo
 from maniskill_tomato.learning.view_quality.quality_config import QualityTrainConfig
 from maniskill_tomato.policies.opening import shipped_policy
-from maniskill_tomato.tasks import TASK_IDS, THESIS_IDS
+from maniskill_tomato.tasks import GENERAL_IDS, TASK_IDS, THESIS_IDS
+
+GENERAL_ID = GENERAL_IDS[0]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -162,10 +164,16 @@ class TrainPpo:
 
 @dataclass(frozen=True, kw_only=True)
 class RecordDemonstrations:
-    """Record a planner's successful episodes on training plants in ManiSkill's trajectory format."""
+    """Record a policy's successful episodes in ManiSkill's trajectory format.
 
-    planner: str = "oracle"
-    """Whose moves to record: a planner's name or a policy's file."""
+    `train --reward-from` learns a reward from them.
+    """
+
+    env_id: EnvId = GENERAL_ID
+    """The task."""
+    policy: str | None = None
+    """Whose moves to record: a planner's name or a policy's file; by default the oracle, on the thesis's tasks the
+    policy that ships with the package."""
     episodes: int = 100
     """How many to try; those that fail are left out."""
     first_seed: int = 0
@@ -174,10 +182,15 @@ class RecordDemonstrations:
     """Folder of trajectory.h5 and trajectory.json."""
     contact_free: bool = False
     """Let the oracle avoid the plant."""
+    plants: Annotated[PlantOptions, Flat] = PlantOptions()
+    """Another plant."""
 
     def run(self) -> None:
         """Records and says what."""
-        check_policy("--planner", self.planner)
+        check_env_id(self.env_id, (*THESIS_IDS, GENERAL_ID))
+        shipped = str(shipped_policy(self.env_id)) if self.env_id in THESIS_IDS else "oracle"
+        policy = self.policy or shipped
+        check_policy("--policy", policy, self.env_id)
         check_counts(episodes=self.episodes)
         check_counts(0, first_seed=self.first_seed)
 
@@ -185,10 +198,10 @@ class RecordDemonstrations:
         from maniskill_tomato.learning.imitation.demonstrations import record_demonstrations
         from maniskill_tomato.learning.rl.envs import make_simulated_env
 
-        env = make_simulated_env("TomatoViewpoint-v1")
-        planner = open_for(PolicySpec.parse(self.planner), env, self.contact_free)
+        env = make_simulated_env(self.env_id, **self.plants.env_options())
+        opened = open_for(PolicySpec.parse(policy), env, self.contact_free)
         seeds = range(self.first_seed, self.first_seed + self.episodes)
-        result = record_demonstrations(env, planner, seeds, self.out)
+        result = record_demonstrations(env, opened, seeds, self.out)
         print(f"{result.path}: {result.recorded} of {result.tried} episodes, {result.moves} moves")
 
 

@@ -83,6 +83,8 @@ class Train:
         check_counts(jobs=self.jobs)
         if self.config.initial_policy is not None:
             check_file("--initial-policy", Path(self.config.initial_policy))
+        if self.config.reward_from is not None:
+            check_file("--reward-from", Path(self.config.reward_from))
         if self.resume is not None:
             self._check_resume(run_file)
         env_options = merge_options(run_file.env_options, self.plants.env_options())

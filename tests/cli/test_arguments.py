@@ -105,8 +105,20 @@ ERRORS: dict[str, tuple[tuple[str, ...], str]] = {
         "error: --seeds must be one or more",
     ),
     "demonstrations": (
-        ("demonstrations", "--planner", "orakle"),
-        "error: --planner: no policy at 'orakle'",
+        ("demonstrations", "--policy", "orakle"),
+        "error: --policy: no policy at 'orakle'",
+    ),
+    "demonstrations of a planner without a belief": (
+        ("demonstrations", GUIDED, "--policy", "nbv"),
+        "error: --policy: nbv plans on a belief",
+    ),
+    "demonstrations to learn from": (
+        ("train", GUIDED, "--reward-from", "no.h5"),
+        "error: --reward-from: there is no file no.h5",
+    ),
+    "hindsight without the task's word": (
+        ("train", GUIDED, "--reward-from", "no.h5", "--hindsight-targets", "2"),
+        "error: --hindsight-targets needs what the task says",
     ),
     "policy beside another": (
         ("eval", GENERAL, "--beside", "lattice_oracle,nbw"),

@@ -15,7 +15,7 @@ from maniskill_tomato.learning.rl.envs import LearnerEnv, make_learner_env
 from maniskill_tomato.learning.rl.experience import Experience, make_replay
 from maniskill_tomato.learning.rl.presets import TrainConfig, get_preset
 from maniskill_tomato.learning.rl.replay import Batch
-from maniskill_tomato.learning.rl.rewards import learned_reward, potential_reward
+from maniskill_tomato.learning.rl.rewards import potential_reward, training_reward
 
 SPARSE = "TomatoViewpointSparse-v1"
 
@@ -59,7 +59,7 @@ def walk(env: LearnerEnv, config: TrainConfig, steps: int) -> tuple[Any, list[di
         next_observations, rewards, terminations, _, next_info = env.step(actions * scale)
         step_info = next_info.get("final_info", next_info)
         reached = next_info.get("final_obs", next_observations)
-        learned = learned_reward(config, rewards, terminations, visible, step_info)
+        learned = training_reward(config, rewards, terminations, visible, step_info)
         experience.add(
             Batch(observations, actions, learned, reached, terminations.float()),
             step_info,

@@ -1,4 +1,4 @@
-"""Demonstrations: a planner's successful episodes in ManiSkill's trajectory format.
+"""Demonstrations: a policy's successful episodes in ManiSkill's trajectory format.
 
 `FOLDER/trajectory.h5` and `.json`, as `mani_skill.utils.wrappers.record.RecordEpisode` writes them: observations,
 actions, rewards and states of every episode, and how to reset the environment to its start.
@@ -14,6 +14,7 @@ import torch
 
 from maniskill_tomato.errors import InvalidInputError
 from maniskill_tomato.folder_lock import only_writer
+from maniskill_tomato.policies.adapters import as_state_policy
 from maniskill_tomato.policies.protocol import Policy, reseed
 
 NAME = "trajectory"
@@ -34,16 +35,16 @@ class Demonstrations:
 
 def record_demonstrations(
     env: gym.Env[Any, Any],
-    planner: Policy,
+    policy: Policy,
     episodes: Iterable[int],
     folder: Path,
     reset_options: Callable[[int], dict[str, Any] | None] = lambda episode: None,
 ) -> Demonstrations:
-    """Runs a planner and keeps the episodes that it solves.
+    """Runs a policy and keeps the episodes that it solves.
 
     Args:
-        env: A single environment with a belief; its observations are recorded as they are. It is closed.
-        planner: Whose moves to record, usually the oracle.
+        env: A single environment; its observations are recorded as they are. It is closed.
+        policy: Whose moves to record.
         episodes: Seeds of the resets.
         folder: Of the files; it must not hold demonstrations yet.
         reset_options: Options of each reset.
@@ -53,12 +54,12 @@ def record_demonstrations(
         CheckpointError: Another process records in the folder, or it cannot be made.
     """
     with only_writer(folder, "records"):
-        return _record(env, planner, episodes, folder, reset_options)
+        return _record(env, policy, episodes, folder, reset_options)
 
 
 def _record(
     env: gym.Env[Any, Any],
-    planner: Policy,
+    policy: Policy,
     episodes: Iterable[int],
     folder: Path,
     reset_options: Callable[[int], dict[str, Any] | None],
@@ -76,19 +77,17 @@ def _record(
         save_on_reset=False,
         trajectory_name=NAME,
         source_type="motionplanning",
-        source_desc=f"moves of the planner {planner.name!r} of maniskill-tomato",
+        source_desc=f"moves of the policy {policy.name!r} of maniskill-tomato",
     )
-    world: Any = env.unwrapped
+    acting = as_state_policy(policy, env)
     recorded = tried = moves = 0
-    everywhere = torch.zeros(1, dtype=torch.int64, device=world.device)
     for episode in episodes:
         options = reset_options(episode)
-        recorder.reset(seed=episode, options=options)
-        reseed(planner, episode)
-        planner.begin(world.belief, everywhere)
+        observations, _ = recorder.reset(seed=episode, options=options)
+        reseed(policy, episode)
         done, success, steps = False, False, 0
         while not done:
-            _, _, terminated, truncated, info = recorder.step(planner.act(world.belief))
+            observations, _, terminated, truncated, info = recorder.step(acting.act(observations))
             steps += 1
             done = bool(torch.as_tensor(terminated).any()) or bool(torch.as_tensor(truncated).any())
             success = bool(torch.as_tensor(info["success"]).any())

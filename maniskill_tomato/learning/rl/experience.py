@@ -10,7 +10,7 @@ from torch import Tensor
 
 from maniskill_tomato.errors import InvalidInputError
 from maniskill_tomato.learning.rl.replay import Batch, ReplayBuffer
-from maniskill_tomato.learning.rl.rewards import learned_reward
+from maniskill_tomato.learning.rl.rewards import training_reward
 from maniskill_tomato.learning.rl.train_config import TrainConfig
 from maniskill_tomato.policies.layout import TARGET_POSITION
 
@@ -121,7 +121,7 @@ class Experience:
         success = info["other_success"]
         terminations = success | info["fail"][:, None]
         visible = info["other_visible_fraction"].flatten()
-        rewards = learned_reward(
+        rewards = training_reward(
             self._config,
             info["other_reward"].flatten(),
             terminations.flatten(),

@@ -1,4 +1,4 @@
-"""The reward that the learner may use instead of the task's own."""
+"""The reward that goes into the replay buffer: the task's own, or one made of what the task tells."""
 
 from collections.abc import Mapping
 
@@ -7,7 +7,7 @@ from torch import Tensor
 from maniskill_tomato.learning.rl.presets import TrainConfig
 
 
-def learned_reward(
+def training_reward(
     config: TrainConfig,
     rewards: Tensor,
     terminations: Tensor,

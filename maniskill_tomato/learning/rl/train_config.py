@@ -83,6 +83,9 @@ class TrainConfig:
     reward: Literal["task", "potential"] = "task"
     """Learn from the task's reward, or from success with V_f as a potential
     (`learning.rl.rewards.potential_reward`)."""
+    reward_from: str | None = None
+    """File of demonstrations (.h5) to learn the reward from, in place of `reward`
+    (`learning.rl.demonstrated_reward`)."""
     step_cost: float = 0.02
     """What each step costs with the potential reward."""
     gamma: float = 0.99
@@ -231,6 +234,7 @@ class TrainConfig:
                 f"({at_once}), got {self.buffer_size}"
             )
         self._check_images()
+        self._check_reward_from()
         for name in ("actor_hidden", "critic_hidden"):
             widths = getattr(self, name)
             if not widths or min(widths) < 1:
@@ -279,6 +283,19 @@ class TrainConfig:
                 "hindsight_targets relabels state vectors, and an image shows one target; set it to 0, or use "
                 "obs_mode 'state'"
             )
+
+    def _check_reward_from(self) -> None:
+        if self.reward_from is None:
+            return
+        if self.obs_mode != STATE_MODE:
+            raise InvalidInputError(
+                f"reward_from judges state vectors; set obs_mode to 'state', got {self.obs_mode!r}"
+            )
+        for name in ("hindsight_targets", "aux_visibility_weight"):
+            if getattr(self, name):
+                raise InvalidInputError(
+                    f"{name} needs what the task says about views, which reward_from does without; set it to 0"
+                )
 
     def to_dict(self) -> dict[str, Any]:
         """The fields as numbers, strings and lists, ready for JSON."""

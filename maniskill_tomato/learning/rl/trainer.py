@@ -16,15 +16,17 @@ from torch import Tensor
 from maniskill_tomato.errors import CheckpointError, InvalidInputError, TrainingDivergedError
 from maniskill_tomato.files import write_tensors
 from maniskill_tomato.folder_lock import only_writer
+from maniskill_tomato.learning.imitation.trajectory_file import read_demonstrations
 from maniskill_tomato.learning.interrupt import StopRequest, stop_on_signals
 from maniskill_tomato.learning.rl.agent import begin_with, check_fits, update
 from maniskill_tomato.learning.rl.checkpoint import make_checkpoint
+from maniskill_tomato.learning.rl.demonstrated_reward import DemonstratedReward, RewardModel
 from maniskill_tomato.learning.rl.envs import LearnerEnv, make_learner_env
 from maniskill_tomato.learning.rl.observations import columns_of, device_of, eyes_of
 from maniskill_tomato.learning.rl.presets import TrainConfig
 from maniskill_tomato.learning.rl.progress import Progress, TrainingLog
 from maniskill_tomato.learning.rl.replay import Batch
-from maniskill_tomato.learning.rl.rewards import learned_reward
+from maniskill_tomato.learning.rl.rewards import training_reward
 from maniskill_tomato.learning.rl.run_folder import (
     check_run_dir,
     checkpoint_path,
@@ -79,6 +81,7 @@ class Trainer:
         env_options: dict[str, Any] | None = None,
         resume: bool = False,
         report: Callable[[Progress], None] | None = None,
+        reward_model: RewardModel | None = None,
     ) -> None:
         """Prepares a run; nothing is stepped or written yet.
 
@@ -93,6 +96,7 @@ class Trainer:
             resume: Go on with the run in `run_dir` from its newest checkpoint, bit for bit as if it had never
                 stopped.
             report: Called about twice a second with where the run is.
+            reward_model: Judges in place of the task; by default the one that `config.reward_from` asks for.
 
         Raises:
             InvalidInputError: `run_dir` already holds a run and `resume` is off, or holds none and it is on,
@@ -115,6 +119,11 @@ class Trainer:
         if config.initial_policy is not None and not resume:
             self._given = load_actor(config.initial_policy, env_id=env_id)
             check_fits(self._given, config, observation_dim)
+        self._reward_model = reward_model
+        if config.reward_from is not None and reward_model is None:
+            demonstrations = read_demonstrations(Path(config.reward_from), env_id)
+            self._reward_model = DemonstratedReward(demonstrations, config, seed)
+            self._reward_model.check_fits(observation_dim)
         if not resume:
             check_run_dir(run_dir)
         elif not (run_dir / "config.json").is_file():
@@ -170,7 +179,14 @@ class Trainer:
         seeds = spread_seed(self._seed, self._env.num_envs)
         observations, info = self._env.reset(seed=self._seed if len(seeds) == 1 else seeds)
         self._state = state = TrainingState(
-            self._env, self._config, self._dims, self._seed, observations, info, self._run_dir
+            self._env,
+            self._config,
+            self._dims,
+            self._seed,
+            observations,
+            info,
+            self._run_dir,
+            self._reward_model,
         )
         write_config(self._run_dir, self._env_id, self._seed, self._env_options, self._config.to_dict())
         self._scale = torch.tensor(self._config.action_scale, device=device_of(observations))
@@ -225,7 +241,11 @@ class Trainer:
             # At the end of an episode `next_observations` is already the start of the next one.
             step_info = info.get("final_info", info)
             reached = info.get("final_obs", next_observations)
-            learned = learned_reward(self._config, rewards, terminations, state.visible_fraction, step_info)
+            learned = torch.zeros_like(rewards)
+            if state.reward_model is None:
+                learned = training_reward(
+                    self._config, rewards, terminations, state.visible_fraction, step_info
+                )
             self._check_finite(reward=learned, observation=state_of(reached))
             batch = Batch(observations, actions, learned, reached, terminations.float())
             state.experience.add(batch, step_info, info)
@@ -275,7 +295,11 @@ class Trainer:
         while state.updates_owed >= 1.0:
             state.updates_owed -= 1.0
             batch = state.replay.sample(config.batch_size, state.generator)
-            logs = update(state.agent, batch, state.updates, state.generator)
+            logs = {}
+            if state.reward_model is not None:
+                logs = state.reward_model.update(batch, state.agent.normalizer, state.generator)
+                batch = state.reward_model.judge(batch, state.agent.normalizer)
+            logs |= update(state.agent, batch, state.updates, state.generator)
             state.updates += 1
             for name, value in logs.items():
                 sums[name] = sums.get(name, 0.0) + float(value)

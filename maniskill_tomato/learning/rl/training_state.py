@@ -11,6 +11,7 @@ from torch import Tensor
 from maniskill_tomato.errors import CheckpointError
 from maniskill_tomato.learning.rl.agent import make_agent
 from maniskill_tomato.learning.rl.checkpoint import TRAINING_PARTS
+from maniskill_tomato.learning.rl.demonstrated_reward import RewardModel
 from maniskill_tomato.learning.rl.env_state import (
     env_state,
     set_env_state,
@@ -40,6 +41,7 @@ class TrainingState:
         observations: Observation,
         info: dict[str, Any],
         run_dir: Path | None = None,
+        reward_model: RewardModel | None = None,
     ) -> None:
         """The state at the start of a run.
 
@@ -51,12 +53,16 @@ class TrainingState:
             observations: What the reset gave. Shape (num_envs, observation_dim), or with images.
             info: What it gave beside them.
             run_dir: Folder of the run, for a replay buffer on the disk.
+            reward_model: Judges in place of the task.
         """
         device = device_of(observations)
         privileged = (
             0 if isinstance(observations, Tensor) else observations.get(PRIVILEGED, Tensor()).shape[-1]
         )
         self.env = env
+        self.reward_model = reward_model
+        if reward_model is not None:
+            reward_model.to(device)
         self.agent = make_agent(config, *dims, device, privileged_dim=privileged)
         self.replay = make_replay(config, env.single_observation_space, dims[1], device, run_dir)
         self.experience = Experience(config, self.replay, dims[0])
@@ -83,6 +89,7 @@ class TrainingState:
             "updates_owed": self.updates_owed,
             "replay": self.replay.state_dict(),
             "experience": self.experience.state_dict(),
+            "reward_model": None if self.reward_model is None else self.reward_model.state_dict(),
             "exploration": tensor_attributes(self.exploration),
             "history": self.history.state_dict(),
             "log": log_state,
@@ -107,6 +114,8 @@ class TrainingState:
                 getattr(self.agent, name).load_state_dict(saved[name])
             self.replay.load_state_dict(run["replay"])
             self.experience.load_state_dict(run["experience"])
+            if self.reward_model is not None:
+                self.reward_model.load_state_dict(run["reward_model"])
             set_tensor_attributes(self.exploration, run["exploration"], device)
             self.history.load_state_dict(run["history"])
             self.observations = mapped(run["observations"], lambda values: values.to(device))

@@ -1,0 +1,128 @@
+"""Demonstrations read from a trajectory file of ManiSkill, as `demonstrations.record_demonstrations` writes them."""
+
+import hashlib
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from maniskill_tomato.errors import InvalidInputError, MissingPackageError
+from maniskill_tomato.text_files import read_json
+
+LARGEST_OBSERVATIONS: Final = 1_000_000_000
+"""Of all episodes of a file together, unpacked, in [bytes]."""
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class DemonstratedViews:
+    """The N views that the moves of demonstrations led to; neither actions nor rewards are read."""
+
+    views: Tensor
+    """Observations after each move. Shape (N, D), float32."""
+    terminations: Tensor
+    """1.0 where the episode ended for good with that view. Shape (N,)."""
+    episodes: int
+    """From which they are."""
+
+    @property
+    def digest(self) -> str:
+        """Tells these demonstrations from others."""
+        content = self.views.numpy().tobytes() + self.terminations.numpy().tobytes()
+        return hashlib.sha256(content).hexdigest()
+
+
+def read_demonstrations(path: Path, env_id: str) -> DemonstratedViews:
+    """Reads every episode of a file.
+
+    Args:
+        path: The `.h5` file; its description, `.json`, stands beside it.
+        env_id: The task that they must be of.
+
+    Raises:
+        InvalidInputError: A file is missing or damaged, is of another task, or holds no move, or observations that are
+            no state vectors.
+        MissingPackageError: h5py, which comes with ManiSkill, is not installed.
+    """
+    _check_task(path, env_id)
+    try:
+        episodes = _episodes(path)
+    except InvalidInputError:
+        raise
+    except (OSError, RuntimeError, ValueError, KeyError, TypeError, AttributeError, MemoryError) as error:
+        raise InvalidInputError(f"{path} cannot be read as demonstrations: {error}") from error
+    if not episodes:
+        raise InvalidInputError(
+            f"{path} holds no episode; record some with `maniskill-tomato demonstrations {env_id}`"
+        )
+    views = np.concatenate([observations[1:] for observations, _ in episodes])
+    if len({observations.shape[1] for observations, _ in episodes}) != 1 or not np.isfinite(views).all():
+        raise InvalidInputError(f"{path} holds observations of several lengths, or that are not finite")
+    return DemonstratedViews(
+        views=torch.from_numpy(views),
+        terminations=torch.from_numpy(np.concatenate([ended for _, ended in episodes])),
+        episodes=len(episodes),
+    )
+
+
+def _check_task(path: Path, env_id: str) -> None:
+    """Refuses a file that is not there, or of another task."""
+    description = path.with_suffix(".json")
+    for file in (path, description):
+        if not file.is_file():
+            raise InvalidInputError(
+                f"there is no file {file}; demonstrations are a .h5 file and a .json file of the same name"
+            )
+    content = read_json(description)
+    about = content.get("env_info") if isinstance(content, dict) else None
+    recorded = about.get("env_id") if isinstance(about, dict) else None
+    if recorded != env_id:
+        raise InvalidInputError(
+            f"{path} holds demonstrations of {recorded}, not of {env_id}; record some with "
+            f"`maniskill-tomato demonstrations {env_id}`"
+        )
+
+
+def _episodes(path: Path) -> list[tuple[NDArray[np.float32], NDArray[np.float32]]]:
+    """Observations of shape (T + 1, D) and terminations of shape (T,) of every episode with a move, in their order."""
+    try:
+        import h5py
+    except ImportError as error:
+        raise MissingPackageError(
+            f"{path} is read with h5py, which is not installed; it comes with ManiSkill (`make venv KIND=full`)"
+        ) from error
+
+    room = LARGEST_OBSERVATIONS
+
+    def array(episode: Any, name: str) -> NDArray[np.float32]:
+        nonlocal room
+        stored = episode.get(name)
+        # What lies in other files could be any file of this machine.
+        if not isinstance(stored, h5py.Dataset) or stored.is_virtual or stored.external:
+            raise InvalidInputError(
+                f"{path}: {episode.name} must hold {name} as an array; record with obs_mode 'state'"
+            )
+        room -= stored.nbytes
+        if room < 0:
+            raise InvalidInputError(f"{path} unpacks to more than {LARGEST_OBSERVATIONS} bytes")
+        return np.asarray(stored[()], np.float32)
+
+    episodes = []
+    with h5py.File(path, "r") as file:
+        names = [name for name in file if name.startswith("traj_")]
+        # traj_2 comes before traj_10.
+        for name in sorted(names, key=lambda name: (len(name), name)):
+            if not isinstance(file.get(name, getlink=True), h5py.HardLink):
+                raise InvalidInputError(f"{path}: {name} must lie in the file itself")
+            observations, ended = array(file[name], "obs"), array(file[name], "terminated")
+            if observations.ndim != 2 or ended.shape != (len(observations) - 1,):
+                raise InvalidInputError(
+                    f"{path}: {name} must have observations of shape (T + 1, D) and terminations of shape (T,), got "
+                    f"{observations.shape} and {ended.shape}"
+                )
+            if len(ended):
+                episodes.append((observations, ended))
+    return episodes
