@@ -44,7 +44,7 @@ from maniskill_tomato.policies.opening import open_policy
 from maniskill_tomato.tasks import THESIS_IDS
 
 Teacher = Literal["designed", "learned", "cloned", "plus", "minus", "bare-plus", "bare-minus"]
-TASKS = dict(zip(("guided", "sparse"), THESIS_IDS, strict=True))
+TASKS: dict[str, str] = dict(zip(("guided", "sparse"), THESIS_IDS, strict=True))
 
 
 @dataclass(frozen=True, kw_only=True)
