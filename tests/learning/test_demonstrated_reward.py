@@ -331,7 +331,8 @@ def a_view_short(path: Path) -> None:
 
 def not_finite(path: Path) -> None:
     with h5py.File(path, "a") as file:
-        file["traj_1/obs"][1, 3] = np.nan
+        observations: Any = file["traj_1/obs"]
+        observations[1, 3] = np.nan
 
 
 def elsewhere(path: Path) -> None:

@@ -111,7 +111,8 @@ def _episodes(path: Path) -> list[tuple[NDArray[np.float32], NDArray[np.float32]
         return np.asarray(stored[()], np.float32)
 
     episodes = []
-    with h5py.File(path, "r") as file:
+    with h5py.File(path, "r") as opened:
+        file: Any = opened
         names = [name for name in file if name.startswith("traj_")]
         # traj_2 comes before traj_10.
         for name in sorted(names, key=lambda name: (len(name), name)):
