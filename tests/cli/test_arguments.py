@@ -118,7 +118,7 @@ ERRORS: dict[str, tuple[tuple[str, ...], str]] = {
     ),
     "hindsight without the task's word": (
         ("train", GUIDED, "--reward-from", "no.h5", "--hindsight-targets", "2"),
-        "error: --hindsight-targets needs what the task says",
+        "error: --hindsight-targets must be 0 beside",
     ),
     "policy beside another": (
         ("eval", GENERAL, "--beside", "lattice_oracle,nbw"),

@@ -377,8 +377,8 @@ def test_demonstrations_of_something_else_are_refused_before_the_training(tmp_pa
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"hindsight_targets": 2}, "hindsight_targets needs what the task says"),
-        ({"aux_visibility_weight": 0.1}, "aux_visibility_weight needs what the task says"),
+        ({"hindsight_targets": 2}, "hindsight_targets must be 0 beside reward_from"),
+        ({"aux_visibility_weight": 0.1}, "aux_visibility_weight must be 0 beside reward_from"),
         ({"obs_mode": "depth"}, "reward_from judges state vectors"),
     ],
 )

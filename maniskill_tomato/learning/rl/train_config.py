@@ -294,7 +294,8 @@ class TrainConfig:
         for name in ("hindsight_targets", "aux_visibility_weight"):
             if getattr(self, name):
                 raise InvalidInputError(
-                    f"{name} needs what the task says about views, which reward_from does without; set it to 0"
+                    f"{name} must be 0 beside reward_from, which does without what the task says about views; "
+                    f"got {getattr(self, name)}"
                 )
 
     def to_dict(self) -> dict[str, Any]:
