@@ -47,8 +47,8 @@ class Approach:
         self._pay = pay
 
     def reset(self, *, seed: int | list[int] | None = None) -> tuple[Tensor, dict[str, Any]]:
-        assert isinstance(seed, int)
-        self._generator = torch.Generator().manual_seed(seed)
+        assert seed is not None
+        self._generator = torch.Generator().manual_seed(seed if isinstance(seed, int) else seed[0])
         self._place = torch.zeros(self.num_envs, 9)
         self._elapsed = torch.zeros(self.num_envs, dtype=torch.long)
         self._begin(torch.ones(self.num_envs, dtype=torch.bool))
@@ -65,7 +65,7 @@ class Approach:
         if bool(done.any()):
             final = self._place.clone()
             self._begin(done)
-            info = self._info(terminated) | {"final_observation": final, "final_info": info}
+            info = self._info(terminated) | {"final_obs": final, "final_info": info}
         return self._place.clone(), reward, terminated, truncated, info
 
     def close(self) -> None:
