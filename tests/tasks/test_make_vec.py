@@ -260,7 +260,8 @@ def test_gymnasiums_wrappers_of_observations_take_it() -> None:
     for expected, found in pairs:
         for i in range(2):
             own = {name: value[i] for name, value in expected.items()}
-            assert np.array_equal(found[i], gym.spaces.flatten(plain.single_observation_space, own))
+            wanted: Any = gym.spaces.flatten(plain.single_observation_space, own)
+            assert np.array_equal(found[i], wanted)
 
 
 def test_single_environments_keep_maniskills_time_limit() -> None:
