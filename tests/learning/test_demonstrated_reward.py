@@ -263,7 +263,7 @@ def test_demonstrations_alone_teach_the_way_to_the_target(tmp_path: Path) -> Non
     config = toy_config(reward_from=str(write(tmp_path / "shown.h5", shown())), critic_learning_rate=2e-3)
     untrained = learn(tmp_path / "untrained", replace(config, total_timesteps=300, learning_starts=300))
     assert arrivals(untrained) < 0.4
-    reached = [arrivals(learn(tmp_path / f"run-{seed}", replace(config, seed=seed))) for seed in (0, 1)]
+    reached = [arrivals(learn(tmp_path / f"run-{seed}", config, seed=seed)) for seed in (0, 1)]
     assert sum(reached) / 2 > 0.6
 
 
