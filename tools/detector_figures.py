@@ -52,7 +52,9 @@ class Args:
     out: Path = Path("docs/images")
     """Folder of `detector_losses.png`, `detector_precision.png` and `detector_pictures.jpg`."""
     pictures: int = 2
-    """Images of each set that are drawn: half of them rendered, half photos."""
+    """Images of each set that are drawn."""
+    photos: bool = False
+    """Whether every second one of them is a photo."""
 
 
 def test_curve(
@@ -80,9 +82,9 @@ def has_masks(image: AnnotatedImage) -> bool:
     return bool(image.fruits) and all(fruit.visible_mask is not None for fruit in image.fruits)
 
 
-def some(images: Sequence[AnnotatedImage], count: int) -> list[AnnotatedImage]:
-    """Rendered images and photos in turn, evenly from the whole set."""
-    kinds = [[i for i in images if has_masks(i)], [i for i in images if not has_masks(i)]]
+def some(images: Sequence[AnnotatedImage], count: int, photos: bool) -> list[AnnotatedImage]:
+    """Rendered images, or these and photos in turn, evenly from the whole set."""
+    kinds = [[i for i in images if has_masks(i)], [i for i in images if photos and not has_masks(i)]]
     kinds = [kind for kind in kinds if kind]
     chosen = []
     for number in range(count):
@@ -114,7 +116,7 @@ def main(args: Args) -> None:
         if found[0] is not None:
             curves[folder.name] = found[0]
         for name in SETS:
-            for image in some(read_place(f"{data}:{name}").images, args.pictures):
+            for image in some(read_place(f"{data}:{name}").images, args.pictures, args.photos):
                 picture = image.load()
                 drawn.append(draw_instances(picture, segmenter(picture), CONFIDENT))
     plot_precision_recall(curves, args.out / "detector_precision.png")

@@ -151,4 +151,5 @@ def open_for_files(name: str, score_threshold: float, thorough: bool) -> Segment
 
 
 def _takes_threshold(opener: Callable[..., Segmenter]) -> bool:
-    return "score_threshold" in inspect.signature(opener).parameters
+    parameters = inspect.signature(opener).parameters.values()
+    return any(p.name == "score_threshold" or p.kind is p.VAR_KEYWORD for p in parameters)

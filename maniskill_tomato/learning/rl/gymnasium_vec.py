@@ -72,7 +72,9 @@ class LearnableVector(gym.vector.VectorWrapper[Any, Any, Any, Any, NDArray[Any]]
             info["final_info"] = _with_reward(info["final_info"], task_reward)
             for i in np.flatnonzero(info["_final_obs"]):
                 info["final_obs"][i] = normalize_observation(info["final_obs"][i])
-            task_reward = np.where(info["_final_obs"], np.float32(0.0), task_reward)  # Of the episodes just begun.
+            task_reward = np.where(
+                info["_final_obs"], np.float32(0.0), task_reward
+            )  # Of the episodes just begun.
         observations = normalize_observation(observations)
         return observations, reward, terminated, truncated, _with_reward(info, task_reward)
 

@@ -66,7 +66,14 @@ class GymnasiumVecEnv(VecEnv):  # type: ignore[misc]
 
     def get_attr(self, attr_name: str, indices: VecEnvIndices = None) -> list[Any]:
         """An attribute, once for each of these environments."""
-        return [getattr(self.env, attr_name)] * self._count(indices)
+        return [self._found(attr_name)] * self._count(indices)
+
+    def _found(self, name: str) -> Any:
+        """An attribute of the environments or of what they wrap; Gymnasium's vector wrappers hide it."""
+        env: Any = self.env
+        while not hasattr(env, name) and isinstance(env, gym.vector.VectorWrapper):
+            env = env.env
+        return getattr(env, name)
 
     def set_attr(self, attr_name: str, value: Any, indices: VecEnvIndices = None) -> None:
         """Sets an attribute of all environments."""
@@ -76,7 +83,7 @@ class GymnasiumVecEnv(VecEnv):  # type: ignore[misc]
         self, method_name: str, *method_args: Any, indices: VecEnvIndices = None, **method_kwargs: Any
     ) -> list[Any]:
         """What a method gives, once for each of these environments."""
-        return [getattr(self.env, method_name)(*method_args, **method_kwargs)] * self._count(indices)
+        return [self._found(method_name)(*method_args, **method_kwargs)] * self._count(indices)
 
     def env_is_wrapped(
         self, wrapper_class: type[gym.Wrapper[Any, Any, Any, Any]], indices: VecEnvIndices = None
