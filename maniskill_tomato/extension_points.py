@@ -13,6 +13,8 @@ import sys
 from collections.abc import Mapping
 from dataclasses import dataclass
 from importlib.metadata import EntryPoint, entry_points
+from importlib.util import find_spec
+from pathlib import Path
 from typing import Any, Final
 
 from maniskill_tomato.errors import InvalidInputError
@@ -74,8 +76,7 @@ class ExtensionPoint:
             InvalidInputError: There is no such name, or the object cannot be imported.
         """
         if is_import_path(name):
-            if "" not in sys.path:
-                sys.path.append("")  # The working directory, whatever it is by then.
+            _look_in_working_directory()
             found = Extension(name, name, "")
         else:
             known = {extension.name: extension for extension in self.extensions()}
@@ -89,6 +90,21 @@ class ExtensionPoint:
             raise InvalidInputError(
                 f"the {self.kind} {name!r}{whose} cannot be loaded: {error}; can Python import {found.target}?"
             ) from error
+
+
+def source_file(import_path: str) -> Path | None:
+    """The file of the module of `package.module:attribute`, which is not imported; None if there is none."""
+    _look_in_working_directory()
+    try:
+        spec = find_spec(import_path.partition(":")[0])
+    except (ImportError, ValueError):
+        return None
+    return None if spec is None or spec.origin is None else Path(spec.origin)
+
+
+def _look_in_working_directory() -> None:
+    if "" not in sys.path:
+        sys.path.append("")  # Whatever it is by then.
 
 
 def is_import_path(name: str) -> bool:

@@ -14,6 +14,7 @@ import torch
 
 from maniskill_tomato.cli import main
 from maniskill_tomato.errors import InvalidInputError, PolicyError
+from maniskill_tomato.experiments.policy_runs import PolicySpec
 from maniskill_tomato.extension_points import ExtensionPoint, is_import_path
 from maniskill_tomato.learning.rl.gymnasium_env import make_gymnasium_env, normalize_observation
 from maniskill_tomato.learning.rl.sb3_policy import sb3_policy
@@ -183,3 +184,16 @@ def test_a_model_with_predict_acts_as_in_the_environment_that_it_learned_in() ->
         world.step(policy.act(world.observation()))
         seen = normalize_observation(world.observation().numpy())
         np.testing.assert_allclose(seen[0], observation, atol=1e-5)
+
+
+def test_stored_episodes_are_not_those_of_a_changed_module(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    module = tmp_path / "changing_policy.py"
+    module.write_text("def make(context): ...\n")
+    first = PolicySpec.parse("changing_policy:make").fingerprint
+    assert PolicySpec.parse("changing_policy:make").fingerprint == first
+    module.write_text("def make(context): return None\n")
+    assert PolicySpec.parse("changing_policy:make").fingerprint != first
+    assert PolicySpec.parse("nbv").fingerprint == "nbv"

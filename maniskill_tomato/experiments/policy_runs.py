@@ -15,6 +15,7 @@ from maniskill_tomato.experiments.episode_record import EpisodeRecord
 from maniskill_tomato.experiments.result_store import ResultStore, fingerprint
 from maniskill_tomato.experiments.rollout import open_widest, run_listed
 from maniskill_tomato.experiments.stored_episodes import about_condition
+from maniskill_tomato.extension_points import is_import_path, source_file
 from maniskill_tomato.learning.rl.envs import make_env
 from maniskill_tomato.policies.opening import find_policy, needs_colours, open_policy
 from maniskill_tomato.policies.protocol import Policy
@@ -53,9 +54,12 @@ class PolicySpec:
 
     @property
     def fingerprint(self) -> str:
-        """Says whether stored episodes are of this policy: its name, or the hash of its file."""
+        """Says whether stored episodes are of this policy: its name, or the hash of its file or of its module."""
         path = Path(self.source)
-        return f"file:{fingerprint(path)}" if path.is_file() else self.source
+        if path.is_file():
+            return f"file:{fingerprint(path)}"
+        module = source_file(self.source) if is_import_path(self.source) else None
+        return self.source if module is None else f"{self.source} {fingerprint(module)}"
 
 
 def label_of(found: str | Path) -> str:
