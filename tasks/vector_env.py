@@ -364,7 +364,11 @@ def make_vector_env(
     _check_vector_options(env_id, options)
     check_choice("arrays", arrays, get_args(Arrays))
     check_choice("device", torch.device(device).type, ("cpu", "cuda"))
-    check_choice("control_mode", control_mode, CONTROL_MODES)
+    if control_mode is not None and control_mode not in CONTROL_MODES:
+        raise InvalidInputError(
+            f"control_mode must be {' or '.join(repr(m) for m in CONTROL_MODES)} without a simulator, got "
+            f"{control_mode!r}{did_you_mean(control_mode, CONTROL_MODES)}; ManiSkill's others go with gymnasium.make"
+        )
     check_integer("num_envs", num_envs, 1)
     steps = MAX_STEPS[env_id] if max_episode_steps is None else max_episode_steps
     check_integer("max_episode_steps", steps, 1)

@@ -8,10 +8,13 @@ import sapien
 import torch
 from mani_skill.agents.base_agent import BaseAgent, Keyframe
 from mani_skill.agents.controllers import (
+    PDEEPosController,
+    PDEEPosControllerConfig,
     PDEEPoseController,
     PDEEPoseControllerConfig,
     PDJointPosControllerConfig,
 )
+from mani_skill.agents.controllers.utils.kinematics import Kinematics
 from mani_skill.agents.registration import register_agent
 from mani_skill.sensors.camera import CameraConfig
 
@@ -32,7 +35,7 @@ JOINT_STEP = 0.1
 """Largest joint increment of one `pd_joint_delta_pos` action, in [rad]."""
 
 POSITION_STEP = 0.1
-"""Largest translation of one `pd_ee_delta_pose` action along each axis, in [m]."""
+"""Largest translation of one `pd_ee_delta_pose` or `pd_ee_delta_pos` action along each axis of the base, in [m]."""
 
 ROTATION_STEP = 0.1
 """Largest rotation of one `pd_ee_delta_pose` action, in [rad]."""
@@ -87,7 +90,35 @@ class D435CameraConfig(CameraConfig):  # type: ignore[misc]
         return d435.depth_intrinsics(self.width, self.height)
 
 
-class EEDeltaPoseController(PDEEPoseController):  # type: ignore[misc]
+class LimitedKinematics(Kinematics):  # type: ignore[misc]
+    """ManiSkill's inverse kinematics, of which solutions beyond the joints' limits count as none."""
+
+    def compute_ik(self, pose: Any, q0: torch.Tensor, **options: Any) -> torch.Tensor | None:
+        """Joint positions that reach a pose, those of `q0` for arms that do not. Shape (num_envs, 7)."""
+        solved: torch.Tensor | None = super().compute_ik(pose, q0, **options)
+        if solved is None:
+            return None
+        lower, upper = self.articulation.get_qlimits().unbind(-1)
+        within = ((solved >= lower) & (solved <= upper)).all(dim=-1, keepdim=True)
+        return torch.where(within, solved, q0)
+
+
+class EEPosController(PDEEPosController):  # type: ignore[misc]
+    """ManiSkill's end-effector controller, within the joints' limits."""
+
+    def _initialize_joints(self) -> None:
+        super()._initialize_joints()
+        config = self.config
+        self.kinematics = LimitedKinematics(
+            config.urdf_path, config.ee_link, self.articulation, self.active_joint_indices
+        )
+
+
+class EEPoseController(EEPosController, PDEEPoseController):  # type: ignore[misc]
+    """The same for position and orientation."""
+
+
+class EEDeltaPoseController(EEPoseController):
     """ManiSkill's end-effector controller, turning the way the action says.
 
     The original scales rotations by their lower bound, so that +1 about an axis turns by -`ROTATION_STEP`.
@@ -112,10 +143,12 @@ class Iiwa14D435(BaseAgent):  # type: ignore[misc]
         "pd_look_at",
         "pd_joint_pos",
         "pd_joint_delta_pos",
+        "pd_ee_delta_pos",
         "pd_ee_delta_pose",
         "pd_ee_pose",
     )
-    """The control modes; the first is the default."""
+    """The control modes; the first is the default. `pd_ee_delta_pos` moves the flange along the axes of the base and
+    keeps its orientation; as with the other two of the end-effector, an arm that does not get there stays."""
 
     uid = "iiwa14_d435"
     fix_root_link = True
@@ -147,6 +180,8 @@ class Iiwa14D435(BaseAgent):  # type: ignore[misc]
         )
         joints = list(iiwa14.JOINT_NAMES)
         end_effector: dict[str, Any] = dict(**drives, ee_link=iiwa14.EE_LINK_NAME, urdf_path=self.urdf_path)
+        delta_pos = PDEEPosControllerConfig(joints, -POSITION_STEP, POSITION_STEP, **end_effector)
+        delta_pos.controller_cls = EEPosController
         delta_pose = PDEEPoseControllerConfig(
             joints,
             -POSITION_STEP,
@@ -156,6 +191,10 @@ class Iiwa14D435(BaseAgent):  # type: ignore[misc]
             **end_effector,
         )
         delta_pose.controller_cls = EEDeltaPoseController
+        pose = PDEEPoseControllerConfig(
+            joints, -MAX_REACH, MAX_REACH, use_delta=False, normalize_action=False, **end_effector
+        )
+        pose.controller_cls = EEPoseController
         return {
             "pd_viewpoint": ArmMoveControllerConfig(joints, **drives, control="viewpoint"),
             "pd_look_at": ArmMoveControllerConfig(joints, **drives, control="look_at"),
@@ -163,15 +202,9 @@ class Iiwa14D435(BaseAgent):  # type: ignore[misc]
             "pd_joint_delta_pos": PDJointPosControllerConfig(
                 joints, -JOINT_STEP, JOINT_STEP, use_delta=True, **drives
             ),
+            "pd_ee_delta_pos": delta_pos,
             "pd_ee_delta_pose": delta_pose,
-            "pd_ee_pose": PDEEPoseControllerConfig(
-                joints,
-                -MAX_REACH,
-                MAX_REACH,
-                use_delta=False,
-                normalize_action=False,
-                **end_effector,
-            ),
+            "pd_ee_pose": pose,
         }
 
     @property

@@ -254,7 +254,8 @@ class TomatoEnv(BaseEnv):  # type: ignore[misc]
             return batch
         if self.motion == "kinematic":
             self.agent.set_action(batch)
-            self._put_joints(self.agent.robot.get_drive_targets())
+            lower, upper = self.agent.robot.get_qlimits().unbind(-1)
+            self._put_joints(self.agent.robot.get_drive_targets().clamp(lower, upper))
         else:
             super()._step_action(batch)
         self.world.arrive(self.agent.robot.get_qpos().clone(), self._move)

@@ -287,6 +287,7 @@ def test_single_environments_keep_maniskills_time_limit() -> None:
         (GENERAL, {"autoreset_mode": "SameSteps"}, "did you mean 'SameStep'"),
         (GENERAL, {"arrays": "jax"}, "'numpy', 'torch'"),
         (GENERAL, {"control_mode": "pd_joint_pos"}, "pd_look_at"),
+        (GENERAL, {"control_mode": "pd_ee_delta_pos"}, "'pd_look_at'.*gymnasium.make"),
         (GENERAL, {"max_episode_steps": 0}, "1 or more"),
         (GENERAL, {"num_envs": 0}, "1 or more"),
         (GENERAL, {"device": "mps"}, "'cpu', 'cuda'"),

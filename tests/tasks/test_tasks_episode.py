@@ -12,8 +12,10 @@ from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 import maniskill_tomato  # noqa: F401
-from maniskill_tomato.robot.inverse_kinematics import Reach
+from maniskill_tomato.robot.iiwa14 import JOINT_UPPER
+from maniskill_tomato.robot.inverse_kinematics import InverseKinematics, Reach
 from maniskill_tomato.robot.kinematics import forward_kinematics
+from maniskill_tomato.tasks import TASK_IDS
 
 GUIDED = "TomatoViewpointGuided-v1"
 SPARSE = "TomatoViewpointSparse-v1"
@@ -264,7 +266,8 @@ def test_dynamic_motion_arrives_where_kinematic_motion_puts_the_arm() -> None:
 
 
 @pytest.mark.parametrize(
-    "control_mode", ["pd_joint_pos", "pd_joint_delta_pos", "pd_ee_delta_pose", "pd_ee_pose"]
+    "control_mode",
+    ["pd_joint_pos", "pd_joint_delta_pos", "pd_ee_delta_pos", "pd_ee_delta_pose", "pd_ee_pose"],
 )
 @pytest.mark.parametrize("motion", ["kinematic", "dynamic"])
 def test_usual_control_modes_work_on_the_task(control_mode: str, motion: str) -> None:
@@ -286,4 +289,48 @@ def test_usual_control_modes_work_on_the_task(control_mode: str, motion: str) ->
     T = forward_kinematics(env.unwrapped.agent.robot.get_qpos().double())[0]
     torch.testing.assert_close(obs[0, :3].double(), T[:3, 3], atol=1e-5, rtol=0)
     assert float((env.unwrapped.agent.robot.get_qpos()[0] - torch.as_tensor(qpos)).abs().max()) > 0.005
+    env.close()
+
+
+@pytest.mark.parametrize("control_mode", ["pd_joint_delta_pos", "pd_ee_delta_pos", "pd_ee_delta_pose"])
+def test_no_control_mode_puts_a_joint_beyond_its_limit(control_mode: str) -> None:
+    env = make(GUIDED, control_mode=control_mode)
+    robot, limits = env.unwrapped.agent.robot, torch.tensor(JOINT_UPPER, dtype=torch.float32)
+    env.action_space.seed(0)
+    close = 0.0
+    for seed in (10, 30, 33, 35):
+        env.reset(seed=seed)
+        action = env.action_space.sample()
+        for _ in range(29):
+            env.step(action)
+            close = max(close, float((robot.get_qpos().abs() / limits).max()))
+            assert close <= 1.0 + 1e-6
+    assert close > 0.9
+    env.close()
+
+
+@pytest.mark.parametrize("env_id", TASK_IDS)
+def test_pd_ee_delta_pos_moves_the_flange_in_tenths_of_a_metre_or_not_at_all(env_id: str) -> None:
+    """Against the closed-form inverse kinematics, which says what the arm can reach, and forward kinematics."""
+    env: Any = gym.make(env_id, control_mode="pd_ee_delta_pos", obs_mode="state", render_backend="none")
+    robot = env.unwrapped.agent.robot
+    exact = InverseKinematics()
+    rng = np.random.default_rng(0)
+    reached = stayed = 0
+    for seed in range(12):
+        env.reset(seed=seed)
+        qpos = robot.get_qpos().double()
+        wanted = forward_kinematics(qpos)
+        action = rng.uniform(-1.5, 1.5, 3).astype(np.float32)
+        wanted[0, :3, 3] += 0.1 * torch.from_numpy(action.clip(-1.0, 1.0)).double()
+        env.step(action)
+        there = forward_kinematics(robot.get_qpos().double())
+        if torch.equal(robot.get_qpos().double(), qpos):
+            stayed += 1
+            continue
+        # ManiSkill's solver stops at an error of 1e-4.
+        torch.testing.assert_close(there, wanted, atol=1e-3, rtol=0)
+        assert int(exact.solve(wanted, qpos, neighbour=False).reach[0]) == Reach.REACHABLE
+        reached += 1
+    assert reached >= 6, (reached, stayed)
     env.close()
