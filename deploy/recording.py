@@ -23,6 +23,7 @@ from numpy.typing import NDArray
 
 from maniskill_tomato.deploy.clock import Clock
 from maniskill_tomato.deploy.deploy_errors import RecordingError
+from maniskill_tomato.deploy.depth_units import in_millimetres
 from maniskill_tomato.deploy.fault_state import FaultState
 from maniskill_tomato.deploy.interface import Float64, Frame
 from maniskill_tomato.deploy.recording_schemas import FAULT, INFO, STEP, TRUTH
@@ -172,7 +173,7 @@ class McapRecorder:
     def step(self, step: Step) -> None:
         frame, stamp, made = step.frame, step.frame.stamp, self._made
         at = self._time(stamp)
-        millimetres, is_exact = made.in_millimetres(frame.depth)
+        millimetres, is_exact = in_millimetres(frame.depth)
         links = link_frames(step.joint_positions, self._T_flange_camera, self._model)
         # Viewers place a picture by the transforms that came before it.
         self._write("/tf", stamp, made.transforms(at, links).encode())

@@ -25,9 +25,6 @@ CAMERA_FRAME: Final = "camera_color_optical_frame"
 MOST_POINTS: Final = 80_000
 """Of a larger picture every second, third ... pixel in each direction becomes a point."""
 
-FARTHEST_MM: Final = 65535
-"""What 16 bits hold; depth beyond is 0 there, as if there were none, in [mm]."""
-
 GREY: Final = fox.Color(r=0.75, g=0.75, b=0.78, a=1.0)
 
 
@@ -89,21 +86,6 @@ def picture(stamp: fox.Timestamp, pixels: NDArray[Any]) -> fox.CompressedImage:
     if not ok:
         raise RecordingError(f"a picture of shape {pixels.shape} cannot be packed as PNG")
     return fox.CompressedImage(timestamp=stamp, frame_id=CAMERA_FRAME, data=content.tobytes(), format="png")
-
-
-def in_millimetres(depth: NDArray[np.float32]) -> tuple[NDArray[np.uint16], bool]:
-    """Depth as viewers want it, and whether nothing is lost by it.
-
-    Args:
-        depth: In [m], 0 where there is none. Shape (H, W).
-
-    Returns:
-        In whole [mm], shape (H, W); and whether that is the very same depth.
-    """
-    rounded = np.round(depth.astype(np.float64) * 1000.0)
-    rounded[~((rounded >= 0.0) & (rounded <= FARTHEST_MM))] = 0.0
-    whole = rounded.astype(np.uint16)
-    return whole, bool(np.array_equal((whole / 1000.0).astype(np.float32), depth))
 
 
 def depth_image(stamp: fox.Timestamp, depth: NDArray[Any]) -> fox.RawImage:

@@ -4,8 +4,9 @@ import contextlib
 import io
 import json
 import os
+import shutil
 import zipfile
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
@@ -44,6 +45,39 @@ def write_atomically(path: Path, content: bytes) -> None:
             f"cannot write {path}: {error.strerror or error}; what was there before is kept. Free some space "
             "or choose another place; a run goes on with --resume"
         ) from error
+
+
+@contextlib.contextmanager
+def whole_folder(path: Path) -> Iterator[Path]:
+    """A new folder that appears under its name once it is complete, or not at all.
+
+    Args:
+        path: Its name; nothing may be there but an empty folder.
+
+    Yields:
+        Where to write meanwhile, beside that.
+
+    Raises:
+        InvalidInputError: Something is there.
+        NotWrittenError: It cannot be written.
+    """
+    if path.is_symlink() or (path.exists() and (not path.is_dir() or any(path.iterdir()))):
+        raise InvalidInputError(f"{path} exists; choose another place, or delete it")
+    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
+    try:
+        temporary.mkdir(parents=True)
+        yield temporary
+        temporary.replace(path)
+        _sync_folder(path.parent)
+    except OSError as error:
+        shutil.rmtree(temporary, ignore_errors=True)
+        raise NotWrittenError(
+            f"cannot write {path}: {error.strerror or error}; nothing was left there. Free some space or choose "
+            "another place"
+        ) from error
+    except BaseException:
+        shutil.rmtree(temporary, ignore_errors=True)
+        raise
 
 
 def refuse_inputs(option: str, out: Path, inputs: Iterable[Path]) -> None:

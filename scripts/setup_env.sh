@@ -64,13 +64,13 @@ kind="${KIND:-$was_kind}"
 
 # Said before the first byte is loaded. Measured for Python 3.11 on x86-64, with the versions of constraints.txt.
 case "$kind $torch" in
-    "full cuda") size="3.9 GB to download, 8.1 GB of disk" ;;
+    "full cuda") size="4.0 GB to download, 8.3 GB of disk" ;;
     "robot cuda") size="3.5 GB to download, 7.0 GB of disk" ;;
-    "full cpu") size="0.9 GB to download, 2.7 GB of disk, and PyTorch's build for the CPU" ;;
+    "full cpu") size="1.0 GB to download, 2.9 GB of disk, and PyTorch's build for the CPU" ;;
     "robot cpu") size="0.5 GB to download, 1.5 GB of disk, and PyTorch's build for the CPU" ;;
 esac
 case "$kind" in
-    full) fallback_size="3.3 GB to download, 6.7 GB of disk" ;;
+    full) fallback_size="3.4 GB to download, 6.9 GB of disk" ;;
     robot) fallback_size="2.9 GB to download, 5.6 GB of disk" ;;
 esac
 size_words() { say "the packages (TORCH=$torch KIND=$kind): $1; what uv's cache already holds is not downloaded"; }
@@ -129,7 +129,7 @@ what=(--override overrides.txt)
 if [[ $kind == robot ]]; then
     what+=(--override overrides-robot.txt -e ".[perception,deploy,hardware]")
 else
-    what+=(-e ".[dev,perception,deploy,hardware,sb3]")
+    what+=(-e ".[dev,perception,deploy,hardware,sb3,lerobot]")
 fi
 if [[ $torch == cpu ]]; then
     # Asked with torch alone, so that nothing else can be the reason for a no, and anew, whatever is installed.

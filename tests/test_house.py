@@ -51,7 +51,9 @@ ALLOWED: dict[str, frozenset[str]] = {
     "learning": SENSES | {"policies", "tasks"},
     "experiments": SENSES | {"rendering", "policies", "tasks", "learning"},
     "view": SENSES | {"policies", "tasks", "learning", "experiments", "deploy"},
-    "cli": SENSES | {"rendering", "policies", "tasks", "learning", "experiments", "deploy", "view"},
+    "conversion": SENSES | {"policies", "tasks", "learning", "deploy"},
+    "cli": SENSES
+    | {"rendering", "policies", "tasks", "learning", "experiments", "deploy", "view", "conversion"},
 }
 """The rooms that a module of each room may import, besides its own. CONTRIBUTING.md has the same in words."""
 

@@ -53,6 +53,9 @@ COMMANDS: Final[dict[str, CommandEntry]] = {
         "learn_commands:RecordDemonstrations", "Record a policy's episodes for other learners"
     ),
     "export": CommandEntry("learn_commands:Export", "Write a policy as ONNX, which runs without PyTorch"),
+    "convert": CommandEntry(
+        "convert_command:Convert", "Turn recordings or demonstrations into a LeRobot data set"
+    ),
     "eval": CommandEntry("eval_command:Eval", "Evaluate a policy and write a report"),
     "benchmark": CommandEntry("measure_commands:Benchmark", "Compare policies on the same held-out episodes"),
     "benchmark-rows": CommandEntry("measure_commands:BenchmarkRows", "Compare policies on whole rows"),
@@ -112,7 +115,7 @@ GROUPS: Final[dict[str, tuple[str, ...]]] = {
     ),
     "Measure": ("eval", "benchmark", "benchmark-rows", "compare", "reproduce", "ablate", "judge"),
     "See": ("dataset", "compose-dataset", "train-segmenter", "detect"),
-    "Use": ("export", "deploy"),
+    "Use": ("export", "convert", "deploy"),
 }
 """The commands as the list shows them."""
 

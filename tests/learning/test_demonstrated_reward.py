@@ -345,6 +345,13 @@ def elsewhere(path: Path) -> None:
         file["traj_1"] = h5py.ExternalLink("other.h5", "/traj_0")
 
 
+def views_elsewhere(path: Path) -> None:
+    write(path.with_name("other.h5"), shown(1))
+    with h5py.File(path, "a") as file:
+        del file["traj_1/obs"]
+        file["traj_1/obs"] = h5py.ExternalLink("other.h5", "/traj_0/obs")
+
+
 @pytest.mark.parametrize(
     ("change", "message"),
     [
@@ -356,6 +363,7 @@ def elsewhere(path: Path) -> None:
         (a_view_short, r"shape \(T \+ 1, D\)"),
         (not_finite, "not finite"),
         (elsewhere, "must lie in the file itself"),
+        (views_elsewhere, "traj_1/obs must lie in the file itself"),
     ],
 )
 def test_files_that_cannot_be_used_are_refused_in_words(tmp_path: Path, change: Any, message: str) -> None:

@@ -19,6 +19,7 @@ NAVIGATION: Final[dict[str, tuple[str, ...]]] = {
         "extending",
         "thesis",
         "export",
+        "lerobot",
         "troubleshooting",
         "contributing",
     ),

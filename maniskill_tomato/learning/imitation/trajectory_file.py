@@ -10,7 +10,8 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from maniskill_tomato.errors import InvalidInputError, MissingPackageError
+from maniskill_tomato.errors import InvalidInputError
+from maniskill_tomato.learning.imitation.trajectory_arrays import opened_trajectories, stored_array
 from maniskill_tomato.text_files import read_json
 
 LARGEST_OBSERVATIONS: Final = 1_000_000_000
@@ -48,12 +49,7 @@ def read_demonstrations(path: Path, env_id: str) -> DemonstratedViews:
         MissingPackageError: h5py, which comes with ManiSkill, is not installed.
     """
     _check_task(path, env_id)
-    try:
-        episodes = _episodes(path)
-    except InvalidInputError:
-        raise
-    except (OSError, RuntimeError, ValueError, KeyError, TypeError, AttributeError, MemoryError) as error:
-        raise InvalidInputError(f"{path} cannot be read as demonstrations: {error}") from error
+    episodes = _episodes(path)
     if not episodes:
         raise InvalidInputError(
             f"{path} holds no episode; record some with `maniskill-tomato demonstrations {env_id}`"
@@ -88,20 +84,12 @@ def _check_task(path: Path, env_id: str) -> None:
 
 def _episodes(path: Path) -> list[tuple[NDArray[np.float32], NDArray[np.float32]]]:
     """Observations of shape (T + 1, D) and terminations of shape (T,) of every episode with a move, in their order."""
-    try:
-        import h5py
-    except ImportError as error:
-        raise MissingPackageError(
-            f"{path} is read with h5py, which is not installed; it comes with ManiSkill (`make venv KIND=full`)"
-        ) from error
-
     room = LARGEST_OBSERVATIONS
 
     def array(episode: Any, name: str) -> NDArray[np.float32]:
         nonlocal room
-        stored = episode.get(name)
-        # What lies in other files could be any file of this machine.
-        if not isinstance(stored, h5py.Dataset) or stored.is_virtual or stored.external:
+        stored = stored_array(path, episode, name)
+        if stored is None:
             raise InvalidInputError(
                 f"{path}: {episode.name} must hold {name} as an array; record with obs_mode 'state'"
             )
@@ -111,14 +99,9 @@ def _episodes(path: Path) -> list[tuple[NDArray[np.float32], NDArray[np.float32]
         return np.asarray(stored[()], np.float32)
 
     episodes = []
-    with h5py.File(path, "r") as opened:
-        file: Any = opened
-        names = [name for name in file if name.startswith("traj_")]
-        # traj_2 comes before traj_10.
-        for name in sorted(names, key=lambda name: (len(name), name)):
-            if not isinstance(file.get(name, getlink=True), h5py.HardLink):
-                raise InvalidInputError(f"{path}: {name} must lie in the file itself")
-            observations, ended = array(file[name], "obs"), array(file[name], "terminated")
+    with opened_trajectories(path) as groups:
+        for name, group in groups.items():
+            observations, ended = array(group, "obs"), array(group, "terminated")
             if observations.ndim != 2 or ended.shape != (len(observations) - 1,):
                 raise InvalidInputError(
                     f"{path}: {name} must have observations of shape (T + 1, D) and terminations of shape (T,), got "

@@ -1,0 +1,1 @@
+"""Recordings of runs and demonstrations in the formats of other projects."""
