@@ -28,7 +28,7 @@ from torch.nn.functional import grid_sample
 
 from maniskill_tomato.policies.moves import move_towards
 from maniskill_tomato.policies.protocol import Planner
-from maniskill_tomato.policies.reach import CameraReach
+from maniskill_tomato.robot.camera_reach import CameraReach
 from maniskill_tomato.robot.look_at import look_frame
 from maniskill_tomato.robot.look_at_move import MAX_MOVE, MIN_DISTANCE
 from maniskill_tomato.sensing.belief import Belief

@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 from maniskill_tomato.policies.protocol import GroundTruth, Planner
-from maniskill_tomato.policies.reach import CameraReach
+from maniskill_tomato.robot.camera_reach import CameraReach
 from maniskill_tomato.robot.look_at import look_at_pose, look_frame
 from maniskill_tomato.robot.look_at_move import MAX_MOVE, MIN_DISTANCE
 from maniskill_tomato.sensing.belief import Belief

@@ -8,7 +8,7 @@
 import warp as wp
 
 from maniskill_tomato.robot.ik_chain import HALF, ONE, TWO, ZERO, Chain, column, homogeneous, vec7d
-from maniskill_tomato.robot.ik_circle import elbow_circle
+from maniskill_tomato.robot.ik_circle import TWO_PI, elbow_circle, evaluate, feasible_configurations
 from maniskill_tomato.robot.ik_neighbour import Allowed, hand_of, nearest_neighbour, pose_ratios
 from maniskill_tomato.robot.ik_select import NO_COST, Weights, angles_at, refined_psi, sampled_choice
 
@@ -24,6 +24,10 @@ STRICT = wp.constant(wp.float64(2.0e-11))
 """Tolerance of the first attempt: what rounding does to a pose at the edge of the workspace."""
 ROUNDING = wp.constant(wp.float64(1.0e-15))
 """What rounding does to the distance of shoulder and wrist, in [m]."""
+PROBES = wp.constant(16)
+"""Arm angles, equally spaced."""
+SLIGHTLY_BENT = wp.constant(wp.float64(1.0e-3))
+"""Elbow angle, in [rad], from which on the rounding of a distance is no matter."""
 LARGEST_SKEW = wp.constant(wp.float64(1.0e-3))
 """How far R^T R may be from the identity, in every element."""
 
@@ -126,6 +130,23 @@ def best_solution(solver: Solver, position: wp.vec3d, rotation: wp.mat33d, q_ref
     if solution.found == 0 and solution.stretched == 1:
         solution = exact_solution(chain, position, rotation, q_ref, weights, tolerance, ZERO)
     return solution
+
+
+@wp.func
+def reaches(solver: Solver, position: wp.vec3d, rotation: wp.mat33d, q_ref: vec7d) -> wp.bool:
+    """Whether `best_solution` finds any joint angles.
+
+    Nearly all poses within reach leave so wide a range of arm angles that one of `PROBES` falls into it. The cheapest
+    joint angles, which cost thirty times as much, are searched for in the others only.
+    """
+    circle = elbow_circle(solver.chain, position, rotation, q_ref, STRICT, ROUNDING)
+    if circle.reachable == 1 and circle.q4 > SLIGHTLY_BENT:
+        for k in range(PROBES):
+            psi = TWO_PI * (wp.float64(k) + HALF) / wp.float64(PROBES)
+            values = evaluate(circle, wp.cos(psi), wp.sin(psi))
+            if feasible_configurations(solver.chain, values, ZERO) != 0:
+                return True
+    return best_solution(solver, position, rotation, q_ref).found == 1
 
 
 @wp.kernel

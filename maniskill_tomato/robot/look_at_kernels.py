@@ -19,6 +19,7 @@ from maniskill_tomato.robot.ik_solve import (
     best_solution,
     nearest_rotation,
     position_of,
+    reaches,
     rotation_of,
 )
 
@@ -110,6 +111,15 @@ def keeps_clear(flange: wp.vec3d, rules: Rules) -> wp.bool:
 
 
 @wp.func
+def roll_of(k: int) -> wp.float64:
+    """The k-th of `CAMERA_ROLLS`."""
+    roll = ROLL_STEP * wp.float64((k + 1) / 2)
+    if k % 2 == 0:
+        roll = -roll
+    return roll
+
+
+@wp.func
 def look_from(
     rules: Rules,
     q_ref: vec7d,
@@ -126,10 +136,7 @@ def look_from(
         rank = (k + 1) / 2
         # Nothing of a higher rank is better than what was found.
         if look.found == 0 or wp.float64(rank) < best:
-            roll = ROLL_STEP * wp.float64(rank)
-            if k % 2 == 0:
-                roll = -roll
-            camera = camera_pose(position, target, roll)
+            camera = camera_pose(position, target, roll_of(k))
             flange = camera * rules.T_camera_flange
             place = position_of(flange)
             if keeps_clear(place, rules):
@@ -200,6 +207,31 @@ def look_kernel(
         reach[i] = REACHABLE
     if not wp.isfinite(finite):
         reach[i] = INVALID
+
+
+@wp.kernel
+def reach_kernel(
+    positions: wp.array[wp.vec3d],
+    targets: wp.array[wp.vec3d],
+    rules: Rules,
+    is_kept_clear: wp.int32,
+    reached: wp.array[wp.int64],
+):
+    """1 where some joint angles look at the target from a position, 0 where none do."""
+    i = wp.tid()
+    position = positions[i]
+    target = targets[i]
+    found = wp.int64(0)
+    for k in range(rules.rolls):
+        if found == wp.int64(0):
+            flange = camera_pose(position, target, roll_of(k)) * rules.T_camera_flange
+            place = position_of(flange)
+            if is_kept_clear == 0 or keeps_clear(place, rules):
+                if reaches(rules.solver, place, nearest_rotation(rotation_of(flange)), vec7d()):
+                    found = wp.int64(1)
+    reached[i] = found
+    if not wp.isfinite(wp.length(position) + wp.length(target)):
+        reached[i] = INVALID
 
 
 @wp.kernel

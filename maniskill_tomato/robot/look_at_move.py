@@ -87,6 +87,27 @@ def keeps_clear(T_world_flange: Tensor) -> Tensor:
     return (position[..., 2] >= LOWEST_FLANGE) & ~near_base
 
 
+def look_rules(
+    device: str | torch.device,
+    T_flange_camera: npt.NDArray[np.float64] = T_flange_camera_color_optical,
+    model: ArmModel = IIWA14,
+) -> Any:
+    """What looks and moves keep, as kernels see it: a `look_at_kernels.Rules`.
+
+    Args:
+        device: Where the kernels run.
+        T_flange_camera: The camera's optical frame in `link_ee`. Shape (4, 4).
+        model: Of the arm.
+    """
+    rules: Any = look_at_kernels.Rules()
+    rules.solver = InverseKinematics(device=device, model=model).solver
+    rules.T_camera_flange = wp.mat44d(*np.linalg.inv(T_flange_camera).ravel())
+    rules.max_move, rules.min_distance = MAX_MOVE, MIN_DISTANCE
+    rules.lowest_flange, rules.base_box = LOWEST_FLANGE, wp.vec3d(*BASE_BOX)
+    rules.rolls, rules.largest_joint_step = len(CAMERA_ROLLS), LARGEST_JOINT_STEP
+    return rules
+
+
 class LookAtMover:
     """Solves moves on one device; not for use from several threads at once."""
 
@@ -104,13 +125,7 @@ class LookAtMover:
             model: Of the arm.
         """
         self._inverse_kinematics = InverseKinematics(device=device, model=model)
-        rules: Any = look_at_kernels.Rules()
-        rules.solver = self._inverse_kinematics.solver
-        rules.T_camera_flange = wp.mat44d(*np.linalg.inv(T_flange_camera).ravel())
-        rules.max_move, rules.min_distance = MAX_MOVE, MIN_DISTANCE
-        rules.lowest_flange, rules.base_box = LOWEST_FLANGE, wp.vec3d(*BASE_BOX)
-        rules.rolls, rules.largest_joint_step = len(CAMERA_ROLLS), LARGEST_JOINT_STEP
-        self.rules = rules
+        self.rules = rules = look_rules(device, T_flange_camera, model)
         """The same as kernels see it."""
         joints, vector = ((NUM_JOINTS,), torch.float64, vec7d), ((3,), torch.float64, wp.vec3d)
         whole, pose = ((), torch.int64, wp.int64), ((4, 4), torch.float64, wp.mat44d)

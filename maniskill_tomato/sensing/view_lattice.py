@@ -11,10 +11,9 @@ from typing import Final
 import torch
 from torch import Tensor
 
-from maniskill_tomato.robot.arm_model import NUM_JOINTS, ArmModel
+from maniskill_tomato.robot.arm_model import ArmModel
+from maniskill_tomato.robot.camera_reach import CameraReach
 from maniskill_tomato.robot.iiwa14 import IIWA14
-from maniskill_tomato.robot.inverse_kinematics import InverseKinematics, Reach
-from maniskill_tomato.robot.look_at import CAMERA_ROLLS, camera_to_flange, look_at_pose
 
 AZIMUTHS: Final = 13
 """Candidates from -90 to 90 degrees of azimuth."""
@@ -32,8 +31,6 @@ directions."""
 
 REACHABLE_SHARE: Final = 0.1
 """A target is in reach when the arm can look at it from this share of the candidates or more."""
-
-_FAR_AWAY = 100.0
 
 
 class ViewLattice:
@@ -72,13 +69,7 @@ class ViewLattice:
         """From the target to each candidate, in the world frame, in [m]. Shape (K, 3)."""
         self.neighbours = self._neighbours()
         """One step down and up in azimuth, elevation and distance; -1 where the lattice ends. Shape (K, 6)."""
-        self._inverse_kinematics = InverseKinematics(self.device, model=model)
-        turns = torch.eye(4, dtype=torch.float64, device=self.device).repeat(len(CAMERA_ROLLS), 1, 1)
-        rolls = torch.tensor(CAMERA_ROLLS, dtype=torch.float64, device=self.device)
-        turns[:, 0, 0] = turns[:, 1, 1] = torch.cos(rolls)
-        turns[:, 1, 0] = torch.sin(rolls)
-        turns[:, 0, 1] = -turns[:, 1, 0]
-        self._rolled_flanges = camera_to_flange(turns).unbind(0)
+        self._reach = CameraReach(self.device, model)
 
     def positions(self, target_position: Tensor) -> Tensor:
         """The candidates' camera positions round each target, in the world frame, in [m].
@@ -136,30 +127,13 @@ class ViewLattice:
         Returns:
             Shape (B, K), bool.
         """
-        return self._reached(target_position, enough=self.size)
+        targets = target_position.double()
+        return self._reach.reachable(self.positions(targets), targets[:, None], kept_clear=False)
 
     def in_reach(self, target_position: Tensor) -> Tensor:
         """Which targets the arm can look at from `REACHABLE_SHARE` of the candidates. Shape (B, 3) to (B,), bool."""
         enough = math.ceil(REACHABLE_SHARE * self.size)
-        return self._reached(target_position, enough).sum(dim=-1) >= enough
-
-    def _reached(self, target_position: Tensor, enough: int) -> Tensor:
-        """As `reachable`, but asks about each target only until so many candidates are reached."""
-        targets = target_position.double().repeat_interleave(self.size, dim=0)
-        positions = self.positions(target_position.double()).reshape(-1, 3)
-        reached = torch.zeros(len(target_position), self.size, dtype=torch.bool, device=self.device)
-        reference = torch.zeros(len(positions), NUM_JOINTS, dtype=torch.float64, device=self.device)
-        upright = look_at_pose(positions, targets)
-        for T_upright_flange in self._rolled_flanges:
-            T_base_flange = upright @ T_upright_flange
-            # What need not be asked is sent out of reach, where the solver takes little time.
-            known = reached | (reached.sum(dim=-1, keepdim=True) >= enough)
-            if bool(known.all()):
-                break
-            T_base_flange[known.view(-1), 0, 3] = _FAR_AWAY
-            solution = self._inverse_kinematics.solve(T_base_flange, reference, neighbour=False)
-            reached |= (solution.reach == Reach.REACHABLE).view(-1, self.size)
-        return reached
+        return self.reachable(target_position).sum(dim=-1) >= enough
 
     def _neighbours(self) -> Tensor:
         steps = torch.stack(

@@ -6,8 +6,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from maniskill_tomato.policies.reach import CameraReach
 from maniskill_tomato.raycast.view_rays import RayLabel
+from maniskill_tomato.robot.camera_reach import CameraReach
 from maniskill_tomato.robot.look_at import look_at_pose
 from maniskill_tomato.tasks.world import World
 from maniskill_tomato.view.episode_recording import Float64, HandView, TargetRays, UInt8

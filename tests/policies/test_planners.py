@@ -35,10 +35,10 @@ from maniskill_tomato.policies.next_best_view import NextBestDirection, NextBest
 from maniskill_tomato.policies.opening import open_policy
 from maniskill_tomato.policies.oracle import Oracle, OracleSearch
 from maniskill_tomato.policies.protocol import Planner
-from maniskill_tomato.policies.reach import CameraReach
 from maniskill_tomato.policies.registry import PLANNERS, PRIVILEGED
 from maniskill_tomato.raycast.scene import RayScene
 from maniskill_tomato.raycast.view_rays import ray_pattern
+from maniskill_tomato.robot.camera_reach import CameraReach
 from maniskill_tomato.robot.d435 import color_intrinsics
 from maniskill_tomato.robot.look_at import camera_to_viewpoint, look_at_pose, look_frame
 from maniskill_tomato.robot.look_at_move import MAX_MOVE, MIN_DISTANCE, moved_position
