@@ -11,18 +11,13 @@ from mani_skill.agents.base_real_agent import BaseRealAgent
 from numpy.typing import NDArray
 from torch import Tensor
 
-from maniskill_tomato.deploy.capture import Capture
+from maniskill_tomato.deploy.arm_session import ArmSession
 from maniskill_tomato.deploy.deploy_errors import NotConnectedError, RefusedError
-from maniskill_tomato.deploy.interface import Float64, Frame, JointMove
-from maniskill_tomato.deploy.plant_points import PlantPoints
+from maniskill_tomato.deploy.interface import Float64, Frame
 from maniskill_tomato.deploy.workcell import Workcell
 from maniskill_tomato.errors import InvalidInputError
 from maniskill_tomato.robot.arm_model import NUM_JOINTS
 from maniskill_tomato.robot.d435 import CameraIntrinsics
-from maniskill_tomato.robot.kinematics import forward_kinematics
-
-SETTLE_S: Final = 0.5
-"""Between the end of a move and a picture, in [s]."""
 
 RESET_STEP: Final = 0.4
 """The most that a joint turns in one piece of a way back to a start, in [rad]."""
@@ -48,22 +43,15 @@ class IiwaRealAgent(BaseRealAgent):  # type: ignore[misc]
         super().__init__()
         self.workcell = workcell
         self._camera_name = camera_name
-        self._points = PlantPoints(workcell.profile.T_flange_camera, model=workcell.arm.model)
-        self._capture = Capture(workcell.camera, workcell.profile.capture, workcell.clock)
-        self._settled_at = -math.inf
-        self._frame: Frame | None = None
-        self._frame_joints: Float64 | None = None
+        self._session = ArmSession(workcell)
 
     def start(self) -> None:
         """Connects arm and camera."""
-        self.workcell.arm.connect()
-        self.workcell.camera.connect()
-        self._settled_at = self.workcell.clock.now()
+        self._session.connect()
 
     def stop(self) -> None:
-        """Disconnects both; a move of the iiwa under way goes on."""
-        self.workcell.camera.disconnect()
-        self.workcell.arm.disconnect()
+        """Disconnects both; a move under way is stopped as far as the arm can be."""
+        self._session.disconnect()
 
     def set_target_qpos(self, qpos: Any) -> None:
         """Moves there and returns when the arm stands.
@@ -75,12 +63,7 @@ class IiwaRealAgent(BaseRealAgent):  # type: ignore[misc]
             RefusedError: `safety` speaks against it; the arm has not moved.
             DeployError: A device fails.
         """
-        joints = _joints(qpos)
-        state = self.workcell.guarded_arm.read()
-        # NaN goes on to safety, which refuses it.
-        if not np.abs(joints - state.joint_positions).max() <= 1e-4:
-            frame_stamp = None if self._frame is None else self._frame.stamp
-            self._go(joints, frame_stamp)
+        self._session.go_to(_joints(qpos))
 
     def set_target_qvel(self, qvel: Any) -> None:
         """Not offered.
@@ -111,12 +94,7 @@ class IiwaRealAgent(BaseRealAgent):  # type: ignore[misc]
         Raises:
             DeployError: The camera gives none that can be used.
         """
-        if self._frame is None or self._frame_joints is None:
-            self.workcell.camera.begin_view()
-            self._frame = self._capture.take(self._settled_at)
-            self._frame_joints = self.workcell.guarded_arm.read().joint_positions
-            self._points.add(self._frame, self.camera_pose(self._frame_joints), self._frame_joints)
-        return self._frame, self._frame_joints
+        return self._session.look()
 
     def capture_sensor_data(self, sensor_names: Sequence[str] | None = None) -> None:
         """Takes a picture, unless one was taken since the arm stands."""
@@ -159,10 +137,7 @@ class IiwaRealAgent(BaseRealAgent):  # type: ignore[misc]
 
     def camera_pose(self, joint_positions: Float64) -> Float64:
         """The colour camera's optical frame in the world at joint angles in [rad], by the calibration. Shape (4, 4)."""
-        flange = forward_kinematics(
-            torch.as_tensor(np.array(joint_positions)), self.workcell.arm.model
-        ).numpy()
-        return np.asarray(flange @ self.workcell.profile.T_flange_camera, np.float64)
+        return self._session.camera_pose(joint_positions)
 
     def get_qpos(self) -> Tensor:
         """Measured joint angles, in [rad]. Shape (1, 7), float32."""
@@ -173,16 +148,6 @@ class IiwaRealAgent(BaseRealAgent):  # type: ignore[misc]
         """Measured joint speeds, in [rad/s]. Shape (1, 7), float32."""
         state = self.workcell.guarded_arm.read()
         return torch.as_tensor(np.array(state.joint_velocities), dtype=torch.float32)[None]
-
-    def _go(self, joints: Float64, frame_stamp: float | None) -> None:
-        arm = self.workcell.guarded_arm
-        move = JointMove(joint_positions=joints, speed_fraction=arm.safety.config.speed_fraction)
-        arm.command(move, frame_stamp, self._points.points_w)
-        self._frame = self._frame_joints = None
-        while not arm.wait(0.2):
-            pass
-        self.workcell.clock.sleep(SETTLE_S)
-        self._settled_at = self.workcell.clock.now()
 
     def _simulated_intrinsics(self) -> CameraIntrinsics | None:
         """Of the simulated camera that this one stands for, once there is a simulation."""

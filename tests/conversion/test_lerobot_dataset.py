@@ -109,19 +109,20 @@ def test_runs_become_episodes_with_a_frame_for_each_look(
     assert rows["frame_index"] == [*range(lengths[0]), *range(lengths[1])]
     assert rows["timestamp"] == [float(k) for k in rows["frame_index"]]
     for k, step in enumerate(steps):
-        joints = np.float32(step.facts["joint_positions"])
+        joints = np.array(step.facts["joint_positions"], np.float32)
         assert rows["observation.state"][k] == joints.tolist()
         sent = step.facts["commanded"]
         assert rows["move_sent"][k] == (sent is not None)
-        assert rows["action"][k] == (joints if sent is None else np.float32(sent)).tolist()
-        assert rows["policy_move"][k] == np.float32(step.facts["action"] or (0.0, 0.0, 0.0)).tolist()
+        assert rows["action"][k] == (joints if sent is None else np.array(sent, np.float32)).tolist()
+        move: Any = step.facts["action"] or (0.0, 0.0, 0.0)
+        assert rows["policy_move"][k] == np.array(move, np.float32).tolist()
         assert rows["visible_fraction"][k] == np.float32(step.facts["visible_fraction"])
         assert np.array_equal(pixels(rows["observation.images.wrist"][k]), step.frame.color)
         seen = pixels(rows["observation.images.wrist_depth"][k])
         assert seen.dtype == np.uint16 and np.abs(seen / 1000.0 - step.frame.depth).max() <= 0.0005001
         camera = np.array(step.facts["T_world_camera"])
         x, y, z, qw, qx, qy, qz = rows["camera_pose"][k]
-        assert [x, y, z] == np.float32(camera[:3, 3]).tolist()
+        assert [x, y, z] == camera[:3, 3].astype(np.float32).tolist()
         # The axis along which the camera looks, by the quaternion's formula.
         axis = [2 * (qx * qz + qw * qy), 2 * (qy * qz - qw * qx), 1 - 2 * (qx * qx + qy * qy)]
         assert np.allclose(axis, camera[:3, 2], atol=1e-6)

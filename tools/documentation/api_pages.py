@@ -97,6 +97,7 @@ PUBLIC: Final[dict[str, tuple[str, ...]]] = {
         "thesis.thesis_rewards",
         "row.row_config",
         "row.episode_sampling",
+        "lerobot_env",
         "maniskill.registered_envs",
         "maniskill.shell_options",
         "maniskill.iiwa14_agent",
@@ -141,10 +142,12 @@ PUBLIC: Final[dict[str, tuple[str, ...]]] = {
         "recording_reader",
         "calibration.calibration_file",
         "calibration.hand_eye",
+        "arm_session",
         "real_agent",
         "sim2real",
         "deploy_errors",
     ),
+    "conversion": ("lerobot_conversion", "lerobot_dataset", "episodes", "demonstrations", "recorded_runs"),
 }
 """The public modules of each room, the most useful first; rooms in the order of the map in CONTRIBUTING.md."""
 
