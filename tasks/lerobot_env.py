@@ -18,8 +18,8 @@ from maniskill_tomato.errors import InvalidInputError
 from maniskill_tomato.plants.organs import Role
 from maniskill_tomato.sensing.image_layout import ImageLayout
 from maniskill_tomato.sensing.perception_kinds import STATE_MODE
-from maniskill_tomato.tasks import GENERAL_IDS
-from maniskill_tomato.tasks.making import check_choice, check_env_id, check_integer
+from maniskill_tomato.task_registry import GENERAL_IDS, find_task
+from maniskill_tomato.tasks.making import check_choice, check_integer
 from maniskill_tomato.tasks.vector_env import make_vector_env
 
 ObservationKind = Literal["state", "pixels_agent_pos"]
@@ -78,7 +78,7 @@ class LeRobotVectorEnv(gym.vector.VectorEnv[Any, Any, Any]):
         """Makes the environments.
 
         Args:
-            task: One of `tasks.TASK_IDS`.
+            task: The task; see `find_task`.
             num_envs: N.
             obs_type: What is observed.
             image_size: Width and height of pictures, also of rendered ones, in [px].
@@ -89,7 +89,7 @@ class LeRobotVectorEnv(gym.vector.VectorEnv[Any, Any, Any]):
         Raises:
             InvalidInputError: An option cannot be used.
         """
-        check_env_id(task)
+        base = find_task(task).base
         check_integer("n_envs", num_envs, 1)
         check_choice("obs_type", obs_type, get_args(ObservationKind))
         mode = str(getattr(autoreset_mode, "value", autoreset_mode))
@@ -110,7 +110,7 @@ class LeRobotVectorEnv(gym.vector.VectorEnv[Any, Any, Any]):
             **options,
         )
         self.task = task
-        self.task_description = DESCRIPTIONS[task == GENERAL_IDS[1]]
+        self.task_description = DESCRIPTIONS[base == GENERAL_IDS[1]]
         self.num_envs = num_envs
         self.render_mode = "rgb_array"
         self.metadata = {

@@ -1,4 +1,4 @@
-"""The four tasks as configurations of a world."""
+"""The tasks as configurations of a world."""
 
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -7,7 +7,7 @@ from typing import Any, get_args
 
 import torch
 
-from maniskill_tomato.errors import InvalidInputError
+from maniskill_tomato.errors import InvalidInputError, did_you_mean
 from maniskill_tomato.plants.episode_list import Episode, listed_plant
 from maniskill_tomato.plants.spec import PlantPose, PlantSpec
 from maniskill_tomato.robot.d435 import Calibration, CameraIntrinsics, color_intrinsics
@@ -15,8 +15,10 @@ from maniskill_tomato.robot.viewpoint_move import OutsideWorkspace
 from maniskill_tomato.sensing.observation import ObservationLayout
 from maniskill_tomato.sensing.perception_kinds import RENDERED, Perception
 from maniskill_tomato.sensing.sensor_noise import SensorNoise
-from maniskill_tomato.tasks import MAX_EPISODE_STEPS, MAX_GENERAL_STEPS, MAX_ROW_STEPS, TASK_IDS, Scene
+from maniskill_tomato.task_registry import TASK_IDS, Task, find_task
+from maniskill_tomato.tasks import Scene
 from maniskill_tomato.tasks.arm_moves import ArmMoves, Control
+from maniskill_tomato.tasks.own_rules import OwnRules
 from maniskill_tomato.tasks.row.episode_selection import EpisodeChoice
 from maniskill_tomato.tasks.row.row_config import GeneralTaskConfig
 from maniskill_tomato.tasks.row.search_game import SearchGame
@@ -28,11 +30,6 @@ from maniskill_tomato.tasks.world import Game, Pictures, TaskConfig, World
 
 IMAGE_SIZE = (160, 120)
 """Width and height of the wrist camera's picture unless somebody says otherwise, in [px]."""
-
-MAX_STEPS: Mapping[str, int] = dict(
-    zip(TASK_IDS, (MAX_EPISODE_STEPS, MAX_EPISODE_STEPS, MAX_GENERAL_STEPS, MAX_ROW_STEPS), strict=True)
-)
-"""Steps after which an episode is cut off, by task."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -101,14 +98,9 @@ class RowOptions(SearchOptions):
         check_choice("transits", self.transits, get_args(Transits))
 
 
-def check_env_id(env_id: str) -> None:
-    """Accepts the ids of this package's tasks.
-
-    Raises:
-        InvalidInputError: Another id; the message lists the allowed ones.
-    """
-    if env_id not in TASK_IDS:
-        raise InvalidInputError.choice("the environment id", env_id, TASK_IDS)
+_KINDS: Mapping[str, type[ThesisOptions] | type[SearchOptions]] = dict(
+    zip(TASK_IDS, (ThesisOptions, ThesisOptions, SearchOptions, RowOptions), strict=True)
+)
 
 
 def make_options(env_id: str, **options: Any) -> ThesisOptions | SearchOptions:
@@ -117,31 +109,77 @@ def make_options(env_id: str, **options: Any) -> ThesisOptions | SearchOptions:
     Raises:
         InvalidInputError: The id or an option's name is unknown.
     """
-    kinds: dict[str, type[ThesisOptions] | type[SearchOptions]] = dict(
-        zip(TASK_IDS, (ThesisOptions, ThesisOptions, SearchOptions, RowOptions), strict=True)
-    )
-    check_env_id(env_id)
-    kind = kinds[env_id]
+    task = find_task(env_id)
+    kind = _KINDS[task.base]
     known = option_names(env_id)
     for name in options:
         if name not in known:
             raise InvalidInputError.choice(f"an option of {env_id}", name, sorted(known))
+    given_task = options.get("task")
+    fields_changed, options_changed = _split_settings(task)
+    options = {**options_changed, **options}
     if kind is ThesisOptions:
         scene = options.get("scene", "hidden")
-        if "scene" in options and "task" in options:
+        if "scene" in options and given_task is not None:
             raise InvalidInputError(
                 f"scene={scene!r} chooses the task's configuration; leave out scene= or task="
             )
-        options.setdefault("task", thesis_task(env_id, scene))
-    if options.get("task", True) is None:
-        del options["task"]
+        if given_task is None:
+            options["task"] = thesis_task(task.base, scene)
+    elif given_task is None:
+        options["task"] = GeneralTaskConfig()
+    if task.env_id not in TASK_IDS:
+        config = options["task"]
+        if given_task is None:
+            config = replace(config, **_changes(config, fields_changed))
+        options["task"] = replace(config, own=_own_rules(task))
     return kind(**options)
+
+
+def _split_settings(task: Task) -> tuple[dict[str, Any], dict[str, Any]]:
+    """The settings of a task that are fields of its base's configuration, and those that are options of the base.
+
+    Raises:
+        InvalidInputError: One is neither.
+    """
+    kind = ViewpointTaskConfig if _KINDS[task.base] is ThesisOptions else GeneralTaskConfig
+    names = {field.name for field in fields(kind)} - {"own"}
+    known = option_names(task.env_id) - {"task"}
+    for name in task.settings:
+        if name not in names | known:
+            raise InvalidInputError(
+                f"the settings of {task.env_id} have {name!r}, which is no field of {kind.__name__} and no option of "
+                f"{task.base}{did_you_mean(name, names | known)}; they take {', '.join(sorted(names | known))}"
+            )
+    changed = {name: value for name, value in task.settings.items() if name in names}
+    if task.base == TASK_IDS[2]:
+        changed.setdefault("max_moves", task.max_episode_steps)
+    return changed, {name: value for name, value in task.settings.items() if name not in names}
+
+
+def _changes(config: TaskConfig, changed: Mapping[str, Any]) -> dict[str, Any]:
+    """Fields of a configuration, the plant and its pose as what they change about the base's."""
+    changes = dict(changed)
+    if "plant" in changes:
+        changes["plant"] = PlantSpec.parse(changes["plant"], config.plant)
+    if "plant_pose" in changes:
+        changes["plant_pose"] = PlantPose.parse(changes["plant_pose"], config.plant_pose)
+    return changes
+
+
+def _own_rules(task: Task) -> OwnRules:
+    return OwnRules(
+        env_id=task.env_id,
+        reward=task.reward,
+        largest_reward=task.largest_reward,
+        starts=task.starts,
+        success=task.success,
+    )
 
 
 def option_names(env_id: str) -> frozenset[str]:
     """Names of the options of a task that a world takes."""
-    kind = ThesisOptions if env_id in TASK_IDS[:2] else RowOptions if env_id == TASK_IDS[3] else SearchOptions
-    return frozenset(field.name for field in fields(kind))
+    return frozenset(field.name for field in fields(_KINDS[find_task(env_id).base]))
 
 
 def check_other_tasks(env_id: str, names: Iterable[str]) -> None:
@@ -156,7 +194,7 @@ def check_other_tasks(env_id: str, names: Iterable[str]) -> None:
     """
     for name in names:
         takers = [other for other in TASK_IDS if name in option_names(other)]
-        if takers and env_id not in takers:
+        if takers and find_task(env_id).base not in takers:
             raise InvalidInputError(
                 f"{env_id} has no {name}=, which is an option of {' and '.join(takers)}; "
                 f"it takes {', '.join(sorted(option_names(env_id)))}"
@@ -165,7 +203,7 @@ def check_other_tasks(env_id: str, names: Iterable[str]) -> None:
 
 def default_control(env_id: str) -> Control:
     """What an action of a task is unless somebody says otherwise."""
-    return "viewpoint" if env_id in TASK_IDS[:2] else "look_at"
+    return "viewpoint" if _KINDS[find_task(env_id).base] is ThesisOptions else "look_at"
 
 
 def wrist_intrinsics(
@@ -243,7 +281,7 @@ def make_world(
     """N environments of a task without a simulator.
 
     Args:
-        env_id: One of `tasks.TASK_IDS`.
+        env_id: The task; see `find_task`.
         num_envs: N.
         device: Where all tensors live.
         control: What an action is; the task's own if None.

@@ -14,12 +14,11 @@ from torch import Tensor
 from maniskill_tomato.errors import InvalidInputError, did_you_mean
 from maniskill_tomato.sensing.image_layout import ImageLayout
 from maniskill_tomato.sensing.perception_kinds import STATE_MODE
+from maniskill_tomato.task_registry import find_task
 from maniskill_tomato.tasks.arm_moves import ACTION_SIZES, CONTROL_MODES
 from maniskill_tomato.tasks.gymnasium_form import masked_info, numpy_of, rows_apart
 from maniskill_tomato.tasks.making import (
-    MAX_STEPS,
     check_choice,
-    check_env_id,
     check_integer,
     check_other_tasks,
     make_world,
@@ -80,7 +79,7 @@ class VectorEnv(gym.vector.VectorEnv[Any, Any, Any]):
         self.arrays = arrays
         self.metadata = {"render_modes": [], "autoreset_mode": autoreset_mode}
         self.spec = (  # pyright: ignore[reportIncompatibleVariableOverride]
-            None if env_id is None else gym.spec(env_id)
+            None if env_id is None else gym.spec(find_task(env_id).env_id)
         )
         self._observed = ObservedWorld(world, eyes)
         self.single_observation_space = self._observed.space
@@ -343,7 +342,7 @@ def make_vector_env(
     """N environments of a task without a simulator; what `gymnasium.make_vec` makes.
 
     Args:
-        env_id: One of `tasks.TASK_IDS`.
+        env_id: The task; see `find_task`.
         num_envs: N.
         device: `cpu` or `cuda`.
         autoreset_mode: When environments that are done are reset; the default is that of Gymnasium's own vector
@@ -360,7 +359,7 @@ def make_vector_env(
     Raises:
         InvalidInputError: An option cannot be used.
     """
-    check_env_id(env_id)
+    task = find_task(env_id)
     _check_vector_options(env_id, options)
     check_choice("arrays", arrays, get_args(Arrays))
     check_choice("device", torch.device(device).type, ("cpu", "cuda"))
@@ -370,7 +369,7 @@ def make_vector_env(
             f"{control_mode!r}{did_you_mean(control_mode, CONTROL_MODES)}; ManiSkill's others go with gymnasium.make"
         )
     check_integer("num_envs", num_envs, 1)
-    steps = MAX_STEPS[env_id] if max_episode_steps is None else max_episode_steps
+    steps = task.max_episode_steps if max_episode_steps is None else max_episode_steps
     check_integer("max_episode_steps", steps, 1)
     mode = str(getattr(autoreset_mode, "value", autoreset_mode))
     check_choice("autoreset_mode", mode, [m.value for m in AutoresetMode])

@@ -11,7 +11,7 @@ import os
 import shutil
 import subprocess
 import sys
-from collections.abc import Generator
+from collections.abc import Generator, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -231,3 +231,35 @@ def pytest_runtest_makereport(
     if (why := unlisted_skip(report)) is not None:
         report.outcome, report.longrepr = "failed", why
     return report
+
+
+@pytest.fixture(scope="session")
+def extras_site(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with the package of `examples/make_it_yours`, built and installed outside of the repository."""
+    import uv
+
+    source, site = tmp_path_factory.mktemp("make_it_yours"), tmp_path_factory.mktemp("site")
+    shutil.copytree(ROOT / "examples" / "make_it_yours", source, dirs_exist_ok=True)
+    options = ["--quiet", "--offline", "--no-deps", "--no-build-isolation", "--python", sys.executable]
+    command = [uv.find_uv_bin(), "pip", "install", *options, "--target", str(site), str(source)]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=120)
+    assert done.returncode == 0, done.stderr
+    return site
+
+
+@pytest.fixture
+def extras(extras_site: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
+    """Has that package in this process; what it registers is forgotten afterwards."""
+    import gymnasium
+
+    from maniskill_tomato import task_registry
+
+    monkeypatch.syspath_prepend(str(extras_site))
+    monkeypatch.setattr(task_registry, "_registered", dict(task_registry._registered))
+    monkeypatch.setattr(task_registry, "_of_path", {})
+    known = set(gymnasium.registry)
+    yield extras_site
+    for env_id in set(gymnasium.registry) - known:
+        del gymnasium.registry[env_id]
+    for module in [name for name in sys.modules if name.startswith("tomato_extras")]:
+        del sys.modules[module]

@@ -24,6 +24,7 @@ FOUNDATION = frozenset(
         "report_plots",
         "run_facts",
         "tables",
+        "task_registry",
         "text_files",
         "version",
         "warp_runtime",
@@ -31,8 +32,8 @@ FOUNDATION = frozenset(
     }
 )
 """What every room may import: files of arrays, asset files, errors, files on the disk, locks of folders, weights put
-into a network, the look of reports and plots, how a result came about, tables of TOML and JSON, the reader of such
-files, the version, the start of Warp, the pool of processes."""
+into a network, the look of reports and plots, how a result came about, tables of TOML and JSON, tasks by ID, the reader
+of such files, the version, the start of Warp, the pool of processes."""
 
 WORLD = FOUNDATION | {"robot", "plants", "raycast"}
 SENSES = WORLD | {"segmentation", "sensing"}

@@ -11,7 +11,7 @@ import tyro
 from maniskill_tomato.cli.arguments import DOCUMENTED
 from maniskill_tomato.cli.command_table import COMMANDS, FAMILIES, PRINT_COMPLETION, PROGRAM, members
 from maniskill_tomato.errors import InvalidInputError, did_you_mean
-from maniskill_tomato.tasks import TASK_IDS
+from maniskill_tomato.task_registry import task_ids
 
 SHELLS: Final = ("bash", "zsh", "fish")
 
@@ -64,7 +64,7 @@ def print_completion(argv: Sequence[str]) -> None:
             registry=DOCUMENTED,
             config=(tyro.conf.OmitSubcommandPrefixes,),
         )
-    addition = NOTHING_KNOWN.get(shell, "").format(words=" ".join(TASK_IDS))
+    addition = NOTHING_KNOWN.get(shell, "").format(words=" ".join(task_ids()))
     print(written.getvalue().replace(LAST_STEP, addition + LAST_STEP), end="")
 
 

@@ -18,7 +18,7 @@ from maniskill_tomato.cli.early_checks import (
 )
 from maniskill_tomato.cli.operator_prompt import FAULT_STATUS, end_by_signal, goes, one_mode, stopped_early
 from maniskill_tomato.cli.shared_options import say
-from maniskill_tomato.policies.layout import GENERAL_IDS
+from maniskill_tomato.task_registry import GENERAL_IDS
 from maniskill_tomato.view.page_address import check_port
 
 if TYPE_CHECKING:

@@ -5,9 +5,10 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from maniskill_tomato.errors import InvalidInputError, PolicyError, did_you_mean
+from maniskill_tomato.extension_points import is_import_path
 from maniskill_tomato.policies.opening import find_policy
 from maniskill_tomato.policies.registry import PRIVILEGED
-from maniskill_tomato.tasks import TASK_IDS
+from maniskill_tomato.task_registry import TASK_IDS, base_of, check_task_name, task_ids
 
 
 def check_choice(flag: str, value: str, allowed: Sequence[str]) -> None:
@@ -16,9 +17,24 @@ def check_choice(flag: str, value: str, allowed: Sequence[str]) -> None:
         raise InvalidInputError.choice(flag, value, allowed)
 
 
-def check_env_id(env_id: str, allowed: Sequence[str] = TASK_IDS) -> None:
-    """Accepts the ID of a task."""
-    check_choice("ENV_ID", env_id, allowed)
+def check_env_id(env_id: str, bases: Sequence[str] = TASK_IDS) -> None:
+    """Accepts the ID of a task, or `package.module:attribute` of one.
+
+    Args:
+        env_id: What was typed.
+        bases: The tasks of this package that it may be, or be a form of.
+    """
+    check_task_name(env_id, "ENV_ID")
+    if env_id in TASK_IDS or len(bases) < len(TASK_IDS):
+        base = env_id if env_id in TASK_IDS else base_of(env_id)
+        if base not in bases:
+            raise InvalidInputError.choice("ENV_ID", env_id, bases)
+
+
+def task_word(argv: Sequence[str]) -> str | None:
+    """The first argument that names a task, before the arguments are taken apart; None if none does."""
+    known = task_ids()
+    return next((word for word in argv if word in known or is_import_path(word)), None)
 
 
 def check_counts(least: int = 1, **values: int | None) -> None:

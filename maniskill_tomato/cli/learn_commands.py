@@ -8,14 +8,14 @@ from typing import Annotated, ClassVar
 import tyro
 
 from maniskill_tomato.cli.arguments import Flat
-from maniskill_tomato.cli.early_checks import check_counts, check_env_id, check_file, check_policy
+from maniskill_tomato.cli.early_checks import check_counts, check_env_id, check_file, check_policy, task_word
 from maniskill_tomato.cli.shared_options import EnvId, PlantOptions, parse_env_options, tell_policy
 from maniskill_tomato.errors import InvalidInputError
 from maniskill_tomato.learning.imitation.imitation_config import ImitationConfig, RegressionConfig
 from maniskill_tomato.learning.rl.ppo_config import PpoConfig, default_ppo
 from maniskill_tomato.learning.view_quality.quality_config import QualityTrainConfig
 from maniskill_tomato.policies.opening import shipped_policy
-from maniskill_tomato.tasks import GENERAL_IDS, TASK_IDS, THESIS_IDS
+from maniskill_tomato.task_registry import GENERAL_IDS, THESIS_IDS, base_of, lasting_name
 
 GENERAL_ID = GENERAL_IDS[0]
 
@@ -134,7 +134,7 @@ class TrainPpo:
     @classmethod
     def defaults(cls, argv: Sequence[str]) -> "TrainPpo":
         """What holds without further options: the general tasks have a configuration of their own."""
-        env_id = next((word for word in argv if word in TASK_IDS), None)
+        env_id = task_word(argv)
         return cls(env_id=tyro.MISSING, out=tyro.MISSING, config=default_ppo(env_id))
 
     def run(self) -> None:
@@ -150,7 +150,7 @@ class TrainPpo:
 
         for seed in self.seeds:
             run_dir = self.out / f"seed-{seed}"
-            if not train_ppo(self.env_id, self.config, run_dir, seed, self.progress):
+            if not train_ppo(lasting_name(self.env_id), self.config, run_dir, seed, self.progress):
                 print(f"stopped; {run_dir} holds what was learned so far")
                 return
             run = load_run(run_dir)
@@ -188,7 +188,7 @@ class RecordDemonstrations:
     def run(self) -> None:
         """Records and says what."""
         check_env_id(self.env_id, (*THESIS_IDS, GENERAL_ID))
-        shipped = str(shipped_policy(self.env_id)) if self.env_id in THESIS_IDS else "oracle"
+        shipped = str(shipped_policy(self.env_id)) if base_of(self.env_id) in THESIS_IDS else "oracle"
         policy = self.policy or shipped
         check_policy("--policy", policy, self.env_id)
         check_counts(episodes=self.episodes)

@@ -9,7 +9,7 @@ import tyro
 from maniskill_tomato.cli.early_checks import check_choice
 from maniskill_tomato.extension_points import OWN_PACKAGE, Extension, ExtensionPoint
 
-KINDS: Final = ("policies", "segmenters", "plants", "arms", "cameras", "models")
+KINDS: Final = ("tasks", "policies", "segmenters", "plants", "arms", "cameras", "models")
 
 
 def extension_points() -> Mapping[str, ExtensionPoint]:
@@ -18,17 +18,26 @@ def extension_points() -> Mapping[str, ExtensionPoint]:
     from maniskill_tomato.plants.plant_generators import PLANT_GENERATORS
     from maniskill_tomato.policies.registry import POLICIES
     from maniskill_tomato.segmentation.segmenter import SEGMENTERS
+    from maniskill_tomato.task_registry import TASKS
 
-    points = (POLICIES, SEGMENTERS, PLANT_GENERATORS, DRIVERS["arm"], DRIVERS["camera"], DRIVERS["model"])
+    points = (
+        TASKS,
+        POLICIES,
+        SEGMENTERS,
+        PLANT_GENERATORS,
+        DRIVERS["arm"],
+        DRIVERS["camera"],
+        DRIVERS["model"],
+    )
     return dict(zip(KINDS, points, strict=True))
 
 
 @dataclass(frozen=True, kw_only=True)
 class List:
-    """List the policies, segmenters, plants, drivers and arm models that there are, and the packages they come from."""
+    """List the tasks, policies, segmenters, plants, drivers and arm models that there are, and whose they are."""
 
     kind: Annotated[str | None, tyro.conf.Positional, tyro.conf.arg(metavar="KIND")] = None
-    """One of policies, segmenters, plants, arms, cameras, models; all if left out."""
+    """One of tasks, policies, segmenters, plants, arms, cameras, models; all if left out."""
 
     def run(self) -> None:
         """Prints a table for each kind."""

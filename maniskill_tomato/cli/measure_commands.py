@@ -7,7 +7,13 @@ from typing import Annotated, get_args
 
 import tyro
 
-from maniskill_tomato.cli.early_checks import check_choice, check_folder, check_place, check_policies
+from maniskill_tomato.cli.early_checks import (
+    check_choice,
+    check_env_id,
+    check_folder,
+    check_place,
+    check_policies,
+)
 from maniskill_tomato.cli.shared_options import say
 from maniskill_tomato.errors import InvalidInputError
 from maniskill_tomato.experiments.configs import (
@@ -33,6 +39,7 @@ class Benchmark(BenchmarkConfig):
     def run(self) -> None:
         """Runs what is missing and says where the results are."""
         check_policies("--policies", self.policies)
+        check_env_id(self.env_id)
         if self.plants is not None:
             check_place("--plants", self.plants)
         elif not Path(self.episode_list).is_file():

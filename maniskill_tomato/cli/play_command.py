@@ -12,7 +12,7 @@ from maniskill_tomato.cli.shared_options import EnvId, PlantOptions, camera_opti
 from maniskill_tomato.errors import InvalidInputError
 from maniskill_tomato.plants.episode_list import EPISODE_LISTS
 from maniskill_tomato.policies.opening import shipped_policy
-from maniskill_tomato.tasks import TASK_IDS
+from maniskill_tomato.task_registry import task_ids
 from maniskill_tomato.view.page_address import check_port
 from maniskill_tomato.view.play_settings import LISTED_ID, PERCEPTIONS, SHIPPED, PlaySettings
 from maniskill_tomato.view.record_kinds import EpisodeFolder, RunFile, find_record
@@ -128,7 +128,7 @@ class Play:
         Raises:
             InvalidInputError: An option cannot be used.
         """
-        if self.env_id not in TASK_IDS and Path(self.env_id).exists():
+        if self.env_id not in task_ids() and Path(self.env_id).exists():
             raise InvalidInputError(
                 f"{self.env_id} is no task; to see what it holds, give --record {self.env_id}"
             )

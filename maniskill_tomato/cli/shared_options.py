@@ -4,19 +4,23 @@ import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, Literal, get_args
+from typing import Annotated, Any, Final, get_args
 
 import tyro
 
 from maniskill_tomato.errors import InvalidInputError, did_you_mean
 from maniskill_tomato.plants.seed_splits import SEED_SPLITS
 from maniskill_tomato.sensing.perception_kinds import RENDERED, Naming, Perception
-from maniskill_tomato.tasks import TASK_IDS, THESIS_IDS, Scene
+from maniskill_tomato.task_registry import TASK_IDS, THESIS_IDS, base_of
+from maniskill_tomato.tasks import Scene
 from maniskill_tomato.text_files import parse_json
 
-EnvId = Annotated[
-    str, tyro.conf.Positional, tyro.conf.arg(metavar="ENV_ID", help=f"The task: {', '.join(TASK_IDS)}.")
-]
+TASK_HELP: Final = (
+    f"The task: {', '.join(TASK_IDS)}, one of another package (`maniskill-tomato list tasks`), or "
+    "package.module:attribute."
+)
+
+EnvId = Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="ENV_ID", help=TASK_HELP)]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -25,8 +29,9 @@ class PlantOptions:
 
     scene: Scene | None = None
     """Of the thesis's tasks, plant, pose and camera: hidden from every start, or the thesis's."""
-    plant: Literal["one_tomato", "three_tomatoes", "full", "varied", "other_kind"] | None = None
-    """Preset of the plant."""
+    plant: Annotated[str | None, tyro.conf.arg(metavar="NAME")] = None
+    """Preset of the plant: one_tomato, three_tomatoes, full, varied or other_kind; or a generator of another package
+    (`maniskill-tomato list plants`), or package.module:callable."""
     mesh: Path | None = None
     """Plants from a mesh file, or from a folder of them with a new one in every episode, in place of grown ones
     (docs/plants.md)."""
@@ -41,6 +46,8 @@ class PlantOptions:
     """Half ranges of a uniform addition to that in every episode: x [m], y [m], yaw [rad]."""
 
     def __post_init__(self) -> None:
+        if self.plant is not None:
+            _check_plant(self.plant)
         splits = tuple(SEED_SPLITS) if self.mesh is None else (*SEED_SPLITS, "all")
         if self.plant_seed is not None and not self.plant_seed.isdigit() and self.plant_seed not in splits:
             raise InvalidInputError(
@@ -62,7 +69,9 @@ class PlantOptions:
             raise InvalidInputError(f"--mesh: there is no file or folder {self.mesh}")
         plant: dict[str, Any] = {}
         if self.plant is not None:
-            plant["preset"] = self.plant
+            from maniskill_tomato.plants.kinds import PLANT_NAMES
+
+            plant["preset" if self.plant in PLANT_NAMES else "generator"] = self.plant
         if self.mesh is not None:
             plant["mesh"] = str(self.mesh.absolute())
         if self.plant_seed is not None:
@@ -77,6 +86,19 @@ class PlantOptions:
         if self.plant_pose_noise is not None:
             options["plant_pose_noise"] = self.plant_pose_noise
         return options
+
+
+def _check_plant(name: str) -> None:
+    from maniskill_tomato.plants.kinds import PLANT_NAMES
+
+    if name in PLANT_NAMES:
+        return
+    from maniskill_tomato.plants.plant_generators import PLANT_GENERATORS
+
+    if not PLANT_GENERATORS.has(name):
+        raise InvalidInputError.choice(
+            "--plant", name, (*PLANT_NAMES, *PLANT_GENERATORS.names(), "package.module:callable")
+        )
 
 
 def camera_options(
@@ -101,7 +123,7 @@ def camera_options(
                 "--target and --map-noise are for a robot that sees through a camera; give --perception as well"
             )
         return {}
-    if options and env_id in THESIS_IDS:
+    if options and base_of(env_id) in THESIS_IDS:
         raise InvalidInputError(
             "--target and --map-noise are for TomatoViewpoint-v1; in the thesis's tasks a robot with a camera "
             "chooses its target itself"

@@ -9,8 +9,8 @@ from typing import Annotated, Any
 import tyro
 
 from maniskill_tomato.cli.arguments import Flat
-from maniskill_tomato.cli.early_checks import check_counts, check_env_id, check_file
-from maniskill_tomato.cli.shared_options import PlantOptions, merge_options
+from maniskill_tomato.cli.early_checks import check_counts, check_env_id, check_file, task_word
+from maniskill_tomato.cli.shared_options import TASK_HELP, PlantOptions, merge_options
 from maniskill_tomato.errors import InvalidInputError, SeedsFailedError
 from maniskill_tomato.learning.rl.config_file import RunFile, parse_seeds, read_run_config, read_run_file
 from maniskill_tomato.learning.rl.presets import (
@@ -21,7 +21,7 @@ from maniskill_tomato.learning.rl.presets import (
     default_preset,
     preset_options,
 )
-from maniskill_tomato.tasks import TASK_IDS
+from maniskill_tomato.task_registry import TASK_IDS, find_task, lasting_name
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -31,7 +31,7 @@ class Train:
     env_id: Annotated[
         str | None,
         tyro.conf.Positional,
-        tyro.conf.arg(metavar="ENV_ID", help=f"The task: {', '.join(TASK_IDS)}. The file or run may say it."),
+        tyro.conf.arg(metavar="ENV_ID", help=f"{TASK_HELP} The file or run may say it."),
     ] = None
     """Id of the task."""
     preset: PresetName = "td3"
@@ -80,6 +80,7 @@ class Train:
                 f"give the task to train on, one of {', '.join(TASK_IDS)}, or --config FILE or --resume DIR"
             )
         check_env_id(env_id)
+        env_id = lasting_name(env_id)
         check_counts(jobs=self.jobs)
         if self.config.initial_policy is not None:
             check_file("--initial-policy", Path(self.config.initial_policy))
@@ -95,7 +96,9 @@ class Train:
         if out is None:
             label = self.preset if self.config_file is None else self.config_file.stem
             which = "seeds" if seeds else f"seed{self.seed}"
-            out = Path("runs") / f"{env_id}-{label}-{which}-{time.strftime('%Y%m%d-%H%M%S')}"
+            out = (
+                Path("runs") / f"{find_task(env_id).env_id}-{label}-{which}-{time.strftime('%Y%m%d-%H%M%S')}"
+            )
         if seeds:
             self._run_seeds(env_id, out, seeds, env_options)
             return
@@ -183,7 +186,7 @@ def _default(argv: Sequence[str]) -> Train:
         run_file = read_run_file(Path(file))
     else:
         run_file = RunFile()
-    env_id = run_file.env_id or next((word for word in argv if word in TASK_IDS), None)
+    env_id = run_file.env_id or task_word(argv)
     preset = run_file.preset or default_preset(env_id, _asked(argv, "--obs-mode"))
     asked = _asked(argv, "--preset")
     for name in PRESETS:

@@ -21,8 +21,9 @@ from maniskill_tomato.conversion.episodes import (
 from maniskill_tomato.conversion.recorded_runs import MOVE_NAMES, ONE_FRUIT, WHOLE_ROW
 from maniskill_tomato.errors import InvalidInputError
 from maniskill_tomato.learning.imitation.trajectory_arrays import opened_trajectories, stored_array
-from maniskill_tomato.policies.layout import ACTION_NAMES, GENERAL_IDS, OBSERVATION_NAMES
+from maniskill_tomato.policies.layout import ACTION_NAMES, OBSERVATION_NAMES
 from maniskill_tomato.robot.iiwa14 import JOINT_NAMES
+from maniskill_tomato.task_registry import GENERAL_IDS, base_of
 from maniskill_tomato.text_files import read_json
 
 ROBOT: Final = "iiwa14_d435"
@@ -70,7 +71,7 @@ def read_demonstrations(path: Path, task: str | None = None) -> EpisodeSource:
             )
         parts = _parts(path, moving[0], _action_names(about))
     env_id = str(about.get("env_id", ""))
-    words = task or (WHOLE_ROW if env_id == GENERAL_IDS[1] else ONE_FRUIT)
+    words = task or (WHOLE_ROW if base_of(env_id) == GENERAL_IDS[1] else ONE_FRUIT)
     options = about.get("env_kwargs")
     robot = options.get("robot_uids") if isinstance(options, dict) else None
     return EpisodeSource(

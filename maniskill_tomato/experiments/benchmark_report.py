@@ -297,7 +297,7 @@ def _cells(row: Mapping[str, Any], privileged: bool) -> tuple[str, ...]:
         number(row["mean_joint_path_rad"], 1),
         number(row["mean_best_visible_fraction"], 3),
         number(row["auc"], 3),
-        percent(row["contact_episode_rate"]),
+        "" if row["contact_episode_rate"] is None else percent(row["contact_episode_rate"]),
         number(row["decision_ms"], 2),
     )
 

@@ -6,6 +6,7 @@ from typing import Any, Literal
 
 from maniskill_tomato.errors import InvalidInputError
 from maniskill_tomato.sensing.perception_kinds import Perception
+from maniskill_tomato.task_registry import GENERAL_IDS
 from maniskill_tomato.tasks import Scene
 
 ExperimentName = Literal["guided", "sparse"]
@@ -65,6 +66,8 @@ class BenchmarkConfig:
 
     policies: str = DEFAULT_POLICIES
     """Names of planners, files of trained policies, or LABEL=FILE, with commas between them."""
+    env_id: str = GENERAL_IDS[0]
+    """The task. Another one than TomatoViewpoint-v1 has no list: its episodes are drawn from their seeds."""
     episodes: int = 500
     """How many episodes of the list."""
     episode_list: str = "held_out"

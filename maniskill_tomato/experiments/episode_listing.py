@@ -167,6 +167,7 @@ def replay_with_eval(
     plant = {"preset": plant} if isinstance(plant, str) else dict(plant)
     for name, flag in (
         ("preset", "--plant"),
+        ("generator", "--plant"),
         ("mesh", "--mesh"),
         ("seed", "--plant-seed"),
         ("pool", "--plant-pool"),

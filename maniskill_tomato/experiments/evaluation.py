@@ -10,7 +10,6 @@ from typing import Any, cast
 
 import gymnasium as gym
 import numpy as np
-from gymnasium.envs.registration import registry
 
 from maniskill_tomato.errors import InvalidInputError
 from maniskill_tomato.experiments import plots
@@ -45,6 +44,7 @@ from maniskill_tomato.policies.protocol import Planner, Policy
 from maniskill_tomato.rendering import vulkan_probe
 from maniskill_tomato.run_facts import duration, is_command_running, run_facts
 from maniskill_tomato.segmentation.datasets.picture_files import write_picture
+from maniskill_tomato.task_registry import base_of, find_task
 
 logger = logging.getLogger(__name__)
 
@@ -273,7 +273,7 @@ def _run_policy(
     try:
         limits = EpisodeLimits(
             threshold=float(cast(Any, env.unwrapped).task.full_visibility),
-            horizon=spec.max_episode_steps if (spec := registry.get(config.env_id)) else None,
+            horizon=find_task(config.env_id).max_episode_steps,
         )
         episodes = run_episodes(env, policy, config.episodes, config.seed, config.show_progress)
     finally:
@@ -287,7 +287,7 @@ def _with_true_association(config: EvaluationConfig, found: str | Path) -> list[
     options = config.env_options
     if options.get("perception", "ground_truth") == "ground_truth" or "association" in options:
         return None
-    if config.env_id == ROW_ID:
+    if base_of(config.env_id) == ROW_ID:
         return None
     logger.info("the same episodes with a true association, to compare")
     env = make_env(config.env_id, colours=needs_colours(found), **options, association="truth")

@@ -131,6 +131,7 @@ def summarise_policy(policy: str, episodes: Sequence[EpisodeRecord], horizon: in
     A failed episode counts as `horizon` moves in `mean_moves`. `auc` is the mean over 1 ... horizon moves of the
     largest V_f seen so far. `spl` is the mean of S * L_oracle / max(L, L_oracle) in moves (Anderson et al. 2018,
     arXiv 1807.06757), `regret_moves` the mean of moves minus the oracle's, both over episodes with a known solution.
+    Contact is None for tasks that do not tell of it.
 
     Args:
         policy: Its name.
@@ -147,6 +148,7 @@ def summarise_policy(policy: str, episodes: Sequence[EpisodeRecord], horizon: in
     moves = counted_moves(episodes, horizon)
     paths = np.array([e.camera_path_length for e in episodes])
     decisions = np.concatenate([e.decision_ms for e in episodes])
+    judged = any(e.contact is not None for e in episodes)
     contacts = [_flags(e.contact, e.steps) for e in episodes]
     touched = np.array([bool(c.any()) for c in contacts])
     nearest = [
@@ -175,9 +177,9 @@ def summarise_policy(policy: str, episodes: Sequence[EpisodeRecord], horizon: in
         **_against_oracle(episodes, moves, success),
         "decision_ms": float(decisions.mean()) if len(decisions) else None,
         "decision_ms_p95": float(np.percentile(decisions, 95)) if len(decisions) else None,
-        "contact_episode_rate": float(touched.mean()),
-        "contact_move_rate": _mean(np.concatenate(contacts)),
-        "contact_free_success_rate": float((success & ~touched).mean()),
+        "contact_episode_rate": float(touched.mean()) if judged else None,
+        "contact_move_rate": _mean(np.concatenate(contacts)) if judged else None,
+        "contact_free_success_rate": float((success & ~touched).mean()) if judged else None,
         "mean_min_clearance_m": float(np.mean(nearest)) if nearest else None,
         "refused_move_rate": _mean(np.concatenate([e.refused for e in episodes])),
     }

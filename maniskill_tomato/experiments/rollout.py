@@ -232,6 +232,8 @@ def _view(world: Any, observations: Any, info: dict[str, Any]) -> dict[str, Floa
     else:
         view["viewpoint"], view["target"] = _array(belief.viewpoint), _array(belief.target_position)
         view["camera"] = _array(belief.camera_position)
+    if belief is None and (inner := getattr(world, "world", None)) is not None:
+        view["camera"] = _array(inner.T_w_camera[:, :3, 3])
     if (qpos := getattr(world, "qpos", None)) is not None:
         view["qpos"] = _array(qpos)
     if (true := info.get("true_visible_fraction")) is not None:

@@ -19,13 +19,15 @@ from maniskill_tomato.experiments.certified_episodes import PlantPlace, certifie
 from maniskill_tomato.experiments.configs import BenchmarkConfig
 from maniskill_tomato.experiments.episode_listing import replay_with_eval
 from maniskill_tomato.experiments.policy_runs import Condition, PolicySpec, parse_policies, run_policies
-from maniskill_tomato.experiments.result_store import ResultStore
+from maniskill_tomato.experiments.result_store import ResultStore, fingerprint
 from maniskill_tomato.experiments.view_grid import draw_view_grid
+from maniskill_tomato.extension_points import source_file
 from maniskill_tomato.folder_lock import only_writer
 from maniskill_tomato.plants.episode_list import EPISODE_LISTS, load_episodes
 from maniskill_tomato.policies.registry import PRIVILEGED
 from maniskill_tomato.rendering import vulkan_probe
-from maniskill_tomato.tasks.row.row_config import GeneralTaskConfig
+from maniskill_tomato.task_registry import GENERAL_IDS, TASK_IDS, TASKS, base_of, find_task
+from maniskill_tomato.tasks.making import make_options
 
 MAIN = "held_out"
 """The condition on which policies are compared; also the name of its list of episodes."""
@@ -79,9 +81,13 @@ def _run_benchmark(config: BenchmarkConfig) -> BenchmarkResult:
     specs = parse_policies(config.policies)
     sweep_specs = _chosen_policies(config, specs)
     processes = config.jobs or len(os.sched_getaffinity(0))
-    if config.plants is None:
+    facts: dict[str, Any]
+    if config.env_id != GENERAL_IDS[0]:
+        main, facts, swept = _drawn_condition(config), {}, []
+        store = _open_store(config, specs, **_task_setting(config.env_id))
+    elif config.plants is None:
         main = main_condition(config.episode_list, config.contact_free_oracle)
-        facts: dict[str, Any] = {}
+        facts = {}
         swept = _swept_conditions(config, main)
         _check_counts(config, main, bool(swept))
         store = _open_store(config, specs)
@@ -98,15 +104,16 @@ def _run_benchmark(config: BenchmarkConfig) -> BenchmarkResult:
         condition.name: {spec.label: store.episodes(condition.name, spec.label, n) for spec in some}
         for condition, some, n in plan
     }
-    task = GeneralTaskConfig()
+    threshold = make_options(config.env_id).task.full_visibility
+    horizon = find_task(config.env_id).max_episode_steps
     pictures, left_out = [], None
     problem = vulkan_probe.rendering_problem() if config.pictures else None
     if config.pictures and problem is None:
         pictures.append(config.out / "views.jpg")
-        draw_view_grid(runs[main.name], main, task.full_visibility, pictures[0])
+        draw_view_grid(runs[main.name], main, threshold, pictures[0])
     elif problem is not None:
         left_out = LEFT_OUT.format(hint=problem)
-    figures = summarise_runs(runs, (main, *swept), task.max_moves)
+    figures = summarise_runs(runs, (main, *swept), horizon)
     sources = {spec.label: spec.source for spec in specs}
 
     def replay(label: str, seed: int) -> str:
@@ -115,8 +122,8 @@ def _run_benchmark(config: BenchmarkConfig) -> BenchmarkResult:
 
     content = BenchmarkInput(
         runs=runs[main.name],
-        threshold=task.full_visibility,
-        horizon=task.max_moves,
+        threshold=threshold,
+        horizon=horizon,
         privileged=[spec.label for spec in specs if spec.source in PRIVILEGED],
         facts={"first episode": config.seed, "processes": processes, **facts},
         pictures=pictures,
@@ -141,6 +148,8 @@ def _replay(config: BenchmarkConfig, source: str, seed: int) -> str:
         f"runs/again-{seed}",
     ]
     flags = [] if config.plants is None else ["--plants", config.plants]
+    if config.env_id != GENERAL_IDS[0]:
+        flags += ["--env-id", config.env_id]
     if config.contact_free_oracle:
         flags += ["--episode-list", config.episode_list, "--contact-free-oracle"]
     return shlex.join(["maniskill-tomato", *words, *flags])
@@ -149,12 +158,40 @@ def _replay(config: BenchmarkConfig, source: str, seed: int) -> str:
 def _open_store(config: BenchmarkConfig, specs: Sequence[PolicySpec], **settings: Any) -> ResultStore:
     """The folder of the results, and what they depend on."""
     common = {
-        "env_id": "TomatoViewpoint-v1",
+        "env_id": config.env_id,
         "package_version": maniskill_tomato.__version__,
         "contact_free_oracle": config.contact_free_oracle,
     }
     members = {f"policy {spec.label}": spec.fingerprint for spec in specs}
     return ResultStore(config.out, {**common, **settings}, members)
+
+
+def _drawn_condition(config: BenchmarkConfig) -> Condition:
+    """Episodes of another task than the one with lists, each drawn from its seed.
+
+    Raises:
+        InvalidInputError: An option is for that task, or the task is a row.
+    """
+    if base_of(config.env_id) == GENERAL_IDS[1]:
+        raise InvalidInputError(f"{config.env_id} is a row, which benchmark-rows judges")
+    if _words(config.sweeps) or config.episode_list != MAIN or config.plants is not None:
+        raise InvalidInputError(
+            f"--sweeps, --episode-list and --plants are for {GENERAL_IDS[0]}; leave them out with --env-id"
+        )
+    if config.episodes < 1 or config.seed < 0:
+        raise InvalidInputError(
+            f"--episodes must be 1 or more and --seed 0 or more; got {config.episodes} and {config.seed}"
+        )
+    return Condition(
+        name=find_task(config.env_id).env_id, env_id=config.env_id, contact_free=config.contact_free_oracle
+    )
+
+
+def _task_setting(env_id: str) -> dict[str, Any]:
+    """What the episodes of somebody else's task depend on: the file that makes it."""
+    targets = {task.name: task.target for task in TASKS.extensions()}
+    module = source_file(targets.get(env_id, env_id))
+    return {} if env_id in TASK_IDS or module is None else {"task": fingerprint(module)}
 
 
 def _checked_plants(config: BenchmarkConfig, text: str) -> PlantPlace:

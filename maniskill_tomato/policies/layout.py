@@ -3,6 +3,8 @@
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
+from maniskill_tomato.task_registry import GENERAL_IDS, base_of
+
 if TYPE_CHECKING:
     from maniskill_tomato.sensing.image_layout import Sight
 
@@ -66,9 +68,6 @@ GENERAL_LAYOUT = PolicyLayout(
     action_meaning="move of the camera in its look frame, cut to norm 1; it looks at the target from there",
 )
 
-GENERAL_IDS = ("TomatoViewpoint-v1", "TomatoViewpointRow-v1")
-"""The tasks on plants never seen before; their policies may decide from a `Belief`."""
-
 EPSILON_GREEDY_LOW = (-0.07, -0.2, -0.1, -0.17, -0.17, -0.17)
 """Lower ends of Eq. 5-6 in the order of `ACTION_NAMES`; the thesis lists pitch before roll. [m], [rad]."""
 
@@ -78,7 +77,7 @@ EPSILON_GREEDY_HIGH = (0.1, 0.1, 0.1, 0.43, 0.17, 0.26)
 
 def has_belief(env_id: str) -> bool:
     """Whether a task keeps a `Belief`, beside its state vector."""
-    return env_id in GENERAL_IDS
+    return base_of(env_id) in GENERAL_IDS
 
 
 def layout_of(env_id: str, sight: "Sight | None" = None) -> PolicyLayout:

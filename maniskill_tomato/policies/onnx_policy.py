@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 from maniskill_tomato.errors import InvalidInputError, PolicyError
 from maniskill_tomato.policies.description import IMAGE_MEANINGS, INPUT_NAME, OUTPUT_NAME, PolicyDescription
 from maniskill_tomato.sensing.image_layout import check_images
+from maniskill_tomato.task_registry import is_same_task
 
 _EXPORT_AGAIN = "run `maniskill-tomato export` again"
 
@@ -59,7 +60,7 @@ class OnnxPolicy:
                 f"{path} is not the file that {description_file.name} describes (their SHA-256 differ): one of them "
                 f"is damaged or belongs to another policy; {_EXPORT_AGAIN}"
             )
-        if env_id is not None and description.env_id != env_id:
+        if env_id is not None and not is_same_task(description.env_id, env_id):
             raise PolicyError(
                 f"{path} was trained on {description.env_id}, not on {env_id}; give a policy of this task "
                 "(`maniskill-tomato eval` tries any with --allow-other-task)"

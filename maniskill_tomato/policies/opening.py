@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 from maniskill_tomato.errors import PolicyError, TomatoError, did_you_mean
 from maniskill_tomato.extension_points import is_import_path
-from maniskill_tomato.policies.layout import GENERAL_IDS, has_belief
+from maniskill_tomato.policies.layout import has_belief
 from maniskill_tomato.policies.registry import (
     PLANNERS,
     PRIVILEGED,
@@ -15,6 +15,7 @@ from maniskill_tomato.policies.registry import (
     make_planner,
     policy_names,
 )
+from maniskill_tomato.task_registry import GENERAL_IDS
 
 if TYPE_CHECKING:
     import torch

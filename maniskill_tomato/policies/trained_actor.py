@@ -17,6 +17,7 @@ from maniskill_tomato.policies.image_encoder import ImageEncoder
 from maniskill_tomato.sensing.image_layout import ImageLayout, Sight, check_images
 from maniskill_tomato.sensing.image_observation import Observation, images_of, state_of
 from maniskill_tomato.sensing.perception_kinds import STATE_MODE
+from maniskill_tomato.task_registry import is_same_task
 
 FORMAT = 1
 """Version of the layout that `learning.rl.checkpoint.make_checkpoint` documents."""
@@ -130,7 +131,7 @@ def load_actor(
         CheckpointError: The file is missing, damaged, inconsistent or made for another task.
     """
     data = load_checkpoint(path, device)
-    if env_id is not None and data["env_id"] != env_id:
+    if env_id is not None and not is_same_task(data["env_id"], env_id):
         raise CheckpointError(
             f"{path} was trained on {data['env_id']}, not on {env_id}; give a policy of this task (`maniskill-tomato "
             "eval` tries any with --allow-other-task)"

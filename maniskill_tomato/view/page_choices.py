@@ -6,7 +6,7 @@ from typing import Any, Final
 import viser
 
 from maniskill_tomato.plants.kinds import PLANT_NAMES
-from maniskill_tomato.tasks import TASK_IDS
+from maniskill_tomato.task_registry import task_ids
 from maniskill_tomato.view.play_settings import PERCEPTIONS
 from maniskill_tomato.view.player import Player
 
@@ -28,7 +28,11 @@ class EpisodeChoices:
         """
         self._player = player
         change = player.change
-        self._env_id: Any = gui.add_dropdown("Task", TASK_IDS, initial_value=player.settings.env_id)
+        self._env_id: Any = gui.add_dropdown(
+            "Task",
+            tuple(dict.fromkeys((*task_ids(), player.settings.env_id))),
+            initial_value=player.settings.env_id,
+        )
         self._env_id.on_update(by_hand(ask, lambda value: change(env_id=value)))
         self._policy: Any = gui.add_dropdown(
             "Policy", player.settings.policies(), initial_value=player.settings.policy

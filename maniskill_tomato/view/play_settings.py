@@ -9,7 +9,7 @@ from maniskill_tomato.policies.layout import has_belief
 from maniskill_tomato.policies.opening import RANDOM
 from maniskill_tomato.policies.registry import policy_names
 from maniskill_tomato.sensing.perception_kinds import RENDERED, Naming, Perception
-from maniskill_tomato.tasks import TASK_IDS
+from maniskill_tomato.task_registry import base_of, check_task_name
 
 LISTED_ID: Final = "TomatoViewpoint-v1"
 """The task that has lists of episodes, and that names its target to a camera."""
@@ -44,8 +44,8 @@ class PlaySettings:
     """A list of episodes, for the task that has some; held-out ones if None, unless the plants are others."""
 
     def __post_init__(self) -> None:
+        check_task_name(self.env_id)
         for name, value, allowed in (
-            ("env_id", self.env_id, TASK_IDS),
             ("perception", self.perception, PERCEPTIONS),
             ("target", self.target or "track", NAMINGS),
         ):
@@ -61,7 +61,7 @@ class PlaySettings:
             options["episodes"] = self.episode_list or "held_out"
         if self.perception != "ground_truth":
             options["perception"] = self.perception
-            if self.target is not None and self.env_id == LISTED_ID:
+            if self.target is not None and base_of(self.env_id) == LISTED_ID:
                 options["target"] = self.target
         return options
 

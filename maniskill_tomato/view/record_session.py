@@ -6,7 +6,6 @@ from typing import Any, Final
 
 import numpy as np
 import torch
-from gymnasium.envs.registration import registry
 
 from maniskill_tomato.errors import InvalidInputError
 from maniskill_tomato.experiments.episode_listing import ListedEpisode, failures_first, list_episode
@@ -16,6 +15,7 @@ from maniskill_tomato.experiments.stored_episodes import StoredEpisodes, read_st
 from maniskill_tomato.report_design import SERIES, rgb
 from maniskill_tomato.robot.inverse_kinematics import Reach
 from maniskill_tomato.robot.kinematics import link_transforms
+from maniskill_tomato.task_registry import find_task
 from maniskill_tomato.tasks.making import option_names
 from maniskill_tomato.tasks.vector_env import make_vector_env
 from maniskill_tomato.view.episode_recording import (
@@ -182,8 +182,7 @@ class RecordSession:
     def _limits(self, stored: StoredEpisodes) -> tuple[float, int | None]:
         """V_f above which the target is fully visible, and the most moves of an episode."""
         world = self._env()[0].world
-        spec = registry.get(stored.env_id)
-        return float(world.task.full_visibility), None if spec is None else spec.max_episode_steps
+        return float(world.task.full_visibility), find_task(stored.env_id).max_episode_steps
 
     def _check_plant(self, world: Any, stored: StoredEpisodes) -> None:
         """Compares V_f of a first view with the stored one.

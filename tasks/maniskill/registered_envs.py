@@ -1,4 +1,4 @@
-"""The four tasks as ManiSkill environments."""
+"""The tasks of this package as ManiSkill environments."""
 
 from mani_skill.utils.registration import register
 

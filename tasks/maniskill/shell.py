@@ -1,6 +1,7 @@
 """ManiSkill's shell over a world: actors, cameras, lights, control modes, pictures, physics; no rule of any game."""
 
 import copy
+import inspect
 from collections.abc import Mapping
 from typing import Any, ClassVar, cast
 
@@ -90,6 +91,10 @@ class TomatoEnv(BaseEnv):  # type: ignore[misc]
         names = option_names(self.env_id)
         options = {name: kwargs.pop(name) for name in list(kwargs) if name in names}
         check_other_tasks(self.env_id, kwargs)
+        own = set(inspect.signature(TomatoEnv.__init__).parameters) | names
+        shell_options.check_names(
+            self.env_id, kwargs, own | set(inspect.signature(BaseEnv.__init__).parameters)
+        )
         self._setup = setup = make_setup(self.env_id, **options)
         self.motion = motion
         if control_mode is None:

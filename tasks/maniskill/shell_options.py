@@ -7,7 +7,7 @@ from typing import Literal, get_args
 import torch
 from mani_skill.envs.utils.observations import ALL_VISUAL_TEXTURES
 
-from maniskill_tomato.errors import InvalidInputError
+from maniskill_tomato.errors import InvalidInputError, did_you_mean
 from maniskill_tomato.rendering.vulkan_probe import NO_RENDERING_HINT
 from maniskill_tomato.tasks.making import check_choice
 
@@ -17,6 +17,22 @@ Scenery = Literal["plain", "greenhouse"]
 PLAIN_OBS_MODES = ("state", "state_dict", "none", "sensor_data", "pointcloud")
 REWARD_MODES = ("dense", "normalized_dense", "sparse", "none")
 RENDER_MODES = ("human", "rgb_array", "sensors", "all")
+
+
+def check_names(env_id: str, given: Iterable[str], known: Iterable[str]) -> None:
+    """Accepts options that the task or ManiSkill has.
+
+    Args:
+        env_id: The task.
+        given: The names that `gymnasium.make` was given.
+        known: Those that there are.
+    """
+    allowed = sorted(set(known) - {"self", "args", "kwargs"})
+    for name in given:
+        if name not in allowed:
+            raise InvalidInputError(
+                f"{env_id} has no option {name!r}{did_you_mean(name, allowed)}; it takes {', '.join(allowed)}"
+            )
 
 
 def check_obs_mode(obs_mode: str | None) -> None:

@@ -115,10 +115,15 @@ class HardStarts:
             ]
         for search in searches:
             if search.best is None:
+                own = self._task.own
+                where = (
+                    f"the box {self._task.start_box} [m] in front of the plant"
+                    if own.starts is None
+                    else f"the starts of {own.env_id}"
+                )
                 raise InvalidInputError(
-                    f"the arm can look at none of the {len(search.order)} ripe fruits from the box "
-                    f"{self._task.start_box} [m] in front of the plant without touching it; move the plant with "
-                    "plant_pose"
+                    f"the arm can look at none of the {len(search.order)} ripe fruits from {where} without touching "
+                    "it; move the plant with plant_pose"
                 )
         return [search.best for search in searches if search.best is not None]
 
@@ -154,16 +159,23 @@ class HardStarts:
 
     def _take_turns(self, searches: Sequence[_Search], T_world_plant: Tensor) -> None:
         """Draws candidates for the next target of each search, and looks from them until one is in range."""
+        own = self._task.own
         draws, target_positions = [], []
         for search in searches:
             search.target = search.order[search.turn % len(search.order)]
             search.turn += 1
-            draws.append(search.request.rng.uniform(self._low, self._high, (CANDIDATES, 3)))
-            target_positions.append(search.request.target_positions[search.target])
+            target, rng = search.request.target_positions[search.target], search.request.rng
+            target_positions.append(target)
+            if own.starts is None:
+                draws.append(rng.uniform(self._low, self._high, (CANDIDATES, 3)))
+            else:
+                draws.append(own.draw_starts(rng, CANDIDATES, target.double().cpu().numpy(), 3))
         env_idx = torch.tensor([search.request.env_index for search in searches], device=self._device)
-        base = T_world_plant[env_idx, :3, 3].double()
-        base[:, 2] = 0.0
-        positions = torch.as_tensor(np.stack(draws), device=self._device) + base[:, None]
+        positions = torch.as_tensor(np.stack(draws), device=self._device)
+        if own.starts is None:
+            base = T_world_plant[env_idx, :3, 3].double()
+            base[:, 2] = 0.0
+            positions = positions + base[:, None]
         targets = torch.stack(target_positions).double()[:, None].expand_as(positions)
         far_enough = (positions - targets).norm(dim=-1) >= self._task.start_distance
         left = {k: np.flatnonzero(own).tolist() for k, own in enumerate(far_enough.cpu().numpy())}

@@ -7,6 +7,7 @@ from torch import Tensor
 from maniskill_tomato.errors import InvalidInputError
 from maniskill_tomato.plants.spec import ROW_PLANT, PlantPose, PlantSpec
 from maniskill_tomato.tasks import MAX_GENERAL_STEPS
+from maniskill_tomato.tasks.own_rules import OwnRules
 
 Range = tuple[float, float]
 
@@ -37,6 +38,8 @@ class GeneralTaskConfig:
     """What a full view of the target is worth."""
     contact_penalty: float = 0.0
     """What a move on which the arm touches a plant costs beside that."""
+    own: OwnRules = OwnRules()
+    """What a task of somebody else's does its own way."""
 
     def __post_init__(self) -> None:
         low, high = self.start_visibility
@@ -73,4 +76,4 @@ class GeneralTaskConfig:
     @property
     def largest_reward(self) -> float:
         """Of one move."""
-        return 1.0 + self.success_reward
+        return 1.0 + self.success_reward if self.own.reward is None else self.own.largest_reward

@@ -23,6 +23,7 @@ from maniskill_tomato.sensing.perception_kinds import Perception
 from maniskill_tomato.sensing.sensor_noise import SensorNoise
 from maniskill_tomato.tasks import MAX_ROW_STEPS
 from maniskill_tomato.tasks.arm_moves import Plan
+from maniskill_tomato.tasks.own_rules import Moved
 from maniskill_tomato.tasks.row.episode_selection import EpisodeChoice
 from maniskill_tomato.tasks.row.hidden_starts import HardStarts, Start, StartRequest
 from maniskill_tomato.tasks.row.inspecting import InspectedSequence, InspectingSenses
@@ -388,11 +389,28 @@ class SearchGame:
             info["target_done"] = state.target_done.clone()
             info["transits"] = state.transits.clone()
             info["joint_path_length"] = state.joint_path_length.clone()
+        if self.task.own.success is not None:
+            info["success"] = self.task.own.success_of(self._moved(info))
         return info
+
+    def _moved(self, info: Mapping[str, Tensor]) -> Moved:
+        """What own rules judge."""
+        world, state = self._world, self._world.state
+        return Moved(
+            info=info,
+            visible_fraction=state.fraction_after,
+            previous_fraction=state.fraction_before,
+            viewpoint=state.viewpoint,
+            qpos=state.qpos,
+            camera_position=world.T_w_camera[:, :3, 3],
+            target_position=self.known_target(),
+        )
 
     def reward(self, info: Mapping[str, Tensor]) -> Tensor:
         """The reward of the last move; in a row each target that was seen is a success, and transits cost what their
         moves do. Shape (N,)."""
+        if self.task.own.reward is not None:
+            return self.task.own.reward_of(self._moved(info))
         state = self._world.state
         success = info["success"] if self.sequence is None else info["target_done"]
         reward = self.task.reward(state.fraction_after, state.fraction_before, success, info["plant_contact"])

@@ -5,6 +5,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from maniskill_tomato.errors import InvalidInputError
@@ -36,11 +37,12 @@ class Starts:
         self._inverse_kinematics = InverseKinematics(device=str(device))
         self._ready = torch.tensor(READY_QPOS, dtype=torch.float64, device=device)
 
-    def draw(self, rngs: Sequence[np.random.RandomState]) -> tuple[Tensor, Tensor]:
+    def draw(self, rngs: Sequence[np.random.RandomState], target_positions: Tensor) -> tuple[Tensor, Tensor]:
         """One start per generator, uniform over the part of the ranges in reach (Eq. 5-1, 5-2, 5-7, 5-8).
 
         Args:
             rngs: The generator of each environment, b of them.
+            target_positions: Where the targets are, world frame, in [m], for starts of a task's own. Shape (b, 3).
 
         Returns:
             Viewpoints (x, y, z [m], roll, pitch, yaw [rad]) of shape (b, 6) and joints [rad] of shape (b, 7).
@@ -53,8 +55,7 @@ class Starts:
         qpos = torch.zeros(b, 7, device=device)
         rows = torch.arange(b, device=device)  # Those without a start so far.
         for _ in range(MAX_DRAWS):
-            open_rngs = [rngs[i] for i in rows.tolist()]
-            draws = np.stack([rng.uniform(self._low, self._high, (CANDIDATES, 6)) for rng in open_rngs])
+            draws = np.stack([self._candidates(rngs[i], target_positions[i]) for i in rows.tolist()])
             candidates = torch.as_tensor(draws, dtype=torch.float32, device=device)
             solution = self._solve(candidates.reshape(-1, 6))
             reachable = (solution.reach == int(Reach.REACHABLE)).reshape(-1, CANDIDATES)
@@ -65,10 +66,19 @@ class Starts:
             rows = rows[~found]
             if not len(rows):
                 return viewpoint, qpos
-        raise InvalidInputError(
-            f"none of {MAX_DRAWS * CANDIDATES} start poses could be reached; the task's ranges "
-            f"{self._task.start_position} [m] and {self._task.start_rpy} [rad] lie outside the arm's workspace"
+        where = (
+            f"the task's ranges {self._task.start_position} [m] and {self._task.start_rpy} [rad]"
+            if self._task.own.starts is None
+            else f"the starts of {self._task.own.env_id}"
         )
+        raise InvalidInputError(
+            f"none of {MAX_DRAWS * CANDIDATES} start poses could be reached; {where} lie outside the arm's workspace"
+        )
+
+    def _candidates(self, rng: np.random.RandomState, target_position: Tensor) -> NDArray[np.float64]:
+        if self._task.own.starts is None:
+            return rng.uniform(self._low, self._high, (CANDIDATES, 6))
+        return self._task.own.draw_starts(rng, CANDIDATES, target_position.double().cpu().numpy(), 6)
 
     def given(self, viewpoint: Any, batch: int) -> tuple[Tensor, Tensor]:
         """The same start for all environments being reset.

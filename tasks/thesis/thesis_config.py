@@ -11,6 +11,7 @@ from torch import Tensor
 from maniskill_tomato.plants.spec import PlantPose, PlantSpec
 from maniskill_tomato.robot.d435 import Calibration
 from maniskill_tomato.tasks import THESIS_IDS, Scene
+from maniskill_tomato.tasks.own_rules import OwnRules
 from maniskill_tomato.tasks.thesis import thesis_rewards as rewards
 from maniskill_tomato.tasks.thesis.scenes import plant_pose
 
@@ -46,6 +47,8 @@ class ViewpointTaskConfig:
     """P_p from reach, forbidden zone."""
     reward_bounds: Range
     """R = R_v + P_p is clipped to these; the upper one is the best reward of a step."""
+    own: OwnRules = OwnRules()
+    """What a task of somebody else's does its own way."""
 
     def reward(self, visual: Tensor, penalty: Tensor) -> Tensor:
         """R = R_v + P_p (Eq. 4-5), clipped to the bounds. Each of shape (B,)."""
@@ -54,7 +57,7 @@ class ViewpointTaskConfig:
     @property
     def largest_reward(self) -> float:
         """Of one step."""
-        return self.reward_bounds[1]
+        return self.reward_bounds[1] if self.own.reward is None else self.own.largest_reward
 
 
 def thesis_task(env_id: str, scene: Scene = "hidden") -> ViewpointTaskConfig:

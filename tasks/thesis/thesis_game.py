@@ -1,5 +1,6 @@
 """The rules of the thesis's tasks: nine observed numbers, increments of the viewpoint, a reward for every view."""
 
+import math
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -12,6 +13,7 @@ from maniskill_tomato.robot.inverse_kinematics import Reach
 from maniskill_tomato.sensing.camera_perception import CameraPerception
 from maniskill_tomato.sensing.perception_kinds import Perception
 from maniskill_tomato.tasks.arm_moves import Plan
+from maniskill_tomato.tasks.own_rules import Moved
 from maniskill_tomato.tasks.senses import (
     CameraConfig,
     CameraSenses,
@@ -72,6 +74,7 @@ class ThesisGame:
         self._starts = Starts(task, world.device)
         self._view: dict[str, Tensor] = {}
         self._views_of_others: list[dict[str, Tensor]] = []
+        self._others_before: list[Tensor] = []
 
     @property
     def perception(self) -> CameraPerception:
@@ -103,14 +106,19 @@ class ThesisGame:
             targets = [world.checked_target(i, options["target"]) for i in indices]
         if "viewpoint" in options:
             viewpoint, qpos = self._starts.given(options["viewpoint"], len(indices))
+            world.set_target(env_idx, targets)
         else:
-            viewpoint, qpos = self._starts.draw(rngs)
-        world.set_target(env_idx, targets)
+            world.set_target(env_idx, targets)
+            viewpoint, qpos = self._starts.draw(rngs, world.target_position_w[env_idx])
         world.set_arm(env_idx, qpos, viewpoint)
+        state = world.state
+        # There is no view before the first one.
+        state.fraction_before = state.fraction_before.index_fill(0, env_idx, math.nan)
         if self._camera is None:
             self.recall(env_idx)
         else:
             self._begin_camera(self._camera, env_idx, rngs)
+        state.fraction_before = state.fraction_before.index_put((env_idx,), state.visible_fraction[env_idx])
 
     def _begin_camera(
         self, camera: CameraSenses, env_idx: Tensor, rngs: Sequence[np.random.RandomState]
@@ -137,6 +145,8 @@ class ThesisGame:
 
     def look(self, before: Tensor, plan: Plan | None) -> Plan | None:
         """Looks at the targets; a step is one look."""
+        self._world.state.fraction_before = self._world.state.visible_fraction
+        self._others_before = [view["visible_fraction"] for view in self._views_of_others]
         if self._camera is None:
             self._look()
         else:
@@ -151,6 +161,7 @@ class ThesisGame:
                 self._measure(self._camera, view)
             return
         if self._other_targets:
+            self._others_before = []
             self._others, self._others_exist = _other_ripe_fruits(
                 self._world.plant_batch.ripe_fruits, self._world.state.target, self._other_targets
             )
@@ -158,10 +169,12 @@ class ThesisGame:
 
     def _look(self) -> None:
         state = self._world.state
-        self._view = self._judge_truth(state.target)
+        self._view = self._judge_truth(state.target, state.fraction_before)
         state.visible_fraction = self._view["visible_fraction"]
         if self._other_targets:
-            self._views_of_others = [self._judge_truth(fruit) for fruit in self._others.unbind(-1)]
+            others = self._others.unbind(-1)
+            before = self._others_before or [state.fraction_before] * len(others)
+            self._views_of_others = [self._judge_truth(*pair) for pair in zip(others, before, strict=True)]
 
     def _measure(self, camera: CameraSenses, view: ViewPoses) -> None:
         """Takes in a camera's view of some environments."""
@@ -171,24 +184,38 @@ class ThesisGame:
         self._measured = measured
         self._world.state.visible_fraction = measured.visible_fraction
         self._view = self._judge(
-            measured.visible_fraction, measured.told_fraction > 0.0, camera.ripe_detected
+            measured.visible_fraction,
+            measured.told_fraction > 0.0,
+            camera.ripe_detected,
+            self._world.state.fraction_before,
+            camera.known_target(),
         ) | camera_info(measured, self.task.full_visibility)
 
-    def _judge_truth(self, target: Tensor) -> dict[str, Tensor]:
-        """The present view as one of `target`, indices in `Plant.fruits`. Shape (N,)."""
+    def _judge_truth(self, target: Tensor, before: Tensor) -> dict[str, Tensor]:
+        """The present view as one of `target`, indices in `Plant.fruits`, of which V_f was `before`. Shape (N,)."""
         world = self._world
         seen = world.scene.visibility(
             world.T_w_camera, target, world.plant_batch.T_world_plant, world.T_w_links
         )
-        return self._judge(seen.visible_fraction, seen.visible_fraction > 0.0, seen.any_visible)
+        position = world.target_position_w
+        if target is not world.state.target and self.task.own.success is not None:
+            position = world.plant_batch.fruit_position_w(target)
+        return self._judge(
+            seen.visible_fraction, seen.visible_fraction > 0.0, seen.any_visible, before, position
+        )
 
-    def _judge(self, fraction: Tensor, target_seen: Tensor, tomato_seen: Tensor) -> dict[str, Tensor]:
-        """A view by V_f, whether the target is seen, and whether any ripe tomato is. Each of shape (N,)."""
+    def _judge(
+        self, fraction: Tensor, target_seen: Tensor, tomato_seen: Tensor, before: Tensor, position: Tensor
+    ) -> dict[str, Tensor]:
+        """A view by V_f, whether the target is seen, whether any ripe tomato is, V_f before, and where the target is.
+
+        Each of shape (N,), the last (N, 3).
+        """
         state = self._world.state
         forbidden = in_forbidden_zone(state.viewpoint[:, :3])
         unreachable = state.reach == int(Reach.UNREACHABLE)
         fail = unreachable if self.task.outside_workspace == "end" else torch.zeros_like(unreachable)
-        return {
+        judged = {
             "success": (fraction > self.task.full_visibility) & ~fail,
             "fail": fail,
             "visible_fraction": fraction,
@@ -199,6 +226,22 @@ class ThesisGame:
             "reward_visual": self.task.visual_reward(fraction, target_seen, tomato_seen, state.reach),
             "reward_penalty": self.task.pose_penalty(state.reach, forbidden),
         }
+        if self.task.own.success is not None:
+            judged["success"] = self.task.own.success_of(self._moved(judged, before, position)) & ~fail
+        return judged
+
+    def _moved(self, judged: Mapping[str, Tensor], before: Tensor, position: Tensor) -> Moved:
+        """What own rules judge."""
+        world, state = self._world, self._world.state
+        return Moved(
+            info=judged,
+            visible_fraction=judged["visible_fraction"],
+            previous_fraction=torch.where(before.isnan(), judged["visible_fraction"], before),
+            viewpoint=state.viewpoint,
+            qpos=state.qpos,
+            camera_position=world.T_w_camera[:, :3, 3],
+            target_position=position,
+        )
 
     @property
     def observation_size(self) -> int:
@@ -225,17 +268,25 @@ class ThesisGame:
     def _info_of_others(self) -> dict[str, Tensor]:
         judged = self._views_of_others
         position = self._world.plant_batch.fruit_position_w
+        places = [position(fruit) for fruit in self._others.unbind(-1)]
+        before = self._others_before or [view["visible_fraction"] for view in judged]
+        rewards = [self._reward(*of_one) for of_one in zip(judged, before, places, strict=True)]
         return {
             "other_visible_fraction": torch.stack([j["visible_fraction"] for j in judged], dim=-1),
             "other_success": torch.stack([j["success"] for j in judged], dim=-1),
-            "other_reward": torch.stack([self.reward(j) for j in judged], dim=-1),
+            "other_reward": torch.stack(rewards, dim=-1),
             "other_exists": self._others_exist.clone(),
-            "other_position": torch.stack([position(fruit) for fruit in self._others.unbind(-1)], dim=-2),
+            "other_position": torch.stack(places, dim=-2),
         }
 
     def reward(self, info: Mapping[str, Tensor]) -> Tensor:
-        """R = R_v + P_p. Shape (N,)."""
-        return self.task.reward(info["reward_visual"], info["reward_penalty"])
+        """R = R_v + P_p, or the task's own reward. Shape (N,)."""
+        return self._reward(info, self._world.state.fraction_before, self.known_target())
+
+    def _reward(self, judged: Mapping[str, Tensor], before: Tensor, position: Tensor) -> Tensor:
+        if self.task.own.reward is not None:
+            return self.task.own.reward_of(self._moved(judged, before, position))
+        return self.task.reward(judged["reward_visual"], judged["reward_penalty"])
 
 
 def _other_ripe_fruits(

@@ -73,7 +73,7 @@ ERRORS: dict[str, tuple[tuple[str, ...], str]] = {
         ("eval", GUIDED, "--plant-seed", "trian"),
         "error: --plant-seed must be a number or one of train",
     ),
-    "plant": (("eval", GUIDED, "--plant", "oak"), "--plant: 'oak' is none of one_tomato"),
+    "plant": (("eval", GUIDED, "--plant", "oak"), "--plant must be one of 'one_tomato'"),
     "policy's file": (("eval", GUIDED, "--policy", "no.pt"), "error: --policy: no policy at 'no.pt'"),
     "planner": (("eval", GENERAL, "--policy", "nvb"), "--policy: no policy at '"),
     "policy to export": (("export", "--policy", "no.pt"), "error: --policy: there is no file no.pt"),

@@ -5,7 +5,6 @@ The packages are real ones: a module and its `entry_points.txt` on the path, as 
 
 import ast
 import sys
-import tomllib
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -35,7 +34,7 @@ from maniskill_tomato.robot.d435 import T_flange_camera_color_optical
 from maniskill_tomato.robot.iiwa14 import IIWA14
 from maniskill_tomato.robot.kinematics import forward_kinematics
 
-EXAMPLE = Path(__file__).parents[2] / "examples" / "other_arm"
+EXAMPLE = Path(__file__).parents[2] / "examples" / "make_it_yours"
 
 DRIVER = '''
 """Another maker's arm: it is at once where it is sent."""
@@ -123,7 +122,7 @@ def makers(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
     """Installs the drivers above; joint 4 of their arm bends from -110 to 100 degrees, at half its speed."""
     folder = tmp_path / "site"
     folder.mkdir()
-    urdf = (EXAMPLE / "tomato_iiwa7" / "iiwa7.urdf").read_text()
+    urdf = (EXAMPLE / "tomato_extras" / "iiwa7.urdf").read_text()
     a4 = 'lower="-2.0943951" upper="2.0943951" effort="110" velocity="2.2689280"'
     assert urdf.count(a4) == 1
     urdf = urdf.replace(a4, 'lower="-1.9198622" upper="1.7453293" effort="110" velocity="1.1344640"')
@@ -142,20 +141,6 @@ def makers(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
     installed(folder, monkeypatch, "other_makers_arm", entries)
     yield folder
     sys.modules.pop("other_makers_arm", None)
-
-
-@pytest.fixture
-def example(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
-    """Installs the example with the entry points of its `pyproject.toml`."""
-    folder = tmp_path / "example"
-    folder.mkdir()
-    project = tomllib.loads((EXAMPLE / "pyproject.toml").read_text())["project"]
-    entries = project["entry-points"]["maniskill_tomato.drivers"]
-    lines = "\n".join(f"{name} = {what}" for name, what in entries.items())
-    installed(folder, monkeypatch, "tomato_iiwa7", lines)
-    monkeypatch.syspath_prepend(str(EXAMPLE))
-    yield
-    sys.modules.pop("tomato_iiwa7", None)
 
 
 def profile(driver: str, extra: str = "") -> Profile:
@@ -388,7 +373,7 @@ def test_deploy_check_judges_another_arm_by_its_own_limits(makers: Path) -> None
     assert not outside.good and "A4 must stay from -108.28 to 98.28 deg, got -109.43 deg" in outside.detail
 
 
-def test_models_are_found_by_name(makers: Path, example: None) -> None:
+def test_models_are_found_by_name(makers: Path, extras: Path) -> None:
     assert driver_names("model") == ("iiwa14", "iiwa7", "narrow", "stray")
     assert arm_model("iiwa14") is IIWA14 and arm_model("iiwa7").name == "iiwa7"
     with pytest.raises(
@@ -400,7 +385,7 @@ def test_models_are_found_by_name(makers: Path, example: None) -> None:
 
 
 def test_the_twin_moves_another_arm_in_mujoco_from_a_profile_to_its_replay(
-    example: None, tmp_path: Path
+    extras: Path, tmp_path: Path
 ) -> None:
     file = EXAMPLE / "iiwa7_twin.toml"
     short = parse_profile(file.read_text() + "\n[loop]\nmax_moves = 3\n", file)

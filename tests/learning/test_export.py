@@ -406,6 +406,7 @@ print(json.dumps([actions.tolist(), sorted(loaded)]))
     assert (np.abs(np.array(actions) - exact_torch(source, observation)) <= tolerance).all()
     assert loaded == [
         "maniskill_tomato.errors",
+        "maniskill_tomato.extension_points",
         "maniskill_tomato.plants",
         "maniskill_tomato.plants.organs",
         "maniskill_tomato.policies",
@@ -415,7 +416,9 @@ print(json.dumps([actions.tolist(), sorted(loaded)]))
         "maniskill_tomato.sensing",
         "maniskill_tomato.sensing.image_layout",
         "maniskill_tomato.sensing.perception_kinds",
+        "maniskill_tomato.task_registry",
         "maniskill_tomato.tasks",
+        "maniskill_tomato.tasks.registration",
         "maniskill_tomato.text_files",
     ]
 

@@ -28,7 +28,7 @@ from maniskill_tomato.robot.transit import TransitPlanner
 
 mj: Any = mujoco
 
-OTHER_URDF = Path(__file__).parents[2] / "examples" / "other_arm" / "tomato_iiwa7" / "iiwa7.urdf"
+OTHER_URDF = Path(__file__).parents[2] / "examples" / "make_it_yours" / "tomato_extras" / "iiwa7.urdf"
 LENGTHS = (0.34, 0.4, 0.4, 0.126)
 """Of the iiwa 7 by its data sheet, in [m]."""
 

@@ -235,6 +235,20 @@ def test_pictures_without_vulkan_are_refused_with_the_command_that_installs_it()
     assert "refused" in result.stdout
 
 
+@pytest.mark.parametrize(
+    ("wrong", "near"),
+    [
+        ({"percption": "occlusion_model"}, "perception"),
+        ({"obs_mod": "state"}, "obs_mode"),
+        ({"moton": "x"}, "motion"),
+    ],
+)
+def test_a_mistyped_option_of_the_shell_names_the_nearest(wrong: dict[str, Any], near: str) -> None:
+    (name,) = wrong
+    with pytest.raises(InvalidInputError, match=f"has no option '{name}'; did you mean '{near}'"):
+        gym.make("TomatoViewpoint-v1", **wrong)
+
+
 @pytest.mark.skipif(torch.cuda.is_available(), reason="needs a machine without CUDA")
 @pytest.mark.parametrize(
     ("backend", "what"), [("gpu", "'cuda', which needs an NVIDIA GPU"), ("typo", "'typo'")]

@@ -93,6 +93,8 @@ PUBLIC: Final[dict[str, tuple[str, ...]]] = {
         "world",
         "world_state",
         "vector_env",
+        "registration",
+        "own_rules",
         "thesis.thesis_config",
         "thesis.thesis_rewards",
         "row.row_config",

@@ -11,12 +11,11 @@ HOME: Final = "index"
 
 NAVIGATION: Final[dict[str, tuple[str, ...]]] = {
     "Begin": ("start", "how_it_works"),
-    "Tutorials": ("tutorials/train", "tutorials/judge", "tutorials/your_own", "tutorials/robot"),
+    "Tutorials": ("tutorials/train", "tutorials/judge", "make_it_yours", "tutorials/robot"),
     "How to": (
         "viewer",
         "hardware",
         "examples",
-        "extending",
         "thesis",
         "export",
         "lerobot",

@@ -1,1 +1,2 @@
-"""What another package can add to maniskill-tomato: a policy, a segmenter and a generator of plants."""
+"""What another package can add to maniskill-tomato: a task with its reward, a policy, a segmenter, plants, an arm and a
+camera."""

@@ -12,6 +12,7 @@ from torch import Tensor
 
 from maniskill_tomato.errors import InvalidInputError
 from maniskill_tomato.learning.imitation.trajectory_arrays import opened_trajectories, stored_array
+from maniskill_tomato.task_registry import is_same_task
 from maniskill_tomato.text_files import read_json
 
 LARGEST_OBSERVATIONS: Final = 1_000_000_000
@@ -75,7 +76,7 @@ def _check_task(path: Path, env_id: str) -> None:
     content = read_json(description)
     about = content.get("env_info") if isinstance(content, dict) else None
     recorded = about.get("env_id") if isinstance(about, dict) else None
-    if recorded != env_id:
+    if not is_same_task(str(recorded), env_id):
         raise InvalidInputError(
             f"{path} holds demonstrations of {recorded}, not of {env_id}; record some with "
             f"`maniskill-tomato demonstrations {env_id}`"

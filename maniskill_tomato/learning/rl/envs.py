@@ -12,7 +12,8 @@ from torch import Tensor
 from maniskill_tomato.errors import InvalidInputError
 from maniskill_tomato.learning.rl.env_state import set_shell_state, shell_state
 from maniskill_tomato.sensing.perception_kinds import RENDERED
-from maniskill_tomato.tasks.making import MAX_STEPS, check_env_id, option_names
+from maniskill_tomato.task_registry import find_task
+from maniskill_tomato.tasks.making import option_names
 from maniskill_tomato.tasks.observed_world import LearnerEyes
 from maniskill_tomato.tasks.vector_env import VectorEnv, make_vector_env
 
@@ -72,7 +73,7 @@ def make_env(
     Raises:
         InvalidInputError: The id or an option is not allowed, or the simulator cannot run that many.
     """
-    check_env_id(env_id)
+    find_task(env_id)
     colours = colours or (eyes is not None and eyes.images.needs_colours)
     mode = AutoresetMode.DISABLED
     if not colours and not needs_simulator(env_id, options):
@@ -92,13 +93,13 @@ def make_simulated_env(env_id: str, num_envs: int = 1, **options: Any) -> gym.En
         InvalidInputError: The id is unknown, or more environments are asked for than this machine can
             simulate at once.
     """
-    check_env_id(env_id)
+    find_task(env_id)
     if num_envs > 1 and not torch.cuda.is_available():
         raise InvalidInputError(
             f"num_envs must be 1 without a CUDA device, where ManiSkill simulates on the CPU; got {num_envs}"
         )
     options = {"obs_mode": "state", "render_backend": "none", "num_envs": num_envs, **options}
-    return gym.make(env_id, **options)
+    return gym.make(find_task(env_id).env_id, **options)
 
 
 def make_learner_env(
@@ -112,7 +113,7 @@ def make_learner_env(
         eyes: The images that are observed; colours make it ManiSkill's shell, which renders them.
         options: Of the task or the shell.
     """
-    check_env_id(env_id)
+    find_task(env_id)
     colours = eyes is not None and eyes.images.needs_colours
     if not colours and not needs_simulator(env_id, options):
         return _make_world_env(env_id, num_envs, eyes, AutoresetMode.SAME_STEP, options)
@@ -160,7 +161,7 @@ class SimulatedVectorEnv(VectorEnv):
         env_id = self.base_env.env_id
         super().__init__(
             self.base_env.world,
-            MAX_STEPS[env_id],
+            find_task(env_id).max_episode_steps,
             autoreset_mode=autoreset_mode,
             arrays="torch",
             env_id=env_id,

@@ -41,8 +41,8 @@ from maniskill_tomato.policies.onnx_policy import OnnxPolicy, description_path
 from maniskill_tomato.policies.trained_actor import load_actor, load_checkpoint, sight_of
 from maniskill_tomato.sensing.image_layout import Sight
 from maniskill_tomato.sensing.image_observation import STATE
-from maniskill_tomato.tasks import THESIS_IDS
-from maniskill_tomato.tasks.thesis.thesis_config import thesis_task
+from maniskill_tomato.task_registry import THESIS_IDS, base_of
+from maniskill_tomato.tasks.making import make_options
 
 OPSET = 17
 """Version of the operators; an old one on purpose, so that old runtimes read the file too."""
@@ -273,7 +273,7 @@ def _add_encoder(graph: "_Graph", encoder: ImageEncoder, sight: Sight) -> str:
 def describe_policy(actor: DenseActor, model: bytes) -> PolicyDescription:
     """The description of a policy and its ONNX file."""
     scene = (actor.env_options or {}).get("scene", "hidden")
-    task = thesis_task(actor.env_id, scene) if actor.env_id in THESIS_IDS else None
+    task = make_options(actor.env_id, scene=scene).task if base_of(actor.env_id) in THESIS_IDS else None
     config = json.dumps(actor.config, sort_keys=True)
     layout = layout_of(actor.env_id, actor.sight)
     for what, given, wanted in (

@@ -20,7 +20,7 @@ from maniskill_tomato.learning.rl.rewards import potential_reward
 from maniskill_tomato.sensing.image_layout import ImageLayout
 from maniskill_tomato.sensing.image_observation import STATE
 from maniskill_tomato.sensing.perception_kinds import STATE_MODE
-from maniskill_tomato.tasks.making import check_env_id
+from maniskill_tomato.task_registry import find_task
 from maniskill_tomato.tasks.observed_world import LearnerEyes
 
 Array = NDArray[np.float32]
@@ -219,7 +219,7 @@ def make_gymnasium_env(
     Raises:
         InvalidInputError: The id or an option is not allowed.
     """
-    check_env_id(env_id)
+    find_task(env_id)
     preset = get_preset(default_preset(env_id))
     images = ImageLayout.parse(obs_mode, image_size)
     env = make_env(env_id, eyes=None if images is None else LearnerEyes(images=images), **options)

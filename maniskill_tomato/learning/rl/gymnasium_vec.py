@@ -12,7 +12,7 @@ from maniskill_tomato.errors import InvalidInputError
 from maniskill_tomato.learning.rl.gymnasium_env import check_learnable, normalize_observation
 from maniskill_tomato.learning.rl.presets import default_preset, get_preset
 from maniskill_tomato.learning.rl.rewards import potential_reward
-from maniskill_tomato.tasks.making import check_env_id
+from maniskill_tomato.task_registry import find_task
 from maniskill_tomato.tasks.vector_env import VectorEnv, make_vector_env
 
 _TD3 = get_preset("td3")
@@ -126,7 +126,7 @@ def make_gymnasium_vec(
     Raises:
         InvalidInputError: The id or an option is not allowed.
     """
-    check_env_id(env_id)
+    find_task(env_id)
     preset = get_preset(default_preset(env_id))
     return LearnableVector(
         make_vector_env(env_id, num_envs, **options),

@@ -27,7 +27,7 @@ from maniskill_tomato.learning.rl.ppo_config import PpoConfig
 from maniskill_tomato.learning.rl.presets import OBSERVATION_CENTRE, OBSERVATION_HALF_RANGE
 from maniskill_tomato.learning.rl.run_folder import check_run_dir
 from maniskill_tomato.policies.actor import ObservationNormalizer
-from maniskill_tomato.tasks import GENERAL_IDS
+from maniskill_tomato.task_registry import GENERAL_IDS, base_of
 
 try:
     from stable_baselines3 import PPO
@@ -179,7 +179,7 @@ def dense_actor(
 ) -> DenseActor:
     """The parts of a policy for its export; `run` is the content of config.json."""
     layers = [layer for layer in policy.mlp_extractor.policy_net if isinstance(layer, nn.Linear)]
-    general = run["env_id"] in GENERAL_IDS
+    general = base_of(run["env_id"]) in GENERAL_IDS
     actions = len(run["config"]["action_scale"])
     return DenseActor(
         act=acting.act,

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from typing import Any, Literal
 
 from maniskill_tomato.learning.rl.presets import get_preset
-from maniskill_tomato.tasks import GENERAL_IDS
+from maniskill_tomato.task_registry import GENERAL_IDS, base_of
 
 TD3 = get_preset("td3")
 
@@ -64,4 +64,4 @@ GENERAL = PpoConfig(
 
 def default_ppo(env_id: str | None) -> PpoConfig:
     """The configuration for a task."""
-    return GENERAL if env_id in GENERAL_IDS else PpoConfig()
+    return GENERAL if base_of(env_id) in GENERAL_IDS else PpoConfig()

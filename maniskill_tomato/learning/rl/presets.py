@@ -9,7 +9,7 @@ from maniskill_tomato.learning.rl.train_config import MAY_CHANGE as MAY_CHANGE
 from maniskill_tomato.learning.rl.train_config import TrainConfig as TrainConfig
 from maniskill_tomato.learning.rl.train_config import modernise as modernise
 from maniskill_tomato.sensing.perception_kinds import STATE_MODE
-from maniskill_tomato.tasks import GENERAL_IDS, THESIS_IDS
+from maniskill_tomato.task_registry import GENERAL_IDS, THESIS_IDS, base_of
 
 OBSERVATION_CENTRE = (0.2, 0.0, 0.8, 0.0, math.pi / 2, 0.0, 0.7, 0.0, 0.8)
 """What normalisation maps to 0: the middle of the arm's working range in front of the plant, looking along x.
@@ -182,7 +182,7 @@ learning rates, tau, gamma and batch size of Lillicrap et al. (2016). Those call
 
 def preset_options(preset: PresetName, env_id: str) -> dict[str, Any]:
     """The options of a task that a preset is for: the thesis's settings belong to the thesis's scene."""
-    thesis = preset in ("thesis-guided", "thesis-sparse") and env_id in THESIS_IDS
+    thesis = preset in ("thesis-guided", "thesis-sparse") and base_of(env_id) in THESIS_IDS
     return {"scene": "thesis"} if thesis else {}
 
 
@@ -193,9 +193,10 @@ def default_preset(env_id: str | None, obs_mode: str | None = None) -> PresetNam
         env_id: The task.
         obs_mode: What is asked to be observed, if anything.
     """
+    general = base_of(env_id) in GENERAL_IDS
     if obs_mode is not None and obs_mode != STATE_MODE:
-        return "general-pixel-td3" if env_id in GENERAL_IDS else "pixel-td3"
-    return "general-td3" if env_id in GENERAL_IDS else "td3"
+        return "general-pixel-td3" if general else "pixel-td3"
+    return "general-td3" if general else "td3"
 
 
 def get_preset(name: str) -> TrainConfig:

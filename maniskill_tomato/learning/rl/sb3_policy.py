@@ -10,7 +10,7 @@ from torch import Tensor
 from maniskill_tomato.learning.rl.gymnasium_env import normalize_observation
 from maniskill_tomato.learning.rl.presets import default_preset, get_preset
 from maniskill_tomato.policies.adapters import ObservationPolicy
-from maniskill_tomato.tasks.making import check_env_id
+from maniskill_tomato.task_registry import find_task
 
 
 class Predictor(Protocol):
@@ -44,6 +44,6 @@ def sb3_policy(
     Raises:
         InvalidInputError: There is no such task.
     """
-    check_env_id(env_id)
+    find_task(env_id)
     scale = get_preset(default_preset(env_id)).action_scale if action_scale is None else action_scale
     return ObservationPolicy(_PredictedActions(model, scale), name=type(model).__name__.lower())

@@ -40,7 +40,7 @@ from maniskill_tomato.learning.rl.training_state import TrainingState, seed_glob
 from maniskill_tomato.learning.rl.wandb_log import import_wandb
 from maniskill_tomato.policies.trained_actor import TrainedActor, load_actor
 from maniskill_tomato.sensing.image_observation import STATE, state_of
-from maniskill_tomato.tasks.making import check_env_id
+from maniskill_tomato.task_registry import find_task
 from maniskill_tomato.tasks.numpy_streams import spread_seed
 
 logger = logging.getLogger(__name__)
@@ -412,7 +412,7 @@ def train(
         CheckpointError: The run cannot be saved or continued.
         TrainingDivergedError: Something is not finite any more.
     """
-    check_env_id(env_id)
+    find_task(env_id)
     if overwrite:
         clear_run(run_dir)
     if not resume:

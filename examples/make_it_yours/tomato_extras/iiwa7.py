@@ -2,8 +2,8 @@
 
 The package registers the model by an entry point (`pyproject.toml`), so that the twin can move it in MuJoCo:
 
-    pip install ./examples/other_arm
-    maniskill-tomato deploy run --profile examples/other_arm/iiwa7_twin.toml --seed 3 --out runs/iiwa7
+    pip install ./examples/make_it_yours
+    maniskill-tomato deploy run --profile examples/make_it_yours/iiwa7_twin.toml --seed 3 --out runs/iiwa7
 
 A driver for the real arm is a subclass of `maniskill_tomato.deploy.interface.Arm` with `model = MODEL`.
 """
