@@ -3,28 +3,20 @@
 # pyright: reportCallIssue=false, reportGeneralTypeIssues=false, reportIndexIssue=false
 # pyright: reportInvalidTypeForm=false, reportOperatorIssue=false, reportOptionalSubscript=false, reportReturnType=false
 # Warp's stubs describe calls from outside, not what stands inside a kernel.
-"""Measures the libraries that can trace rays on a CPU beside each other, and whole steps with them, all in one run.
-
-Usage:
-    python scripts/benchmark_rays.py --out rays.json
+"""Libraries that trace rays on a CPU, and whole steps with Embree and with Warp.
 
 Rates are per second of processor time of this process, and medians of measurements taken in turns.
 """
 
 import importlib
-import json
 import statistics
-import sys
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
-from pathlib import Path
 from typing import Any, Final
 from unittest import mock
 
 import numpy as np
 import torch
-import tyro
 import warp as wp
 from numpy.typing import NDArray
 
@@ -35,9 +27,7 @@ from maniskill_tomato.raycast.embree import Backend, load_embree
 from maniskill_tomato.raycast.mesh_rays import Tracer, any_hit, closest_hit
 from maniskill_tomato.raycast.meshes import build_mesh
 from maniskill_tomato.raycast.warp_scene import WarpScene
-from maniskill_tomato.run_facts import run_facts
 from maniskill_tomato.tasks.vector_env import VectorEnv, make_vector_env
-from maniskill_tomato.warp_runtime import start_warp
 
 Floats = NDArray[np.float32]
 Query = Callable[[Floats, Floats], NDArray[Any]]
@@ -52,18 +42,6 @@ FARTHEST: Final = 1.5
 """Length of the rays, in [m]."""
 TASKS: Final = ("TomatoViewpointGuided-v1", "TomatoViewpoint-v1")
 BACKENDS: Final[tuple[Backend, ...]] = ("warp", "embree")
-
-
-@dataclass(frozen=True, kw_only=True)
-class Args:
-    """What to measure and where to write it."""
-
-    out: Path = Path("rays.json")
-    """The JSON file."""
-    repeats: int = 5
-    """Each rate is the median of this number of measurements, taken in turns."""
-    envs: tuple[int, ...] = (1, 64, 256)
-    """Environments whose steps are measured."""
 
 
 @wp.kernel(enable_backward=False)
@@ -242,7 +220,7 @@ class RayClock:
 def made_with(backend: Backend, env_id: str, envs: int) -> VectorEnv:
     """Environments whose rays a library traces."""
     with mock.patch.object(scene, "choose_backend", lambda device, wanted: backend):
-        env = make_vector_env(env_id, envs, auto_reset=False)
+        env = make_vector_env(env_id, envs, autoreset_mode="Disabled", arrays="torch")
     env.reset(seed=0)
     return env
 
@@ -259,7 +237,7 @@ def compare_steps(counts: tuple[int, ...], repeats: int) -> list[dict[str, Any]]
             shares: dict[str, list[float]] = {backend: [] for backend in BACKENDS}
             for repeat in range(-1, repeats):
                 rng = np.random.default_rng(repeat + 1)
-                actions = rng.uniform(-0.05, 0.05, (steps, count, size)).astype(np.float32)
+                actions = torch.from_numpy(rng.uniform(-0.05, 0.05, (steps, count, size)).astype(np.float32))
                 for backend, env in envs.items():
                     clock.spent, start = 0.0, time.process_time()
                     for action in actions:
@@ -281,23 +259,3 @@ def compare_steps(counts: tuple[int, ...], repeats: int) -> list[dict[str, Any]]
                 }
             )
     return rows
-
-
-def main(args: Args) -> int:
-    """Runs every measurement and writes the file."""
-    torch.set_num_threads(1)
-    start_warp()
-    result = {
-        "facts": run_facts(),
-        "libraries": compare_libraries(args.repeats),
-        "steps": compare_steps(args.envs, args.repeats),
-    }
-    text = json.dumps(result, indent=2)
-    args.out.parent.mkdir(parents=True, exist_ok=True)
-    args.out.write_text(text + "\n")
-    sys.stdout.write(text + "\n")
-    return 0
-
-
-if __name__ == "__main__":
-    sys.exit(main(tyro.cli(Args)))
