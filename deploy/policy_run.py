@@ -29,6 +29,7 @@ from maniskill_tomato.deploy.workcell import Workcell, make_workcell
 from maniskill_tomato.errors import TomatoError
 from maniskill_tomato.files import write_atomically
 from maniskill_tomato.folder_lock import only_writer
+from maniskill_tomato.policies.adapters import check_control_mode
 from maniskill_tomato.policies.opening import open_policy
 from maniskill_tomato.policies.protocol import Policy
 from maniskill_tomato.report_design import INK, rgb
@@ -125,6 +126,7 @@ def prepare(config: RunConfig, clock: Clock | None = None) -> Prepared:
     profile = config.profile
     name = default_policy() if config.policy is None else config.policy
     policy = open_policy(name, env_id=TASK, seed=config.seed)
+    check_control_mode(policy, "pd_look_at")
     workcell = make_workcell(profile, config.seed, clock)
     mode: Mode = config.mode or ("unattended" if workcell.simulated else "dry_run")
     if mode != "dry_run":

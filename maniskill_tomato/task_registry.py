@@ -83,10 +83,12 @@ def find_task(name: str) -> Task:
 
     Args:
         name: The ID of a task of this package, of an installed one or of this process, or `package.module:attribute`.
+            An ID of this package may also have the form in which Gymnasium imports it, `maniskill_tomato:ID`.
 
     Raises:
         InvalidInputError: There is no such task, or it cannot be imported.
     """
+    name = _plain_id(name)
     if name in _registered:
         return _registered[name]
     if name in _of_path:
@@ -108,6 +110,12 @@ def find_task(name: str) -> Task:
     return task
 
 
+def _plain_id(name: str) -> str:
+    """An ID of this package without the package that Gymnasium imports; other names as they are."""
+    plain = name.removeprefix("maniskill_tomato:")
+    return plain if plain in TASK_IDS else name
+
+
 def check_task_name(name: str, what: str = "the task") -> None:
     """Accepts the name of a task, which is not imported.
 
@@ -118,7 +126,7 @@ def check_task_name(name: str, what: str = "the task") -> None:
     Raises:
         InvalidInputError: There is no such task.
     """
-    if name in _registered or is_import_path(name):
+    if _plain_id(name) in _registered or is_import_path(name):
         return
     known = task_ids()
     if name not in known:

@@ -26,7 +26,7 @@ from maniskill_tomato.sensing.belief import Belief
 from maniskill_tomato.sensing.camera_perception import CameraPerception
 from maniskill_tomato.sensing.image_layout import ImageLayout
 from maniskill_tomato.sensing.image_observation import cast_images
-from maniskill_tomato.tasks.arm_moves import ACTION_SIZES, ArmMoves, Plan
+from maniskill_tomato.tasks.arm_moves import ACTION_SIZES, CONTROL_MODES, ArmMoves, Plan
 from maniskill_tomato.tasks.ground_truth import WorldTruth
 from maniskill_tomato.tasks.numpy_streams import (
     random_state,
@@ -332,6 +332,11 @@ class World:
         return target
 
     # ------------------------------------------------------------------- step
+
+    @property
+    def control_mode(self) -> str:
+        """What an action is, in ManiSkill's words."""
+        return next(name for name, control in CONTROL_MODES.items() if control == self.moves.control)
 
     def check_action(self, action: Any) -> Tensor:
         """Actions as a tensor of shape (N, A), float32.

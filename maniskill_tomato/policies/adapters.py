@@ -7,6 +7,7 @@ import torch
 from torch import Tensor
 
 from maniskill_tomato.errors import PolicyError
+from maniskill_tomato.policies.layout import has_belief
 from maniskill_tomato.policies.pixel_policy import PixelFollower, PixelPolicy
 from maniskill_tomato.policies.protocol import Planner, Policy, StatePolicy, reseed
 from maniskill_tomato.sensing.belief import Belief
@@ -112,10 +113,11 @@ def as_state_policy(policy: Policy | StatePolicy, env: Any) -> StatePolicy:
         env: Its `unwrapped` has a `belief` after a reset if it says so by an attribute `keeps_belief`.
 
     Raises:
-        PolicyError: The policy needs a belief, which the environment has not.
+        PolicyError: The policy needs a belief, which the environment has not, or its actions mean something else there.
     """
     if not isinstance(policy, Policy):
         return policy
+    check_control_mode(policy, getattr(env.unwrapped, "control_mode", None))
     if getattr(env.unwrapped, "keeps_belief", False):
         return BeliefFollower(policy, env)
     if isinstance(policy, ObservationPolicy):
@@ -123,6 +125,28 @@ def as_state_policy(policy: Policy | StatePolicy, env: Any) -> StatePolicy:
     if isinstance(policy, PixelPolicy):
         return PixelFollower(policy, env)
     raise PolicyError(f"{policy.name} decides from beliefs, which this environment does not have")
+
+
+def check_control_mode(policy: Policy, control_mode: str | None) -> None:
+    """Refuses a policy that was trained on actions of another meaning.
+
+    Args:
+        policy: Any.
+        control_mode: What actions mean where it shall act; None accepts any.
+
+    Raises:
+        PolicyError: It was trained with another control mode.
+    """
+    facts: dict[str, Any] = describe(policy)
+    if control_mode is None or "trained_on" not in facts:
+        return
+    own = "pd_look_at" if has_belief(str(facts["trained_on"])) else "pd_viewpoint"
+    trained = (facts.get("trained_with") or {}).get("control_mode", own)
+    if trained != control_mode:
+        raise PolicyError(
+            f"{policy.name} was trained with control_mode={trained!r} and cannot act with {control_mode!r}; make the "
+            f"environment with control_mode={trained!r}, or train it again"
+        )
 
 
 def describe(policy: Policy) -> dict[str, Any]:

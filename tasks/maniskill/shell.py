@@ -8,6 +8,7 @@ from typing import Any, ClassVar, cast
 import numpy as np
 import sapien
 import torch
+from gymnasium.utils import seeding
 from mani_skill.envs.sapien_env import BaseEnv
 from mani_skill.sensors.camera import CameraConfig, parse_camera_configs, update_camera_configs_from_dict
 from mani_skill.utils import sapien_utils
@@ -221,7 +222,10 @@ class TomatoEnv(BaseEnv):  # type: ignore[misc]
     def reset(  # pyright: ignore[reportIncompatibleMethodOverride]
         self, seed: int | list[int] | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Any, dict[str, Any]]:
-        """ManiSkill's reset; `env_idx` among the options may also be a list."""
+        """ManiSkill's reset; `env_idx` among the options may also be a list, and the seed goes to `np_random` too."""
+        if seed is not None:
+            first = int(np.atleast_1d(np.asarray(seed))[0])
+            self._np_random, self._np_random_seed = seeding.np_random(first)
         if options is not None and "env_idx" in options:
             options = {**options, "env_idx": self.world.env_rows(options["env_idx"])}
         result: tuple[Any, dict[str, Any]] = super().reset(seed=seed, options=options)

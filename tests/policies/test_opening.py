@@ -25,6 +25,7 @@ from maniskill_tomato.policies.opening import find_policy, open_policy, shipped_
 from maniskill_tomato.policies.protocol import Policy
 from maniskill_tomato.policies.trained_actor import load_actor
 from maniskill_tomato.tasks import GENERAL_IDS, TASK_IDS, THESIS_IDS
+from maniskill_tomato.tasks.vector_env import make_vector_env
 
 GUIDED, GENERAL = THESIS_IDS[0], GENERAL_IDS[0]
 
@@ -206,6 +207,37 @@ def test_a_policy_begins_where_the_memory_holds_one_view() -> None:
         world.belief = belief(torch.zeros(3, 4), visits)
         np.testing.assert_array_equal(follower.act(torch.zeros(3, 1)), np.zeros((3, 3)))
     assert policy.begun == [[0, 1, 2], [1]]
+
+
+@pytest.mark.parametrize(
+    ("task", "options", "fits"),
+    [
+        (GENERAL, {}, "pd_look_at"),
+        (GENERAL, None, "pd_look_at"),
+        (GUIDED, {"scene": "thesis"}, "pd_viewpoint"),
+        (GENERAL, {"control_mode": "pd_ee_delta_pos"}, "pd_ee_delta_pos"),
+    ],
+)
+def test_a_policy_acts_only_where_its_actions_mean_what_it_learned(
+    task: str, options: dict[str, Any] | None, fits: str
+) -> None:
+    class Trained(Twice):
+        def describe(self) -> dict[str, Any]:
+            return {"kind": "TD3", "trained_on": task, "trained_with": options}
+
+    policy = as_policy(Trained())
+    for mode in ("pd_look_at", "pd_viewpoint", "pd_ee_delta_pos"):
+        env = SimpleNamespace(unwrapped=SimpleNamespace(control_mode=mode))
+        if mode == fits:
+            as_state_policy(policy, env)
+        else:
+            with pytest.raises(PolicyError, match=f"control_mode='{fits}' and cannot act with '{mode}'"):
+                as_state_policy(policy, env)
+
+
+def test_worlds_and_their_vectors_tell_what_an_action_is() -> None:
+    for env_id, mode in ((GUIDED, "pd_viewpoint"), (GENERAL, "pd_look_at")):
+        assert make_vector_env(env_id).control_mode == mode
 
 
 def test_a_policy_that_needs_a_belief_says_so_where_there_is_none() -> None:

@@ -80,7 +80,7 @@ def test_demonstrations_can_be_replayed(tmp_path: Path) -> None:
     result = record_demonstrations(made, planner, range(4), tmp_path)
     assert result.tried == 4 and result.recorded >= 2
     description = json.loads(result.path.with_suffix(".json").read_text())
-    assert description["env_info"]["env_id"] == "TomatoViewpoint-v1"
+    assert description["env_info"]["env_id"] == "maniskill_tomato:TomatoViewpoint-v1"
     assert len(description["episodes"]) == result.recorded
     again: Any = make_simulated_env("TomatoViewpoint-v1", plant=PLANTS)
     with h5py.File(result.path) as file:

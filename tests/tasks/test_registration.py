@@ -10,6 +10,8 @@ import pytest
 from gymnasium.envs.registration import EnvSpec, load_env_creator
 
 import maniskill_tomato
+from maniskill_tomato.errors import InvalidInputError
+from maniskill_tomato.task_registry import find_task, is_same_task
 from maniskill_tomato.tasks import MAX_EPISODE_STEPS, TASK_IDS
 
 EXPECTED_IDS = (
@@ -88,7 +90,7 @@ def test_make_works_from_the_module_form_in_a_fresh_process(tmp_path: Path) -> N
     code = (
         "import sys, gymnasium as gym\n"
         "for env_id in sys.argv[1:]:\n"
-        "    env = gym.make('maniskill_tomato.tasks:' + env_id, obs_mode='state', render_backend='none')\n"
+        "    env = gym.make('maniskill_tomato:' + env_id, obs_mode='state', render_backend='none')\n"
         "    observation, info = env.reset(seed=3)\n"
         "    size = 9 if 'Guided' in env_id or 'Sparse' in env_id else 786\n"
         "    assert tuple(observation.shape) == (1, size), observation.shape\n"
@@ -103,3 +105,11 @@ def test_make_works_from_the_module_form_in_a_fresh_process(tmp_path: Path) -> N
 def test_an_unknown_version_is_refused_with_the_one_that_exists() -> None:
     with pytest.raises(gym.error.Error, match="TomatoViewpointGuided"):
         gym.spec("TomatoViewpointGuided-v9")
+
+
+@pytest.mark.parametrize("env_id", EXPECTED_IDS)
+def test_an_id_may_be_given_as_gymnasium_imports_it(env_id: str) -> None:
+    assert find_task(f"maniskill_tomato:{env_id}") is find_task(env_id)
+    assert is_same_task(f"maniskill_tomato:{env_id}", env_id)
+    with pytest.raises(InvalidInputError, match="TomatoViewpoint"):
+        find_task(f"other_package:{env_id}")

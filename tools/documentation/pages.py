@@ -16,6 +16,7 @@ NAVIGATION: Final[dict[str, tuple[str, ...]]] = {
         "viewer",
         "hardware",
         "examples",
+        "maniskill",
         "thesis",
         "export",
         "lerobot",

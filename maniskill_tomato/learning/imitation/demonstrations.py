@@ -1,23 +1,28 @@
 """Demonstrations: a policy's successful episodes in ManiSkill's trajectory format.
 
 `FOLDER/trajectory.h5` and `.json`, as `mani_skill.utils.wrappers.record.RecordEpisode` writes them: observations,
-actions, rewards and states of every episode, and how to reset the environment to its start.
+actions, rewards and states of every episode, and how to reset the environment to its start. ManiSkill's
+`replay_trajectory` makes other observations of them, images too; `replay_of` says how it makes the task.
 """
 
-from collections.abc import Callable, Iterable
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
 import torch
+from gymnasium.envs.registration import EnvSpec
 
 from maniskill_tomato.errors import InvalidInputError
 from maniskill_tomato.folder_lock import only_writer
 from maniskill_tomato.policies.adapters import as_state_policy
 from maniskill_tomato.policies.protocol import Policy, reseed
+from maniskill_tomato.tasks import TASK_IDS
 
 NAME = "trajectory"
+PACKAGE = "maniskill_tomato"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -69,16 +74,17 @@ def _record(
     path = folder / f"{NAME}.h5"
     if path.exists():
         raise InvalidInputError(f"{path} exists; choose another folder, or delete it")
-    task: Any = env
-    recorder = RecordEpisode(
-        task,
-        output_dir=str(folder),
-        save_video=False,
-        save_on_reset=False,
-        trajectory_name=NAME,
-        source_type="motionplanning",
-        source_desc=f"moves of the policy {policy.name!r} of maniskill-tomato",
-    )
+    with _described_for_replays(env):
+        task: Any = env
+        recorder = RecordEpisode(
+            task,
+            output_dir=str(folder),
+            save_video=False,
+            save_on_reset=False,
+            trajectory_name=NAME,
+            source_type="motionplanning",
+            source_desc=f"moves of the policy {policy.name!r} of maniskill-tomato",
+        )
     acting = as_state_policy(policy, env)
     recorded = tried = moves = 0
     for episode in episodes:
@@ -97,3 +103,25 @@ def _record(
         moves += steps if success else 0
     recorder.close()
     return Demonstrations(path=path, recorded=recorded, tried=tried, moves=moves)
+
+
+def replay_of(spec: EnvSpec) -> EnvSpec:
+    """How a program that knows Gymnasium and ManiSkill only makes a task of this package again.
+
+    The id names the package, which Gymnasium then imports, and nothing says whether pictures are drawn: the tasks draw
+    where the observation mode asks for it.
+    """
+    kwargs = {name: value for name, value in spec.kwargs.items() if name != "render_backend"}
+    return replace(spec, id=f"{PACKAGE}:{spec.id}" if spec.id in TASK_IDS else spec.id, kwargs=kwargs)
+
+
+@contextmanager
+def _described_for_replays(env: gym.Env[Any, Any]) -> Iterator[None]:
+    """Within it, whoever asks the environment what it is gets `replay_of` that."""
+    inner = env.unwrapped
+    spec = inner.spec
+    inner.spec = None if spec is None else replay_of(spec)
+    try:
+        yield
+    finally:
+        inner.spec = spec
