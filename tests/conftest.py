@@ -36,6 +36,9 @@ STORED_OPTIONS: dict[str, Any] = {"episodes": "held_out"}
 NO_BROWSER = "no Chromium on PATH; `make browser` installs one"
 
 ALLOWED_SKIPS = {
+    "tests/test_examples.py::test_ap_gym_takes_a_prediction_of_what_is_visible_with_every_move": (
+        "ap_gym is not installed"  # With what it needs it takes 400 MB.
+    ),
     "tests/learning/test_learning_wandb.py::test_the_real_package_logs_without_a_network": (
         "wandb is not installed; it is an extra"
     ),

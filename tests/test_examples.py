@@ -11,6 +11,7 @@ from typing import Any, Literal
 import gymnasium as gym
 import numpy as np
 import pytest
+from gymnasium.utils.env_checker import check_env
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
 
 from maniskill_tomato.errors import InvalidInputError
@@ -287,3 +288,28 @@ def test_an_example_trains_and_prints_its_success(arguments: tuple[str, ...]) ->
     assert done.returncode == 0, done.stderr
     assert " of 2 episodes, " in done.stdout
     assert "success" in done.stdout.splitlines()[-1]
+
+
+def test_ap_gym_takes_a_prediction_of_what_is_visible_with_every_move() -> None:
+    pytest.importorskip("ap_gym", reason="ap_gym is not installed")
+    env = load_example("ap_gym_env").VisibleFraction(image_size=(36, 28))
+    plain = make_gymnasium_env("TomatoViewpoint-v1", obs_mode="depth+segmentation", image_size=(36, 28))
+    check_env(env, skip_render_check=True, skip_close_check=True)
+    seen, info = env.reset(seed=3)
+    expected, told = plain.reset(seed=3)
+    for guess in (0.0, 0.5, 1.0):
+        assert {name: part.tolist() for name, part in seen.items()} == {
+            n: p.tolist() for n, p in expected.items()
+        }
+        visible = told["visible_fraction"]
+        step = np.full(3, 0.3 - 0.6 * guess, np.float32)
+        seen, reward, terminated, truncated, info = env.step(
+            {"action": step, "prediction": np.full(1, guess, np.float32)}
+        )
+        expected, earned, *ended, told = plain.step(step)
+        # Its loss is the squared error by the variance of a uniform target.
+        assert reward == pytest.approx(earned - 12.0 * (guess - visible) ** 2, abs=1e-5)
+        assert info["prediction"]["target"][0] == pytest.approx(visible)
+        assert [terminated, truncated] == ended
+    env.close()
+    plain.close()
