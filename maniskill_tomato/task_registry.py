@@ -4,7 +4,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Any, Final
 
-from maniskill_tomato.errors import InvalidInputError, did_you_mean
+from maniskill_tomato.errors import InvalidInputError
 from maniskill_tomato.extension_points import ExtensionPoint, is_import_path
 
 MAX_EPISODE_STEPS: Final = 30
@@ -62,6 +62,8 @@ TASKS: Final = ExtensionPoint(
     },
 )
 """What another package adds is what `tasks.register_task` returned, or a callable that returns it."""
+
+ELSEWHERE: Final = "A task of another package is known where that package is installed."
 
 _registered: dict[str, Task] = {task.env_id: task for task in (GUIDED, SPARSE, GENERAL, ROW)}
 _of_path: dict[str, Task] = {}
@@ -131,8 +133,8 @@ def check_task_name(name: str, what: str = "the task") -> None:
     known = task_ids()
     if name not in known:
         error = InvalidInputError.choice(what, name, (*known, "package.module:attribute"))
-        missing = "" if did_you_mean(name, known) else "; is the package that has it installed here?"
-        raise InvalidInputError(f"{error}{missing}")
+        stop = " " if str(error).endswith("?") else ". "
+        raise InvalidInputError(f"{error}{stop}{ELSEWHERE}")
 
 
 def task_ids() -> tuple[str, ...]:

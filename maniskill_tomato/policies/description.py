@@ -8,9 +8,8 @@ from typing import Any, Final
 import maniskill_tomato
 from maniskill_tomato.errors import PolicyError
 from maniskill_tomato.plants.organs import Role
-from maniskill_tomato.policies.layout import layout_of
+from maniskill_tomato.policies.layout import layout_of, unknown_task
 from maniskill_tomato.sensing.image_layout import ImageLayout, Sight
-from maniskill_tomato.task_registry import base_of
 from maniskill_tomato.text_files import parse_json
 
 FORMAT = 2
@@ -181,7 +180,7 @@ class PolicyDescription:
                 raise PolicyError(
                     f"its {what} is {shortened(given)}; this version's is {shortened(wanted)}: "
                     "export the policy with this version"
-                    + ("" if base_of(self.env_id) else f", or install the package of the task {self.env_id}")
+                    f"{unknown_task(self.env_id)}"
                 )
         if not len(self.normalizer_centre) == len(self.normalizer_half_range) == len(self.observation):
             raise PolicyError(f"its normaliser must have {len(self.observation)} centres and half ranges")

@@ -80,6 +80,13 @@ def has_belief(env_id: str) -> bool:
     return base_of(env_id) in GENERAL_IDS
 
 
+def unknown_task(env_id: str) -> str:
+    """The end of a message about a layout that does not fit, where that may be for want of the task's package."""
+    if base_of(env_id) is not None:
+        return ""
+    return f"; the task {env_id} is not known here: is the package that has it installed?"
+
+
 def layout_of(env_id: str, sight: "Sight | None" = None) -> PolicyLayout:
     """What the policies of a task observe and do; the thesis's for tasks that this package does not know.
 

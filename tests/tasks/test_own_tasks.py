@@ -15,13 +15,15 @@ import torch
 
 from maniskill_tomato import task_registry
 from maniskill_tomato.cli import main
-from maniskill_tomato.errors import CheckpointError, InvalidInputError
+from maniskill_tomato.errors import CheckpointError, InvalidInputError, PolicyError
 from maniskill_tomato.experiments.configs import EvaluationConfig
 from maniskill_tomato.experiments.evaluation import evaluate
+from maniskill_tomato.learning.rl.export import export_policy
 from maniskill_tomato.learning.rl.presets import PRESETS, default_preset
 from maniskill_tomato.learning.rl.train_config import TrainConfig
 from maniskill_tomato.learning.rl.trainer import train
 from maniskill_tomato.policies.layout import has_belief
+from maniskill_tomato.policies.onnx_policy import OnnxPolicy
 from maniskill_tomato.policies.trained_actor import load_actor
 from maniskill_tomato.task_registry import find_task
 from maniskill_tomato.tasks import register_task
@@ -163,6 +165,27 @@ def test_a_policy_keeps_the_id_that_it_was_trained_on(trained: Path, tmp_path: P
         assert result.metrics["episodes"] == 2 and result.metrics["env_id"] == name
 
 
+def test_a_policy_whose_task_is_missing_says_so(
+    trained: Path,
+    extras: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    export_policy(trained, tmp_path / "export")
+    monkeypatch.setattr(sys, "path", [path for path in sys.path if path != str(extras)])
+    monkeypatch.delitem(task_registry._registered, BELOW)
+    missing = f"the task {BELOW} is not known here: is the package that has it installed"
+    with pytest.raises(PolicyError, match=missing):
+        export_policy(trained, tmp_path / "again")
+    with pytest.raises(PolicyError, match=missing):
+        OnnxPolicy.load(tmp_path / "export" / "policy.onnx")
+    for command in (["eval", BELOW, "--policy", str(trained)], ["train", "--resume", str(trained.parent)]):
+        with pytest.raises(SystemExit):
+            main(command)
+        assert task_registry.ELSEWHERE in capsys.readouterr().err
+
+
 def test_the_benchmark_draws_the_episodes_of_another_task(trained: Path, tmp_path: Path) -> None:
     out = tmp_path / "benchmark"
     command = ["benchmark", "--env-id", BELOW, "--policies", f"spiral,own={trained}", "--episodes", "2"]
@@ -206,7 +229,7 @@ def test_a_task_of_a_package_that_is_not_here_is_refused_with_what_to_do(
 ) -> None:
     with pytest.raises(SystemExit):
         main(["eval", "SomebodyElses-v3"])
-    assert "is the package that has it installed here?" in capsys.readouterr().err
+    assert task_registry.ELSEWHERE in capsys.readouterr().err
     with pytest.raises(SystemExit):
         main(["train", "TomatoViewpontGuided-v1"])
     assert "did you mean 'TomatoViewpointGuided-v1'?" in capsys.readouterr().err

@@ -73,7 +73,7 @@ class FolderCamera(Camera):
             raise ProtocolError(f"{path} or its depth is no picture")
         self._number += 1
         return Frame(
-            color=np.ascontiguousarray(color[..., ::-1]),
+            color=color[..., ::-1].astype(np.uint8),
             depth=(depth / 1000.0).astype(np.float32),
             intrinsics=intrinsics,
             stamp=self._clock.now(),

@@ -36,7 +36,7 @@ from maniskill_tomato.policies.description import (
     shortened,
 )
 from maniskill_tomato.policies.image_encoder import DEPTH_SCALE_MM, FARTHEST, ImageEncoder
-from maniskill_tomato.policies.layout import layout_of
+from maniskill_tomato.policies.layout import layout_of, unknown_task
 from maniskill_tomato.policies.onnx_policy import OnnxPolicy, description_path
 from maniskill_tomato.policies.trained_actor import load_actor, load_checkpoint, sight_of
 from maniskill_tomato.sensing.image_layout import Sight
@@ -448,7 +448,7 @@ def _check_layout(path: Path) -> None:
         if list(data[what]["names"]) != list(names):
             raise PolicyError(
                 f"{path} cannot be exported: its {what} is {shortened(list(data[what]['names']))}; this version's is "
-                f"{shortened(list(names))}"
+                f"{shortened(list(names))}{unknown_task(data['env_id'])}"
             )
 
 
