@@ -160,6 +160,7 @@ LONG_FILES = (
     "test_row_env.py",
     "test_tasks_options.py",
     "test_tasks_rendered.py",
+    "test_maniskill_contract.py",
     "test_view_quality.py",
     "test_learning_training.py",
     "test_deploy_sunrise_loop.py",
