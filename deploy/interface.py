@@ -308,6 +308,11 @@ class Camera(Device):
             NotConnectedError: It is not connected.
         """
 
+    @property
+    def announced_size(self) -> tuple[int, int] | None:
+        """Width and height that frames will have, in [px], before it is connected; None if it cannot tell."""
+        return None
+
     @abstractmethod
     def read(self, max_age_s: float = 0.5, after: float | None = None) -> Frame:
         """A frame, waiting for a new one if need be.

@@ -48,6 +48,17 @@ ALLOWED_SKIPS = {
     "tests/deploy/test_recording_viewers.py::test_rerun_reads_the_recording_as_arm_pictures_and_points": (
         "no rerun on PATH"  # With what it needs it takes 800 MB.
     ),
+    **{
+        f"tests/integrations/test_lerobot.py::{name}": (
+            "MANISKILL_TOMATO_LEROBOT_PYTHON names no environment with LeRobot"  # It takes 6 GB.
+        )
+        for name in (
+            "test_lerobot_loads_runs_as_they_were_recorded",
+            "test_lerobot_loads_demonstrations_with_images",
+            "test_lerobot_drives_the_guarded_arm_and_is_refused_what_is_unsafe",
+            "test_lerobots_evaluation_counts_successes_as_a_plain_loop_does",
+        )
+    },
 }
 """What may be skipped with CI=true, and the reason that it gives."""
 

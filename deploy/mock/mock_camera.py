@@ -58,6 +58,10 @@ class MockCamera(Camera):
         self._check()
         return self._world.intrinsics
 
+    @property
+    def announced_size(self) -> tuple[int, int] | None:
+        return self._options.width, self._options.height
+
     def connect(self) -> None:
         self._connected = True
 

@@ -74,6 +74,11 @@ class RealSenseCamera(Camera):
         return _connected(self._intrinsics)
 
     @property
+    def announced_size(self) -> tuple[int, int] | None:
+        # Those of a recording are the recording's.
+        return None if self._config.recording is not None else self._config.color_size
+
+    @property
     def depth_intrinsics(self) -> CameraIntrinsics:
         """Of the depth stream before it is aligned, once connected; its focal length sets the nearest depth.
 

@@ -27,6 +27,9 @@ class Convert:
     """Frames a second in the data set's time stamps. Looks have no fixed rate; a run's feature `seconds` holds when
     each was."""
 
+    depth: bool = True
+    """Write images of depth. Policies of LeRobot whose networks take three channels, such as ACT, cannot read them."""
+
     def run(self) -> None:
         """Converts and says what there is."""
         from maniskill_tomato.conversion.lerobot_conversion import check_sources, convert_to_lerobot
@@ -37,7 +40,7 @@ class Convert:
 
         with tqdm(unit="episode", disable=None) as bar:
             done = convert_to_lerobot(
-                self.sources, self.out, fps=self.fps, task=self.task, on_episode=bar.update
+                self.sources, self.out, fps=self.fps, task=self.task, depth=self.depth, on_episode=bar.update
             )
         print(f"{self.out}: {done.episodes} episodes, {done.frames} frames")
         print(f"features  {', '.join(done.features)}")

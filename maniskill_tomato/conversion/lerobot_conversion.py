@@ -56,6 +56,7 @@ def convert_to_lerobot(
     *,
     fps: int = 1,
     task: str | None = None,
+    depth: bool = True,
     on_episode: Callable[[], object] = lambda: None,
 ) -> Converted:
     """Writes LeRobotDataset v3.0; the folder appears when it is complete, or not at all.
@@ -66,6 +67,7 @@ def convert_to_lerobot(
         fps: Frames a second by which frames get time stamps. A frame is a look, and looks have no fixed rate; a run's
             feature `seconds` holds when each was.
         task: What was to be done, in words; None for what each file says.
+        depth: Whether to write images of depth, which not every policy of LeRobot takes.
         on_episode: Called after each.
 
     Raises:
@@ -78,10 +80,11 @@ def convert_to_lerobot(
     check_fps(fps)
     check_task(task)
     first = _read(sources[0], task)
+    features = {name: one for name, one in first.features.items() if depth or not one.is_depth}
     frames = episodes = 0
     origin: list[dict[str, Any]] = []
     with whole_folder(out) as folder:
-        writer = LeRobotWriter(folder, first.features, fps, first.robot)
+        writer = LeRobotWriter(folder, features, fps, first.robot)
         with closing(writer):
             for number, path in enumerate(sources):
                 source = first if number == 0 else _read(path, task)
@@ -94,7 +97,7 @@ def convert_to_lerobot(
             writer.finish()
         made_by = {"maniskill_tomato": __version__, "command": command_text()}
         write_json(folder / "meta" / ORIGIN, {**made_by, "episodes": origin})
-    return Converted(episodes=episodes, frames=frames, features=tuple(first.features))
+    return Converted(episodes=episodes, frames=frames, features=tuple(features))
 
 
 def _read(path: Path, task: str | None) -> EpisodeSource:

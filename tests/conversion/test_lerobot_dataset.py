@@ -218,6 +218,14 @@ def test_demonstrations_become_episodes_with_a_frame_for_each_move(tmp_path: Pat
     assert with_images == (features["observation.state"]["names"][0] == "joint_1.pos")
 
 
+def test_depth_can_be_left_out(tmp_path: Path) -> None:
+    path = write_trajectories(tmp_path / "trajectory.h5", with_images=True)
+    out = tmp_path / "converted"
+    main(["convert", str(path), "--to", "lerobot", "--out", str(out), "--no-depth"])
+    assert {name for name in table_of(out) if "images" in name} == {"observation.images.d435"}
+    assert "observation.images.d435_depth" not in info_of(out)["features"]
+
+
 def soft_link(path: Path) -> None:
     write_trajectories(path.with_name("other.h5"))
     with h5py.File(path, "a") as file:
