@@ -10,6 +10,7 @@ from typing import Final
 from maniskill_tomato.errors import InvalidInputError
 from maniskill_tomato.experiments.occlusion_figure import draw_steps
 from maniskill_tomato.experiments.occlusion_scores import (
+    OUTLINE_HEAD,
     SCORE_HEAD,
     Judged,
     annotated_fruits,
@@ -17,6 +18,7 @@ from maniskill_tomato.experiments.occlusion_scores import (
     judge,
     make_view,
     markdown,
+    outline_cells,
     score,
     score_cells,
 )
@@ -54,6 +56,12 @@ FIGURES: Final = (
     "MAE is the mean absolute error of V_f (0 to 1). A tomato of which a model says nothing is a failure, and counts "
     "in MAE as a guess of 0. Bias (mean error) and RMSE (root of the mean squared error) are without failures. The "
     "CPU time is a model's for all tomatoes of an image, without the segmenter's, in ms."
+)
+
+OUTLINES: Final = (
+    "Intersection over union (0 to 1) of the model's whole silhouettes with the true ones inside the image, and of "
+    "what is hidden of both, where 5 % or more of a tomato is hidden. Means over tomatoes, 0 for a failure. What is "
+    "visible was given to the models."
 )
 
 STEPS: Final = (
@@ -160,9 +168,17 @@ def _write_report(out: Path, judged: list[Judged], milliseconds: Mapping[str, fl
                 table(*band_table(judged, milliseconds)),
                 paragraph("Mean absolute error of V_f (0 to 1), and in brackets its bias.", "caption"),
             ),
+            *_outlines(judged),
         ],
         run_facts(),
     )
+
+
+def _outlines(judged: list[Judged]) -> list[str]:
+    rows = outline_cells(judged)
+    if not rows:
+        return []
+    return [section("Whole silhouettes", table(OUTLINE_HEAD, rows), paragraph(OUTLINES, "caption"))]
 
 
 WORST_HEAD: Final = ("image", "model", "tomato", "why", "true V_f", "estimate", "visible [px]")

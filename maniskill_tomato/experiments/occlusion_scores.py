@@ -15,10 +15,13 @@ from maniskill_tomato.segmentation.metrics.detection_metrics import mask_overlap
 from maniskill_tomato.segmentation.segmenter import Segmenter
 from maniskill_tomato.sensing.fruit_detector import FruitDetector
 from maniskill_tomato.sensing.posed_frame import PosedFrame
-from maniskill_tomato.sensing.visible_fraction.estimate import OcclusionModel, SegmentedImage
+from maniskill_tomato.sensing.visible_fraction.estimate import Estimate, OcclusionModel, SegmentedImage
 
 BANDS = ((0.0, 0.2), (0.2, 0.4), (0.4, 0.6), (0.6, 0.8), (0.8, 0.95), (0.95, 1.001))
 """Levels of the true visible fraction."""
+
+LEAST_HIDDEN = 0.05
+"""Share of a tomato that must be hidden for its hidden part to be compared."""
 
 SAME_FRUIT = 0.5
 """Intersection over union of a fruit's visible pixels and a mask from which on the mask is that fruit's."""
@@ -36,6 +39,11 @@ class Judged:
     """V_f of the annotation."""
     estimate: float
     """V_f of the model; NaN where it failed."""
+    whole_iou: float = float("nan")
+    """Intersection over union of the model's whole silhouette with the true one, inside the image; 0 where it failed,
+    NaN where silhouettes are not compared."""
+    hidden_iou: float = float("nan")
+    """The same of what is hidden of the silhouettes; NaN where less than `LEAST_HIDDEN` is."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -106,12 +114,16 @@ def judge(
             found = None if segmenter is None else segmenter(view.rgb, view.depth_m.astype(np.float32))
             for name, model in models.items():
                 start = time.process_time()
+                outlines = [(float("nan"), float("nan"))] * len(fruits)
                 if found is None:
-                    estimates = [estimate.visible_fraction for estimate in model(view)]
+                    told = model(view)
+                    seconds[name] += time.process_time() - start
+                    estimates = [estimate.visible_fraction for estimate in told]
+                    outlines = [compared_outline(f, e) for f, e in zip(fruits, told, strict=True)]
                 else:
                     estimates = _measured(image, view, fruits, model, found)
-                seconds[name] += time.process_time() - start
-                for fruit, estimate in zip(fruits, estimates, strict=True):
+                    seconds[name] += time.process_time() - start
+                for fruit, estimate, outline in zip(fruits, estimates, outlines, strict=True):
                     assert fruit.visible_mask is not None and fruit.visible_fraction is not None
                     area = fruit.visible_mask.area
                     if area < min_visible or area < min_total * fruit.visible_fraction:
@@ -124,11 +136,31 @@ def judge(
                             visible_px=area,
                             truth=fruit.visible_fraction,
                             estimate=estimate,
+                            whole_iou=outline[0],
+                            hidden_iou=outline[1],
                         )
                     )
         if on_image is not None:
             on_image(1)
     return results, {name: 1000 * s / max(count, 1) for name, s in seconds.items()}
+
+
+def compared_outline(fruit: Instance, estimate: Estimate) -> tuple[float, float]:
+    """`Judged.whole_iou` and `Judged.hidden_iou` of an estimate; NaN where the true silhouette is not known."""
+    if fruit.amodal_mask is None or fruit.visible_mask is None:
+        return float("nan"), float("nan")
+    whole, visible = fruit.amodal_mask.decode(), fruit.visible_mask.decode()
+    hidden = whole & ~visible
+    is_compared = hidden.sum() >= LEAST_HIDDEN * whole.sum()
+    if estimate.whole is None:
+        return 0.0, 0.0 if is_compared else float("nan")
+    return _iou(whole, estimate.whole), _iou(hidden, estimate.whole & ~visible) if is_compared else float(
+        "nan"
+    )
+
+
+def _iou(a: NDArray[np.bool_], b: NDArray[np.bool_]) -> float:
+    return float((a & b).sum() / max((a | b).sum(), 1))
 
 
 def _measured(
@@ -211,10 +243,29 @@ def band_table(
     return ("true V_f", *(f"{name}: MAE (bias)" for name in milliseconds), "tomatoes"), rows
 
 
+OUTLINE_HEAD = ("model", "tomatoes", "IoU of the whole", "partly hidden", "IoU of the hidden part")
+
+
+def outline_cells(judged: list[Judged]) -> list[tuple[str, ...]]:
+    """The lines of a table with `OUTLINE_HEAD`, means over tomatoes; none where no silhouettes were compared."""
+    rows: list[tuple[str, ...]] = []
+    for name in dict.fromkeys(j.model for j in judged):
+        own = [j for j in judged if j.model == name and np.isfinite(j.whole_iou)]
+        hidden = [j.hidden_iou for j in own if np.isfinite(j.hidden_iou)]
+        if own:
+            whole = float(np.mean([j.whole_iou for j in own]))
+            part = f"{np.mean(hidden):.3f}" if hidden else ""
+            rows.append((name, str(len(own)), f"{whole:.3f}", str(len(hidden)), part))
+    return rows
+
+
 def markdown(judged: list[Judged], milliseconds: Mapping[str, float]) -> str:
-    """The judgements as two tables."""
+    """The judgements as tables."""
     by_model = markdown_table(SCORE_HEAD, score_cells(judged, milliseconds))
-    return f"{by_model}\n\n{markdown_table(*band_table(judged, milliseconds))}\n"
+    tables = [by_model, markdown_table(*band_table(judged, milliseconds))]
+    if outlines := outline_cells(judged):
+        tables.append(markdown_table(OUTLINE_HEAD, outlines))
+    return "\n\n".join(tables) + "\n"
 
 
 def _by_model(judged: list[Judged], milliseconds: Mapping[str, float]) -> dict[str, list[Judged]]:

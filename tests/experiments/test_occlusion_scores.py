@@ -2,18 +2,28 @@
 
 import re
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 
 from maniskill_tomato.experiments.occlusion_report import report_occlusion
-from maniskill_tomato.experiments.occlusion_scores import Judged, by_band, judge, markdown, score
+from maniskill_tomato.experiments.occlusion_scores import (
+    Judged,
+    by_band,
+    compared_outline,
+    judge,
+    markdown,
+    outline_cells,
+    score,
+)
 from maniskill_tomato.robot.d435 import color_intrinsics
 from maniskill_tomato.segmentation.datasets.annotations import AnnotatedImage, CameraView, Instance
 from maniskill_tomato.segmentation.datasets.picture_files import write_picture
 from maniskill_tomato.segmentation.instances import Instances, mask_box
 from maniskill_tomato.segmentation.masks import EncodedMask
+from maniskill_tomato.sensing.visible_fraction.estimate import Estimate
 from maniskill_tomato.sensing.visible_fraction.sphere import SphereModel
 
 
@@ -96,6 +106,42 @@ def test_fruits_that_a_segmenter_misses_are_failures_and_the_others_are_measured
     found = [np.roll(masks[0], 25, axis=1), masks[1]]
     judged, _ = judge((image,), {"sphere": SphereModel()}, segmenter=segmenter, min_total=0)
     assert np.isnan(judged[0].estimate) and np.isfinite(judged[1].estimate)
+
+
+def test_silhouettes_are_compared_whole_and_where_they_are_hidden() -> None:
+    columns = np.arange(40)[None].repeat(20, axis=0)
+    whole, visible = columns < 20, columns < 10
+    encoded = EncodedMask.encode(visible)
+
+    def fruit(truth: NDArray[np.bool_] | None, seen: NDArray[np.bool_] = visible) -> Instance:
+        return Instance(
+            category="tomato",
+            box_xywh=encoded.box_xywh,
+            visible_mask=EncodedMask.encode(seen),
+            amodal_mask=None if truth is None else EncodedMask.encode(truth),
+        )
+
+    def estimate(silhouette: NDArray[np.bool_]) -> Estimate:
+        return Estimate(visible=1.0, total=1.0, whole=silhouette)
+
+    assert compared_outline(fruit(whole), estimate(whole)) == (1.0, 1.0)
+    # 15 of 20 columns, and 5 of the 10 that are hidden.
+    assert compared_outline(fruit(whole), estimate(columns < 15)) == (0.75, 0.5)
+    assert compared_outline(fruit(whole), Estimate.failed()) == (0.0, 0.0)
+    # Nothing is hidden, or the truth is not known.
+    alone = compared_outline(fruit(whole, whole), estimate(columns < 15))
+    assert alone[0] == 0.75 and np.isnan(alone[1])
+    assert np.isnan(compared_outline(fruit(None), estimate(whole))).all()
+
+
+def test_the_table_of_silhouettes_has_means_over_tomatoes() -> None:
+    def one(whole: float, hidden: float) -> Judged:
+        common: dict[str, Any] = {"model": "m", "file_name": "a", "category": "tomato", "visible_px": 1}
+        return Judged(**common, truth=0.5, estimate=0.5, whole_iou=whole, hidden_iou=hidden)
+
+    nan = float("nan")
+    assert outline_cells([one(0.9, 0.6), one(0.7, nan), one(nan, nan)]) == [("m", "2", "0.800", "1", "0.600")]
+    assert outline_cells([one(nan, nan)]) == []
 
 
 def test_the_page_lists_the_largest_errors_first_and_says_what_went_wrong(tmp_path: Path) -> None:
