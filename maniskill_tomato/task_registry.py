@@ -142,12 +142,44 @@ def task_ids() -> tuple[str, ...]:
     return tuple(dict.fromkeys((*TASKS.names(), *_registered)))
 
 
-def base_of(name: str | None) -> str | None:
-    """The task of this package that a task is a form of; None for a task that is not known here."""
+def known_task(name: str) -> Task | None:
+    """The task of a name, which may stand in a file; None for a task that is not known here.
+
+    A module is not imported because a file names it: `package.module:attribute` is known once `find_task` was asked for
+    it.
+    """
+    if is_import_path(name) and _plain_id(name) not in (*_registered, *_of_path):
+        return None
     try:
-        return None if name is None else find_task(name).base
+        return find_task(name)
     except InvalidInputError:
         return None
+
+
+def check_recorded_task(name: str, source: object) -> None:
+    """Accepts the task that a file names.
+
+    Args:
+        name: The task.
+        source: The file or folder, for the message.
+
+    Raises:
+        InvalidInputError: There is no such task, or it is a module's that nobody else has named.
+    """
+    check_task_name(name)
+    if known_task(name) is None:
+        if not is_import_path(name):
+            find_task(name)
+        raise InvalidInputError(
+            f"{source} is of the task {name}, a module that is not imported because a file names it; name the task "
+            "in the command where it takes one, or give it an entry point"
+        )
+
+
+def base_of(name: str | None) -> str | None:
+    """The task of this package that a task is a form of; None for a task that is not known here, as `known_task`."""
+    task = None if name is None else known_task(name)
+    return None if task is None else task.base
 
 
 def lasting_name(name: str) -> str:
@@ -161,10 +193,8 @@ def lasting_name(name: str) -> str:
 
 
 def is_same_task(name: str, other: str) -> bool:
-    """Whether two names are of one task; names that are not known here are those of one task if they are equal."""
+    """Whether two names are of one task; those that are not known here are of one task if they are equal."""
     if name == other:
         return True
-    try:
-        return find_task(name).env_id == find_task(other).env_id
-    except InvalidInputError:
-        return False
+    one, another = known_task(name), known_task(other)
+    return one is not None and another is not None and one.env_id == another.env_id

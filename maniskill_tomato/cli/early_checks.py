@@ -2,13 +2,14 @@
 
 import os
 from collections.abc import Sequence
+from contextlib import suppress
 from pathlib import Path
 
 from maniskill_tomato.errors import InvalidInputError, PolicyError, did_you_mean
 from maniskill_tomato.extension_points import is_import_path
 from maniskill_tomato.policies.opening import find_policy
 from maniskill_tomato.policies.registry import PRIVILEGED
-from maniskill_tomato.task_registry import TASK_IDS, base_of, check_task_name, task_ids
+from maniskill_tomato.task_registry import TASK_IDS, base_of, check_task_name, find_task, task_ids
 
 
 def check_choice(flag: str, value: str, allowed: Sequence[str]) -> None:
@@ -25,6 +26,8 @@ def check_env_id(env_id: str, bases: Sequence[str] = TASK_IDS) -> None:
         bases: The tasks of this package that it may be, or be a form of.
     """
     check_task_name(env_id, "ENV_ID")
+    if is_import_path(env_id):
+        find_task(env_id)
     if env_id in TASK_IDS or len(bases) < len(TASK_IDS):
         base = env_id if env_id in TASK_IDS else base_of(env_id)
         if base not in bases:
@@ -34,7 +37,11 @@ def check_env_id(env_id: str, bases: Sequence[str] = TASK_IDS) -> None:
 def task_word(argv: Sequence[str]) -> str | None:
     """The first argument that names a task, before the arguments are taken apart; None if none does."""
     known = task_ids()
-    return next((word for word in argv if word in known or is_import_path(word)), None)
+    word = next((word for word in argv if word in known or is_import_path(word)), None)
+    if word is not None and is_import_path(word):
+        with suppress(InvalidInputError):  # `check_env_id` tells it.
+            find_task(word)
+    return word
 
 
 def check_counts(least: int = 1, **values: int | None) -> None:

@@ -21,7 +21,7 @@ from maniskill_tomato.learning.rl.presets import (
     default_preset,
     preset_options,
 )
-from maniskill_tomato.task_registry import TASK_IDS, find_task, lasting_name
+from maniskill_tomato.task_registry import TASK_IDS, check_recorded_task, find_task, lasting_name
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -79,6 +79,8 @@ class Train:
             raise InvalidInputError(
                 f"give the task to train on, one of {', '.join(TASK_IDS)}, or --config FILE or --resume DIR"
             )
+        if self.resume is not None or self.config_file is not None:
+            check_recorded_task(env_id, self.resume or self.config_file)
         check_env_id(env_id)
         env_id = lasting_name(env_id)
         check_counts(jobs=self.jobs)
@@ -179,14 +181,14 @@ class Train:
 
 def _default(argv: Sequence[str]) -> Train:
     """What `train` does without further flags, from the files and the preset that the arguments name."""
-    resumed, file = _asked(argv, "--resume"), _asked(argv, "--config")
+    resumed, file, typed = _asked(argv, "--resume"), _asked(argv, "--config"), task_word(argv)
     if resumed is not None:
         run_file = read_run_config(Path(resumed))
     elif file is not None:
         run_file = read_run_file(Path(file))
     else:
         run_file = RunFile()
-    env_id = run_file.env_id or task_word(argv)
+    env_id = run_file.env_id or typed
     preset = run_file.preset or default_preset(env_id, _asked(argv, "--obs-mode"))
     asked = _asked(argv, "--preset")
     for name in PRESETS:

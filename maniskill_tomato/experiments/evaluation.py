@@ -44,7 +44,7 @@ from maniskill_tomato.policies.protocol import Planner, Policy
 from maniskill_tomato.rendering import vulkan_probe
 from maniskill_tomato.run_facts import duration, is_command_running, run_facts
 from maniskill_tomato.segmentation.datasets.picture_files import write_picture
-from maniskill_tomato.task_registry import base_of, find_task
+from maniskill_tomato.task_registry import base_of, check_recorded_task, find_task
 
 logger = logging.getLogger(__name__)
 
@@ -96,6 +96,7 @@ def evaluate(config: EvaluationConfig) -> EvaluationResult:
         PolicyError: The policy cannot be used.
     """
     start = time.perf_counter()
+    find_task(config.env_id)
     found = find_policy(config.policy or shipped_policy(config.env_id), _required_task(config))
     path = found if isinstance(found, Path) else None
     episodes, baseline, limits, policy = _run(config, found)
@@ -186,6 +187,7 @@ def evaluate_run(run: Run, episodes: int, seed: int) -> EvaluationResult:
             f"{run.path} holds no policy to evaluate (policy.pt or policy.onnx); finish the run with "
             f"`maniskill-tomato train --resume {run.path}`, or compare without evaluating"
         )
+    check_recorded_task(run.env_id, run.path)
     logger.info("evaluating %s", run.path)
     return evaluate(
         EvaluationConfig(

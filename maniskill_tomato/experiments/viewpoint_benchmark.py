@@ -26,7 +26,7 @@ from maniskill_tomato.folder_lock import only_writer
 from maniskill_tomato.plants.episode_list import EPISODE_LISTS, load_episodes
 from maniskill_tomato.policies.registry import PRIVILEGED
 from maniskill_tomato.rendering import vulkan_probe
-from maniskill_tomato.task_registry import GENERAL_IDS, TASK_IDS, TASKS, base_of, find_task
+from maniskill_tomato.task_registry import GENERAL_IDS, TASK_IDS, TASKS, find_task
 from maniskill_tomato.tasks.making import make_options
 
 MAIN = "held_out"
@@ -172,7 +172,7 @@ def _drawn_condition(config: BenchmarkConfig) -> Condition:
     Raises:
         InvalidInputError: An option is for that task, or the task is a row.
     """
-    if base_of(config.env_id) == GENERAL_IDS[1]:
+    if find_task(config.env_id).base == GENERAL_IDS[1]:
         raise InvalidInputError(f"{config.env_id} is a row, which benchmark-rows judges")
     if _words(config.sweeps) or config.episode_list != MAIN or config.plants is not None:
         raise InvalidInputError(

@@ -15,7 +15,7 @@ from maniskill_tomato.experiments.stored_episodes import StoredEpisodes, read_st
 from maniskill_tomato.report_design import SERIES, rgb
 from maniskill_tomato.robot.inverse_kinematics import Reach
 from maniskill_tomato.robot.kinematics import link_transforms
-from maniskill_tomato.task_registry import find_task
+from maniskill_tomato.task_registry import check_recorded_task, find_task
 from maniskill_tomato.tasks.making import option_names
 from maniskill_tomato.tasks.vector_env import make_vector_env
 from maniskill_tomato.view.episode_recording import (
@@ -173,6 +173,7 @@ class RecordSession:
         """The environment of the chosen condition, which sees the truth."""
         stored = self.conditions[self.condition]
         if self._made is None or self._made[0] != self.condition:
+            check_recorded_task(stored.env_id, self._folder)
             known = option_names(stored.env_id) - set(CAMERA_OPTIONS)
             options = {name: value for name, value in stored.env_options.items() if name in known}
             env = make_vector_env(stored.env_id, arrays="torch", autoreset_mode="Disabled", **options)

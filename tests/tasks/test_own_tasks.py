@@ -17,13 +17,15 @@ from maniskill_tomato import task_registry
 from maniskill_tomato.cli import main
 from maniskill_tomato.errors import CheckpointError, InvalidInputError, PolicyError
 from maniskill_tomato.experiments.configs import EvaluationConfig
-from maniskill_tomato.experiments.evaluation import evaluate
+from maniskill_tomato.experiments.evaluation import evaluate, evaluate_run
+from maniskill_tomato.experiments.training_runs import load_run
 from maniskill_tomato.learning.rl.export import export_policy
 from maniskill_tomato.learning.rl.presets import PRESETS, default_preset
 from maniskill_tomato.learning.rl.train_config import TrainConfig
 from maniskill_tomato.learning.rl.trainer import train
 from maniskill_tomato.policies.layout import has_belief
 from maniskill_tomato.policies.onnx_policy import OnnxPolicy
+from maniskill_tomato.policies.opening import open_policy
 from maniskill_tomato.policies.trained_actor import load_actor
 from maniskill_tomato.task_registry import find_task
 from maniskill_tomato.tasks import register_task
@@ -184,6 +186,28 @@ def test_a_policy_whose_task_is_missing_says_so(
         with pytest.raises(SystemExit):
             main(command)
         assert task_registry.ELSEWHERE in capsys.readouterr().err
+
+
+def test_no_module_is_imported_because_a_file_names_it(
+    trained: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "planted.py").write_text("raise SystemExit('the module ran')\n")
+    monkeypatch.chdir(tmp_path)
+    content = torch.load(trained, weights_only=True)
+    torch.save({**content, "env_id": "planted:run"}, tmp_path / "policy.pt")
+    with pytest.raises(CheckpointError, match=f"was trained on planted:run, not on {GENERAL}"):
+        load_actor(tmp_path / "policy.pt", env_id=GENERAL)
+    open_policy(tmp_path / "policy.pt")
+    config = tmp_path / "run" / "config.json"
+    config.write_text(config.read_text().replace(BELOW, "planted:run"))
+    for command in (["train", "--resume", str(tmp_path / "run")], ["train", "--config", str(config)]):
+        with pytest.raises(SystemExit) as end:
+            main(command)
+        assert end.value.code == 2
+        assert "is not imported because a file names it" in capsys.readouterr().err
+    with pytest.raises(InvalidInputError, match="is not imported because a file names it"):
+        evaluate_run(load_run(tmp_path / "run"), 1, 0)
+    assert "planted" not in sys.modules
 
 
 def test_the_benchmark_draws_the_episodes_of_another_task(trained: Path, tmp_path: Path) -> None:
