@@ -244,6 +244,28 @@ def test_lerobot_drives_the_guarded_arm_and_is_refused_what_is_unsafe(
     assert "width must be 424" in camera["wrong_size"]
 
 
+def test_lerobot_replays_a_converted_run_on_its_twin_and_on_no_other(
+    lerobot: str, plugins: Path, tmp_path: Path
+) -> None:
+    run(RunConfig(profile=load_profile("mock"), out=tmp_path / "run", policy="nbv", seed=3))
+    convert_to_lerobot([tmp_path / "run" / "run.mcap"], tmp_path / "converted")
+    places = os.pathsep.join((str(plugins), str(ROOT)))
+    given = {"HF_HUB_OFFLINE": "1", "PYTHONPATH": places, "HF_LEROBOT_HOME": str(tmp_path / "home")}
+
+    def replay(seed: int) -> subprocess.CompletedProcess[str]:
+        command = [str(Path(lerobot).with_name("lerobot-replay")), "--robot.type=kuka_iiwa"]
+        dataset = ["--dataset.repo_id=local/run", f"--dataset.root={tmp_path / 'converted'}"]
+        words = [*command, f"--robot.seed={seed}", *dataset, "--dataset.episode=0", "--play_sounds=false"]
+        return subprocess.run(
+            words, capture_output=True, text=True, timeout=SECONDS, env={**os.environ, **given}
+        )
+
+    same = replay(3)
+    assert same.returncode == 0, same.stderr[-3000:]
+    other = replay(9)  # The arm of this one stands elsewhere.
+    assert other.returncode != 0 and "RefusedError" in other.stderr
+
+
 def scripted_episodes(seeds: range) -> list[tuple[bool, float]]:
     """Success and sum of rewards of the scripted moves, one environment at a time."""
     found = []
