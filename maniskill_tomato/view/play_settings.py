@@ -44,7 +44,7 @@ class PlaySettings:
     """A list of episodes, for the task that has some; held-out ones if None, unless the plants are others."""
 
     def __post_init__(self) -> None:
-        check_task_name(self.env_id)
+        check_task_name(self.env_id, "env_id")
         for name, value, allowed in (
             ("perception", self.perception, PERCEPTIONS),
             ("target", self.target or "track", NAMINGS),

@@ -282,7 +282,12 @@ def test_without_vulkan_an_evaluation_still_reports_and_names_the_remedy(
     monkeypatch.setenv("VK_DRIVER_FILES", "/nonexistent")
     monkeypatch.setenv("VK_ICD_FILENAMES", "/nonexistent")
     config = EvaluationConfig(
-        env_id="Task-v1", policy="forward", episodes=4, seed=0, out=tmp_path, show_progress=False
+        env_id="TomatoViewpointGuided-v1",
+        policy="forward",
+        episodes=4,
+        seed=0,
+        out=tmp_path,
+        show_progress=False,
     )
     result = evaluation.evaluate(config)
     assert result.origin == "Forward"
