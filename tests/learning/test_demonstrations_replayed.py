@@ -61,7 +61,7 @@ def test_replays_are_images_of_the_recorded_views(recorded: Path) -> None:
     from mani_skill.trajectory.replay_trajectory import Args, main
 
     main(Args(traj_path=str(recorded), obs_mode=OBS_MODE, save_traj=True))
-    data = ManiSkillTrajectoryDataset(str(recorded.with_name(REPLAYED)), success_only=True)
+    data: Any = ManiSkillTrajectoryDataset(str(recorded.with_name(REPLAYED)), success_only=True)
     pictures = data.obs["sensor_data"]["d435"]
     shapes = {name: (picture.shape[1:], picture.dtype) for name, picture in pictures.items()}
     assert shapes == {

@@ -253,7 +253,7 @@ def test_a_robot_with_two_cameras_observes_with_both() -> None:
 def test_maniskills_wrapper_for_one_environment_satisfies_gymnasiums_checks(
     env_id: str, recwarn: pytest.WarningsRecorder
 ) -> None:
-    env = CPUGymWrapper(make(env_id), record_metrics=True)
+    env: Any = CPUGymWrapper(make(env_id), record_metrics=True)
     check_env(env, skip_render_check=True, skip_close_check=True)
     said = [str(w.message) for w in recwarn if "gymnasium" in str(w.filename)]
     # Observations have no bounds, and what is checked is a wrapper.
@@ -323,7 +323,9 @@ def test_maniskills_vector_wrapper_counts_episodes(env_id: str, ignore: bool) ->
 
 @pytest.mark.parametrize("env_id", [SPARSE])
 def test_stacked_and_repeated_steps(env_id: str) -> None:
-    plain, stacked, repeated = make(env_id), FrameStack(make(env_id), 2), ActionRepeatWrapper(make(env_id), 2)
+    plain = make(env_id)
+    stacked: Any = FrameStack(make(env_id), 2)
+    repeated: Any = ActionRepeatWrapper(make(env_id), 2)
     first, _ = plain.reset(seed=8)
     frames, _ = stacked.reset(seed=8)
     assert torch.equal(frames, torch.stack([first, first], dim=1))
@@ -402,11 +404,10 @@ def test_a_video_tells_the_info_of_each_step(tmp_path: Path) -> None:
     """Around `CPUGymWrapper`, whose rewards are plain numbers; NumPy 2.4 turns no array of one into a number."""
     frames = []
     for told in (True, False):
-        env: Any = make(
-            SPARSE, render_backend="auto", render_mode="rgb_array", human_render_camera_configs=FILM_SIZE
-        )
-        env = RecordEpisode(
-            CPUGymWrapper(env),
+        made = gym.make(SPARSE, render_mode="rgb_array", human_render_camera_configs=FILM_SIZE)
+        unbatched: Any = CPUGymWrapper(made)
+        env: Any = RecordEpisode(
+            unbatched,
             str(tmp_path / str(told)),
             save_trajectory=False,
             info_on_video=told,
