@@ -302,7 +302,9 @@ def test_sources_that_do_not_go_together_are_refused(recordings: tuple[Path, Pat
     ):
         with pytest.raises(InvalidInputError, match=message):
             convert_to_lerobot(sources, tmp_path / "converted")
-    for options, message in (({"fps": 0}, "--fps"), ({"task": " "}, "--task"), ({"task": "a\nb"}, "--task")):
+    wrong: tuple[dict[str, Any], ...] = ({"fps": 0}, {"task": " "}, {"task": "a\nb"})
+    for options in wrong:
+        message = f"--{next(iter(options))} must be"
         with pytest.raises(InvalidInputError, match=message):
             convert_to_lerobot([path], tmp_path / "converted", **options)
     assert not (tmp_path / "converted").exists()
