@@ -83,19 +83,18 @@ def camera_to_flange(T_world_camera: Tensor) -> Tensor:
     """The pose of `link_ee` that puts the colour camera's optical frame at a pose. Shape (..., 4, 4)."""
     require_trailing("T_world_camera", T_world_camera, (4, 4))
     inverse: Tensor = _mount(T_world_camera.dtype, T_world_camera.device)[1]
-    return T_world_camera @ inverse
+    return _product(T_world_camera, inverse)
 
 
 def flange_to_camera(T_world_flange: Tensor) -> Tensor:
     """The pose of the colour camera's optical frame when `link_ee` is at a pose. Shape (..., 4, 4)."""
     require_trailing("T_world_flange", T_world_flange, (4, 4))
     mount: Tensor = _mount(T_world_flange.dtype, T_world_flange.device)[0]
-    return T_world_flange @ mount
+    return _product(T_world_flange, mount)
 
 
 def carried_pose(T_world_flange: Tensor, T_flange_camera: Tensor) -> Tensor:
-    """The pose of a camera that the flange carries, multiplied in double precision: so a batch rounds as its rows do
-    alone, on every processor.
+    """The pose of a camera that the flange carries, multiplied in double precision.
 
     Args:
         T_world_flange: Of any floating-point type. Shape (..., 4, 4).
@@ -104,8 +103,16 @@ def carried_pose(T_world_flange: Tensor, T_flange_camera: Tensor) -> Tensor:
     Returns:
         Of the type of `T_world_flange`. Shape (..., 4, 4).
     """
-    pose: Tensor = (T_world_flange.double() @ T_flange_camera).to(T_world_flange.dtype)
-    return pose
+    return _product(T_world_flange.double(), T_flange_camera).to(T_world_flange.dtype)
+
+
+def _product(first: Tensor, second: Tensor) -> Tensor:
+    """Products of 4 x 4 matrices that round in a batch as they do alone, which those of `torch.matmul` do not.
+
+    The last digit matters: the inverse kinematics seeks the lowest place of a flat valley, and finds another one.
+    """
+    columns = [first[..., k, None] * second[..., k, None, :] for k in range(4)]
+    return (columns[0] + columns[1]) + (columns[2] + columns[3])
 
 
 def camera_to_viewpoint(T_world_camera: Tensor, reference_rpy: Tensor) -> Tensor:

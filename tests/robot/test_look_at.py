@@ -1,6 +1,7 @@
 """The camera that looks at a target: axes worked out by hand, poses through the flange and back."""
 
 import math
+from collections.abc import Callable
 
 import numpy as np
 import pytest
@@ -9,7 +10,7 @@ from torch.testing import assert_close
 
 from maniskill_tomato.errors import InvalidInputError
 from maniskill_tomato.robot.d435 import T_flange_camera_color_optical
-from maniskill_tomato.robot.kinematics import viewpoint_transform
+from maniskill_tomato.robot.kinematics import forward_kinematics, viewpoint_transform
 from maniskill_tomato.robot.look_at import (
     CAMERA_ROLLS,
     camera_to_flange,
@@ -108,3 +109,13 @@ def test_the_rolls_cover_the_circle_evenly_and_begin_upright() -> None:
 def test_positions_that_are_none_are_refused(position: torch.Tensor) -> None:
     with pytest.raises(InvalidInputError, match=r"position must be a floating-point tensor of shape"):
         look_frame(position, torch.zeros(2, 3))
+
+
+@pytest.mark.parametrize("move", [flange_to_camera, camera_to_flange])
+def test_mounted_cameras_stand_in_a_batch_exactly_where_they_stand_alone(
+    move: Callable[[torch.Tensor], torch.Tensor],
+) -> None:
+    qpos = torch.rand(120, 3, 7, generator=torch.Generator().manual_seed(0), dtype=torch.float64) * 2.0 - 1.0
+    for some in qpos:
+        alone = torch.cat([move(forward_kinematics(row[None])) for row in some])
+        assert torch.equal(move(forward_kinematics(some)), alone)
