@@ -104,5 +104,9 @@ class MissingPackageError(TomatoError):
         return cls(f'{package} is not installed; install it with `pip install "maniskill-tomato[{extra}]"`')
 
 
+class ClusterError(TomatoError):
+    """A cluster of machines cannot be reached, or cannot do what it was given."""
+
+
 class MissingWeightsError(TomatoError):
     """Weights that would have to be downloaded cannot be."""

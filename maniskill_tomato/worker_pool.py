@@ -9,10 +9,18 @@ import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
+from contextvars import ContextVar
 from multiprocessing.process import BaseProcess
 from typing import Any, Final, TypeVar
 
 from maniskill_tomato.errors import InvalidInputError
+
+Cluster = Callable[
+    [Callable[[Any], Any], Sequence[Any], Callable[[], None] | None], Iterator[tuple[Any, Any]]
+]
+"""Does the jobs of `run_jobs` elsewhere: a function, the jobs, and what warms a worker up."""
+
+_cluster: ContextVar[Cluster | None] = ContextVar("cluster", default=None)
 
 Job = TypeVar("Job")
 Result = TypeVar("Result")
@@ -24,6 +32,21 @@ GRACE_SECONDS: Final = 120.0
 """How long a process may take to save its work and end when the one that started it is gone."""
 
 
+@contextlib.contextmanager
+def working_on(cluster: Cluster) -> Iterator[None]:
+    """Lets a cluster do the jobs of `run_jobs` meanwhile, however many processes are asked for."""
+    token = _cluster.set(cluster)
+    try:
+        yield
+    finally:
+        _cluster.reset(token)
+
+
+def is_on_cluster() -> bool:
+    """Whether a cluster does the jobs of `run_jobs`."""
+    return _cluster.get() is not None
+
+
 def run_jobs(
     function: Callable[[Job], Result],
     jobs: Sequence[Job],
@@ -32,7 +55,8 @@ def run_jobs(
 ) -> Iterator[tuple[Job, Result]]:
     """Calls a function with every job; yields each job with its result as it becomes known.
 
-    An exception of the function is raised here and ends the other processes, as does leaving the loop early.
+    An exception of the function is raised here and ends the other processes, as does leaving the loop early. Within
+    `working_on` a cluster does the jobs.
 
     Args:
         function: A function of a module, since other processes must find it.
@@ -45,6 +69,9 @@ def run_jobs(
     """
     if processes < 1:
         raise InvalidInputError(f"the number of processes must be 1 or more, got {processes}")
+    if (cluster := _cluster.get()) is not None and jobs:
+        yield from cluster(function, jobs, warm_up)
+        return
     if processes == 1 or not jobs:
         if jobs and warm_up is not None:
             warm_up()

@@ -129,7 +129,7 @@ what=(--override overrides.txt)
 if [[ $kind == robot ]]; then
     what+=(--override overrides-robot.txt -e ".[perception,deploy,hardware]")
 else
-    what+=(-e ".[dev,perception,deploy,hardware,sb3,lerobot]")
+    what+=(-e ".[dev,perception,deploy,hardware,sb3,lerobot,ray]")
 fi
 if [[ $torch == cpu ]]; then
     # Asked with torch alone, so that nothing else can be the reason for a no, and anew, whatever is installed.

@@ -28,6 +28,7 @@ FOUNDATION = frozenset(
         "text_files",
         "version",
         "warp_runtime",
+        "ray_jobs",
         "worker_pool",
     }
 )

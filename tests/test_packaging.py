@@ -240,7 +240,7 @@ def test_constraints_hold_every_direct_dependency() -> None:
         line.split("==")[0] for line in (ROOT / "constraints.txt").read_text().splitlines() if "==" in line
     }
     requirements = list(project["dependencies"])
-    for extra in ("dev", "docs", "lerobot", "perception", "sb3"):
+    for extra in ("dev", "docs", "lerobot", "perception", "ray", "sb3"):
         requirements += project["optional-dependencies"][extra]
     names = {requirement.split(">")[0].split("=")[0].split("[")[0].strip() for requirement in requirements}
     assert names - pinned == {project["name"]}, (

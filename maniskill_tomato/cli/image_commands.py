@@ -8,7 +8,9 @@ from typing import Annotated, ClassVar, Literal
 import tyro
 
 from maniskill_tomato.cli.early_checks import check_counts, check_folder, check_place, check_segmenter
+from maniskill_tomato.cli.shared_options import Ray
 from maniskill_tomato.errors import InvalidInputError
+from maniskill_tomato.ray_jobs import jobs_on_ray
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -39,6 +41,7 @@ class Dataset:
     """Share of the scenes in which another arm works; only some of their images show it."""
     jobs: int | None = None
     """Processes; by default one per processor core."""
+    ray: Ray = False
 
     def run(self) -> None:
         """Renders what is missing and says where it is."""
@@ -65,7 +68,7 @@ class Dataset:
         if photos is not None and photos.skipped:
             print(f"left out of {self.real}: {photos.skipped_text()}")
         jobs = self.jobs or len(os.sched_getaffinity(0))
-        with tqdm(total=self.count, unit="image", disable=None) as bar:
+        with jobs_on_ray(self.ray), tqdm(total=self.count, unit="image", disable=None) as bar:
             images = make_dataset(config, self.out, jobs=jobs, real=photos, on_scene=bar.update)
         page = write_statistics(images, self.out)
         fruits = sum(len(image.fruits) for image in images.images)

@@ -14,7 +14,7 @@ from maniskill_tomato.cli.early_checks import (
     check_place,
     check_policies,
 )
-from maniskill_tomato.cli.shared_options import say
+from maniskill_tomato.cli.shared_options import Ray, say
 from maniskill_tomato.errors import InvalidInputError
 from maniskill_tomato.experiments.configs import (
     AblationConfig,
@@ -28,6 +28,7 @@ from maniskill_tomato.experiments.variants import choose_variants, experiments, 
 from maniskill_tomato.learning.rl.presets import PRESETS
 from maniskill_tomato.plants.episode_list import EPISODE_LISTS
 from maniskill_tomato.plants.seed_splits import SEED_SPLITS
+from maniskill_tomato.ray_jobs import jobs_on_ray
 from maniskill_tomato.sensing.perception_kinds import Perception
 from maniskill_tomato.tasks import TASK_IDS
 
@@ -35,6 +36,8 @@ from maniskill_tomato.tasks import TASK_IDS
 @dataclass(frozen=True, kw_only=True)
 class Benchmark(BenchmarkConfig):
     """Compare policies on the same held-out episodes: benchmark.json, plots and report.html."""
+
+    ray: Ray = False
 
     def run(self) -> None:
         """Runs what is missing and says where the results are."""
@@ -47,7 +50,8 @@ class Benchmark(BenchmarkConfig):
 
         from maniskill_tomato.experiments.viewpoint_benchmark import run_benchmark
 
-        result = run_benchmark(self)
+        with jobs_on_ray(self.ray):
+            result = run_benchmark(self)
         if result.left_out is not None:
             print(result.left_out)
         print(result.table)
@@ -115,6 +119,7 @@ class Reproduce(ReproductionConfig):
 
     experiment: Annotated[ExperimentName, tyro.conf.Positional]
     """guided: section 5-1; sparse: section 5-2."""
+    ray: Ray = False
 
     def run(self) -> None:
         """Trains and judges what is missing, and says where the results are."""
@@ -123,7 +128,8 @@ class Reproduce(ReproductionConfig):
 
         from maniskill_tomato.experiments.reproduction import run_reproduction
 
-        run_reproduction(self, say)
+        with jobs_on_ray(self.ray):
+            run_reproduction(self, say)
 
 
 @dataclass(frozen=True, kw_only=True)

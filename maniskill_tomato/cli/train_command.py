@@ -10,7 +10,7 @@ import tyro
 
 from maniskill_tomato.cli.arguments import Flat
 from maniskill_tomato.cli.early_checks import check_counts, check_env_id, check_file, task_word
-from maniskill_tomato.cli.shared_options import TASK_HELP, PlantOptions, merge_options
+from maniskill_tomato.cli.shared_options import TASK_HELP, PlantOptions, Ray, merge_options
 from maniskill_tomato.errors import InvalidInputError, SeedsFailedError
 from maniskill_tomato.learning.rl.config_file import RunFile, parse_seeds, read_run_config, read_run_file
 from maniskill_tomato.learning.rl.presets import (
@@ -21,6 +21,7 @@ from maniskill_tomato.learning.rl.presets import (
     default_preset,
     preset_options,
 )
+from maniskill_tomato.ray_jobs import jobs_on_ray
 from maniskill_tomato.task_registry import TASK_IDS, check_recorded_task, find_task, lasting_name
 
 
@@ -48,6 +49,7 @@ class Train:
     """Train one run for each of these seeds, as in 0 1 2 or 0..4, each in a process of its own."""
     jobs: int | None = None
     """How many of them at a time; by default one per processor core."""
+    ray: Ray = False
     out: Path | None = None
     """Folder of the run or runs; by default one below runs/ named after the task, the preset, the seed and the
     time."""
@@ -94,6 +96,8 @@ class Train:
         if run_file.package_version is None:  # The file of a run says all there is to say.
             env_options = {**preset_options(self.preset, env_id), **env_options}
         seeds = parse_seeds(self.seeds)
+        if self.ray and not seeds:
+            raise InvalidInputError("--ray trains several --seeds, each on a core of the cluster; give some")
         out = self.resume or self.out
         if out is None:
             label = self.preset if self.config_file is None else self.config_file.stem
@@ -160,16 +164,17 @@ class Train:
     def _run_seeds(self, env_id: str, out: Path, seeds: tuple[int, ...], env_options: dict[str, Any]) -> None:
         from maniskill_tomato.learning.rl.seeds import summary_table, train_seeds
 
-        results = train_seeds(
-            env_id,
-            self.config,
-            out,
-            seeds,
-            env_options,
-            jobs=self.jobs,
-            overwrite=self.overwrite,
-            resume=self.resume is not None,
-        )
+        with jobs_on_ray(self.ray):
+            results = train_seeds(
+                env_id,
+                self.config,
+                out,
+                seeds,
+                env_options,
+                jobs=self.jobs,
+                overwrite=self.overwrite,
+                resume=self.resume is not None,
+            )
         print(summary_table(results))
         if any(r.stop_reason != "finished" for r in results):
             print(f"go on   maniskill-tomato train --resume {out}")

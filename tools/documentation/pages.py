@@ -19,6 +19,7 @@ NAVIGATION: Final[dict[str, tuple[str, ...]]] = {
         "maniskill",
         "thesis",
         "export",
+        "clusters",
         "lerobot",
         "troubleshooting",
         "contributing",

@@ -9,7 +9,7 @@ import signal
 import sys
 import time
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from multiprocessing.connection import Connection
 from multiprocessing.process import BaseProcess
@@ -27,7 +27,7 @@ from maniskill_tomato.learning.rl.presets import TrainConfig
 from maniskill_tomato.learning.rl.progress import Progress
 from maniskill_tomato.learning.rl.run_folder import LOG_NAME, check_run_dir, clear_run
 from maniskill_tomato.learning.rl.trainer import TrainResult, train
-from maniskill_tomato.worker_pool import start_process
+from maniskill_tomato.worker_pool import is_on_cluster, run_jobs, start_process
 
 logger = logging.getLogger(__name__)
 
@@ -87,7 +87,8 @@ def train_seeds(
         out: Folder of the runs.
         seeds: One run each.
         env_options: Options of the task for `gymnasium.make`.
-        jobs: How many at a time; by default one per processor core.
+        jobs: How many at a time; by default one per processor core. A cluster decides that itself
+            (`worker_pool.working_on`).
         overwrite: Remove earlier runs of these seeds from the folder.
         resume: Go on with those that were begun.
         show_progress: Whether to show where each of them is.
@@ -131,6 +132,12 @@ def _train_seeds(
         "config": config.to_dict(),
     }
     write_json(out / SEEDS_FILE, content)
+    if is_on_cluster():
+        runs = [SeedRun(seed, folder, env_id, config, env_options) for seed, folder in folders.items()]
+        return sorted(
+            (result for _, result in run_jobs(train_alone, runs, len(runs))),
+            key=lambda r: seeds.index(r.seed),
+        )
     waiting = deque(
         _Worker(seed, folder, env_id, config, env_options, resume) for seed, folder in folders.items()
     )
@@ -154,6 +161,68 @@ def _train_seeds(
         for worker in workers:
             worker.kill()
     return [worker.result() for worker in workers]
+
+
+@dataclass(frozen=True)
+class SeedRun:
+    """One seed's run, for a worker of a cluster."""
+
+    seed: int
+    run_dir: Path
+    env_id: str
+    config: TrainConfig
+    env_options: dict[str, Any]
+
+
+def train_alone(run: SeedRun) -> SeedResult:
+    """Trains, and says everything into the run's log; goes on with what a worker that was lost has left there."""
+    run.run_dir.mkdir(parents=True, exist_ok=True)
+    package = logging.getLogger("maniskill_tomato")
+    told: list[Progress] = []
+    end: TrainResult | None = None
+    error = None
+    with _logging_to(package, run.run_dir / LOG_NAME):
+        try:
+            end = train(
+                run.env_id,
+                run.config,
+                run.run_dir,
+                run.seed,
+                run.env_options,
+                resume=(run.run_dir / "config.json").is_file(),
+                show_progress=False,
+                report=told.append,
+            )
+        except TomatoError as failure:
+            package.error("error: %s", failure)
+            error = str(failure)
+    last = told[-1] if told else None
+    known = end or last
+    return SeedResult(
+        seed=run.seed,
+        run_dir=run.run_dir,
+        steps=0 if known is None else known.steps,
+        episodes=0 if known is None else known.episodes,
+        success=math.nan if last is None else last.success,
+        seconds=0.0 if end is None else end.seconds,
+        stop_reason="failed" if end is None else end.stop_reason,
+        error=error,
+    )
+
+
+@contextlib.contextmanager
+def _logging_to(source: logging.Logger, path: Path) -> Iterator[None]:
+    """Adds what a logger says to a file meanwhile."""
+    handler = logging.FileHandler(path)
+    level = source.level
+    source.addHandler(handler)
+    source.setLevel(logging.INFO)
+    try:
+        yield
+    finally:
+        source.setLevel(level)
+        source.removeHandler(handler)
+        handler.close()
 
 
 def summary_table(results: Sequence[SeedResult]) -> str:
