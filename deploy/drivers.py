@@ -141,6 +141,7 @@ def _load(kind: Kind, name: str) -> Any:
             f"{kind}.driver must be one of {names}; got {name!r}{did_you_mean(name, driver_names(kind))}"
         )
     try:
+        DRIVERS[kind].check_recorded(name, "the profile or recording", "")
         return DRIVERS[kind].load(name)
     except InvalidInputError as error:
         raise ProfileError(f"{what} cannot be used: {error}") from error

@@ -51,8 +51,8 @@ class PerceptionConfig:
     """What turns pictures into views."""
 
     segmenter: str = "light"
-    """`ground_truth` (perfect masks, simulated cameras only), a segmenter of `maniskill_tomato.segmentation`, or its
-    weights."""
+    """`ground_truth` (perfect masks, simulated cameras only), a segmenter's name (`maniskill-tomato list segmenters`),
+    or its weights."""
     sight: Sight = "images"
     """`images`: masks and depth, as on a robot; `rays`: the twin's exact rays, as in the simulated task."""
 

@@ -312,6 +312,7 @@ def open_perception(sight: Sight, segmenter: str) -> Perception:
         return ImagePerception(segmenter, None)
     try:
         module: Any = importlib.import_module("maniskill_tomato.segmentation.segmenter")
+        module.SEGMENTERS.check_recorded(segmenter, "the profile", "")
         return ImagePerception(segmenter, module.make_segmenter(segmenter))
     except ImportError as error:
         raise ProfileError(

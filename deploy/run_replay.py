@@ -36,7 +36,9 @@ from maniskill_tomato.deploy.run_records import RunResult, Step
 from maniskill_tomato.deploy.safety import Safety
 from maniskill_tomato.deploy.stops import Stops
 from maniskill_tomato.deploy.workcell import Workcell
+from maniskill_tomato.errors import InvalidInputError
 from maniskill_tomato.policies.opening import open_policy
+from maniskill_tomato.policies.registry import POLICIES
 from maniskill_tomato.raycast.view_rays import ViewRays
 from maniskill_tomato.robot.arm_model import ArmModel
 from maniskill_tomato.robot.d435 import CameraIntrinsics
@@ -155,7 +157,7 @@ def replay(recorded: RecordedRun, policy: str | None = None) -> Replay:
     clock = SimulatedClock(recorded.steps[0].frame.stamp - BEFORE)
     playback = _Playback(recorded.steps, clock)
     comparison = _Comparison(recorded.steps)
-    opened = open_policy(policy or str(recorded.info["policy"]), env_id=TASK, seed=int(recorded.info["seed"]))
+    opened = open_policy(policy or _recorded_policy(recorded), env_id=TASK, seed=int(recorded.info["seed"]))
     workcell, row_moves = _played_workcell(recorded, playback), recorded.info.get("row_moves")
     goal = None if row_moves is None else whole_row(workcell, int(row_moves))
     result = Loop(workcell, opened, Stops(), "unattended", [comparison], goal=goal).run()
@@ -168,6 +170,15 @@ def replay(recorded: RecordedRun, policy: str | None = None) -> Replay:
     elif playback.exhausted and last not in ("moved", "refused", "broken off"):
         differences.append(Difference(step=comparison.count, what="end", recorded=last, now="goes on"))
     return Replay(steps=comparison.count, differences=tuple(differences), result=result)
+
+
+def _recorded_policy(recorded: RecordedRun) -> str:
+    name = str(recorded.info["policy"])
+    try:
+        POLICIES.check_recorded(name, "the recording", f"name it with --policy {name}")
+    except InvalidInputError as error:
+        raise RecordingError(str(error)) from error
+    return name
 
 
 def _played_workcell(recorded: RecordedRun, playback: "_Playback") -> Workcell:

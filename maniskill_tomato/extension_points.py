@@ -7,19 +7,29 @@ A package declares what it adds in its `pyproject.toml`:
 
 Wherever such a name is asked for, `package.module:attribute` works too: it names an object that can be imported, also
 from the working directory.
+
+A file is not trusted to choose what runs: a `package.module:attribute` that stands in one is loaded only if the user
+named it too, at the command line or in Python.
 """
 
 import sys
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from importlib.metadata import EntryPoint, entry_points
 from importlib.util import find_spec
 from pathlib import Path
+from traceback import walk_tb
 from typing import Any, Final
 
 from maniskill_tomato.errors import InvalidInputError
 
 OWN_PACKAGE: Final = "maniskill-tomato"
+
+_loaded: set[tuple[str, str]] = set()
+"""Kind and `package.module:attribute` of what this process was asked to load."""
+
+_foreign: dict[str, str] = {}
+"""What was loaded from others, in words, by the package or module that it is in."""
 
 
 @dataclass(frozen=True)
@@ -32,6 +42,8 @@ class Extension:
     """`module:attribute` of the object."""
     origin: str
     """The distribution that adds it."""
+    others: tuple[str, ...] = ()
+    """Distributions that add one of the same name."""
 
 
 @dataclass(frozen=True)
@@ -48,14 +60,16 @@ class ExtensionPoint:
     """What the names of others begin with in the group, where several kinds share one."""
 
     def extensions(self) -> tuple[Extension, ...]:
-        """All of them, this package's first; a name that is taken already is not taken again."""
+        """All of them, this package's first; a name that is taken already goes to `others` of that."""
         found = {name: Extension(name, target, OWN_PACKAGE) for name, target in self.own.items()}
         others = entry_points(group=self.group)
         for entry in sorted(others, key=lambda entry: entry.name):
             if entry.name.startswith(self.prefix):
                 name = entry.name.removeprefix(self.prefix)
                 origin = "" if entry.dist is None else entry.dist.name
-                found.setdefault(name, Extension(name, entry.value, origin))
+                first = found.setdefault(name, Extension(name, entry.value, origin))
+                if first.origin != origin:
+                    found[name] = replace(first, others=(*first.others, origin))
         return tuple(found.values())
 
     def names(self) -> tuple[str, ...]:
@@ -73,7 +87,8 @@ class ExtensionPoint:
             name: One of `names`, or `package.module:attribute`.
 
         Raises:
-            InvalidInputError: There is no such name, or the object cannot be imported.
+            InvalidInputError: There is no such name, two packages add one of this name, or the object cannot be
+                imported.
         """
         if is_import_path(name):
             _look_in_working_directory()
@@ -83,13 +98,48 @@ class ExtensionPoint:
             if name not in known:
                 raise InvalidInputError.choice(f"the {self.kind}", name, (*known, "package.module:attribute"))
             found = known[name]
+            if found.others and found.origin != OWN_PACKAGE:
+                raise InvalidInputError(
+                    f"the {self.kind} {name!r} is added by {found.origin} and by {', '.join(found.others)}; give "
+                    "package.module:attribute of the one that you mean, or uninstall the other"
+                )
+        if found.origin != OWN_PACKAGE:
+            _foreign[found.target.partition(":")[0].partition(".")[0]] = f"the {self.kind} {name!r}"
         try:
-            return EntryPoint(name, found.target, self.group).load()
-        except (ImportError, AttributeError) as error:
+            made = EntryPoint(name, found.target, self.group).load()
+        except (ImportError, AttributeError, SyntaxError) as error:
             whose = f" of the package {found.origin}" if found.origin else ""
             raise InvalidInputError(
                 f"the {self.kind} {name!r}{whose} cannot be loaded: {error}; can Python import {found.target}?"
             ) from error
+        _loaded.add((self.kind, name))
+        return made
+
+    def may_load_recorded(self, name: str) -> bool:
+        """Whether a name that stands in a file may be loaded.
+
+        A module is not imported because a file names it: `package.module:attribute` may be once `load` was asked for
+        it.
+        """
+        return not is_import_path(name) or (self.kind, name) in _loaded
+
+    def check_recorded(self, name: str, source: object, instead: str) -> None:
+        """Accepts a name that stands in a file, unless it would import a module that only the file names.
+
+        Args:
+            name: What the file says; whether there is such a name is not looked at.
+            source: The file or folder, or where in it the name stands, for the message.
+            instead: What the user may do beside giving it an entry point, for the message; empty if there is nothing.
+
+        Raises:
+            InvalidInputError: `may_load_recorded` is false.
+        """
+        if not self.may_load_recorded(name):
+            way = f"{instead}, or give it" if instead else "give it"
+            raise InvalidInputError(
+                f"{source} names the {self.kind} {name}, a module that is not imported because a file names it; "
+                f"{way} an entry point and write its name there (docs/make_it_yours.md)"
+            )
 
 
 def source_file(import_path: str) -> Path | None:
@@ -105,6 +155,16 @@ def source_file(import_path: str) -> Path | None:
 def _look_in_working_directory() -> None:
     if "" not in sys.path:
         sys.path.append("")  # Whatever it is by then.
+
+
+def whose_fault(error: BaseException) -> str | None:
+    """Whose code an error that nobody expected comes from: what was loaded of others, in words; None if it is ours."""
+    whose = None
+    for frame, _ in walk_tb(error.__traceback__):
+        package = str(frame.f_globals.get("__name__")).partition(".")[0]
+        if package in (__name__.partition(".")[0], *_foreign):
+            whose = _foreign.get(package)
+    return whose
 
 
 def is_import_path(name: str) -> bool:

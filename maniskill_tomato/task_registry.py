@@ -145,10 +145,9 @@ def task_ids() -> tuple[str, ...]:
 def known_task(name: str) -> Task | None:
     """The task of a name, which may stand in a file; None for a task that is not known here.
 
-    A module is not imported because a file names it: `package.module:attribute` is known once `find_task` was asked for
-    it.
+    `package.module:attribute` is known once `find_task` was asked for it (`ExtensionPoint.may_load_recorded`).
     """
-    if is_import_path(name) and _plain_id(name) not in (*_registered, *_of_path):
+    if _plain_id(name) not in _registered and not TASKS.may_load_recorded(name):
         return None
     try:
         return find_task(name)
@@ -168,12 +167,8 @@ def check_recorded_task(name: str, source: object) -> None:
     """
     check_task_name(name)
     if known_task(name) is None:
-        if not is_import_path(name):
-            find_task(name)
-        raise InvalidInputError(
-            f"{source} is of the task {name}, a module that is not imported because a file names it; name the task "
-            "in the command where it takes one, or give it an entry point"
-        )
+        TASKS.check_recorded(name, source, "name the task in the command where it takes one")
+        find_task(name)
 
 
 def base_of(name: str | None) -> str | None:

@@ -64,7 +64,14 @@ class OwnRules:
             InvalidInputError: The function returned something else.
         """
         assert self.reward is not None
-        return self._checked("reward", self.reward(moved), moved).float()
+        reward = self._checked("reward", self.reward(moved), moved).float()
+        finite = reward.isfinite()
+        if not bool(finite.all()):
+            raise InvalidInputError(
+                f"the reward of {self.env_id} must be finite; got {float(reward[~finite][0])} in "
+                f"{int((~finite).sum())} of {len(reward)} environments"
+            )
+        return reward
 
     def success_of(self, moved: Moved) -> Tensor:
         """Which episodes are a success, of shape (N,), bool, where `success` is not None.

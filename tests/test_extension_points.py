@@ -117,6 +117,53 @@ def test_a_name_with_a_typo_suggests_and_a_broken_one_says_what_is_wrong(
         assert not is_import_path(text)
 
 
+@pytest.mark.usefixtures("extras")
+def test_two_packages_that_add_the_same_name_are_told_apart(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    about = tmp_path / "tomato_rival-2.0.dist-info"
+    about.mkdir()
+    (about / "METADATA").write_text("Metadata-Version: 2.1\nName: tomato-rival\nVersion: 2.0\n")
+    rivals = "spiral = json:loads\nnbv = json:loads\n"
+    (about / "entry_points.txt").write_text(f"[maniskill_tomato.policies]\n{rivals}")
+    monkeypatch.syspath_prepend(str(tmp_path))
+    with pytest.raises(
+        PolicyError,
+        match=r"'spiral' is added by tomato-(extras|rival) and by tomato-(extras|rival); give package",
+    ):
+        open_policy("spiral", env_id=GENERAL)
+    assert open_policy("tomato_extras.spiral:make_policy", env_id=GENERAL).name
+    main(["list", "policies"])
+    lines = capsys.readouterr().out.splitlines()
+    assert [line.split() for line in lines if line.split()[0] == "nbv"] == [
+        ["nbv", "maniskill-tomato,", "and", "also", "tomato-rival"]
+    ]
+    assert open_policy("nbv", env_id=GENERAL).name == "nbv"
+
+
+def test_a_failure_of_another_package_is_not_called_ours(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "failing_search.py").write_text(
+        "import torch\ndef make(context): return torch.zeros(2) @ torch.zeros(3)\n"
+    )
+    (tmp_path / "unfinished_search.py").write_text("def make(context:\n")
+    monkeypatch.chdir(tmp_path)
+    judged = ["eval", GENERAL, "--episodes", "1", "--no-video", "--no-baseline", "--policy"]
+    for name, status, words in (
+        (
+            "failing_search:make",
+            1,
+            "the policy 'failing_search:make' failed, which is not of maniskill-tomato",
+        ),
+        ("unfinished_search:make", 2, "'unfinished_search:make' cannot be loaded: "),
+    ):
+        with pytest.raises(SystemExit) as end:
+            main([*judged, name])
+        said = capsys.readouterr().err
+        assert end.value.code == status and words in said.splitlines()[-1], said
+
+
 def test_a_generator_that_makes_no_plant_is_refused() -> None:
     for name, words in (
         (f"{__name__}:no_plant", "must give a mapping from names to triangles"),

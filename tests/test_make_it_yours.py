@@ -96,6 +96,10 @@ def test_its_camera_shows_the_pictures_of_a_folder(pictures: tuple[Path, Frame])
     empty: Any = make_camera("folder", {"folder": str(folder.parent)}, DriverContext(clock=clock))
     with pytest.raises(NotConnectedError, match="must hold"):
         empty.connect()
+    (folder / "color_001.png").write_bytes((folder / "color_000.png").read_bytes())
+    with pytest.raises(NotConnectedError, match="there is no .*depth_001.png"):
+        camera.connect()
+    assert not camera.is_connected
 
 
 def test_deploy_check_looks_through_its_camera(

@@ -138,7 +138,13 @@ def _status(error: TomatoError) -> int:
 
 
 def _end_by_fault() -> NoReturn:
+    from maniskill_tomato.extension_points import whose_fault
+
     traceback.print_exc()
+    error = sys.exception()
+    whose = None if error is None else whose_fault(error)
+    if whose is not None:
+        _end(f"{whose} failed, which is not of maniskill-tomato; the lines above say where", FAILED)
     _end("this is a fault of maniskill-tomato; please report it with the lines above", FAILED)
 
 

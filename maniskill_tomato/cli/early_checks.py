@@ -37,7 +37,8 @@ def check_env_id(env_id: str, bases: Sequence[str] = TASK_IDS) -> None:
 def task_word(argv: Sequence[str]) -> str | None:
     """The first argument that names a task, before the arguments are taken apart; None if none does."""
     known = task_ids()
-    word = next((word for word in argv if word in known or is_import_path(word)), None)
+    words = [word for before, word in zip(("", *argv), argv, strict=False) if before != "--plant"]
+    word = next((word for word in words if word in known or is_import_path(word)), None)
     if word is not None and is_import_path(word):
         with suppress(InvalidInputError):  # `check_env_id` tells it.
             find_task(word)

@@ -53,4 +53,5 @@ class List:
             print(f"{kind} ({points[kind].group})")
             width = max(len(extension.name) for extension in found)
             for extension in found:
-                print(f"  {extension.name:<{width}}  {extension.origin or 'unknown package'}")
+                others = f", and also {', '.join(extension.others)}" if extension.others else ""
+                print(f"  {extension.name:<{width}}  {extension.origin or 'unknown package'}{others}")

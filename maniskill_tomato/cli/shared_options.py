@@ -9,6 +9,7 @@ from typing import Annotated, Any, Final, get_args
 import tyro
 
 from maniskill_tomato.errors import InvalidInputError, did_you_mean
+from maniskill_tomato.extension_points import is_import_path
 from maniskill_tomato.plants.seed_splits import SEED_SPLITS
 from maniskill_tomato.sensing.perception_kinds import RENDERED, Naming, Perception
 from maniskill_tomato.task_registry import TASK_IDS, THESIS_IDS, base_of
@@ -105,6 +106,8 @@ def _check_plant(name: str) -> None:
         raise InvalidInputError.choice(
             "--plant", name, (*PLANT_NAMES, *PLANT_GENERATORS.names(), "package.module:callable")
         )
+    if is_import_path(name):
+        PLANT_GENERATORS.load(name)
 
 
 def camera_options(
@@ -140,13 +143,22 @@ def camera_options(
 
 
 def merge_options(base: dict[str, Any], changes: dict[str, Any]) -> dict[str, Any]:
-    """The task options `base` with `changes` put over them, one by one within tables such as `plant`."""
-    merged = dict(base)
+    """The task options `base` with `changes` put over them, one by one within tables such as `plant`.
+
+    A plant that `base` only names becomes a table, and what another one is taken from replaces that.
+    """
+    from maniskill_tomato.plants.kinds import PLANT_NAMES
+
+    merged, sources = dict(base), ("preset", "generator", "mesh")
+    if isinstance(plant := merged.get("plant"), str):
+        merged["plant"] = {"preset" if plant in PLANT_NAMES else "generator": plant}
     for name, value in changes.items():
         old = merged.get(name)
-        if isinstance(old, str) and name == "plant":
-            old = {"preset": old}
-        merged[name] = {**old, **value} if isinstance(old, dict) and isinstance(value, dict) else value
+        if isinstance(old, dict) and isinstance(value, dict):
+            if name == "plant" and any(source in value for source in sources):
+                old = {key: kept for key, kept in old.items() if key not in sources}
+            value = {**old, **value}
+        merged[name] = value
     return merged
 
 

@@ -1,5 +1,6 @@
 """`maniskill-tomato train`: one run, several seeds, or the rest of what was stopped."""
 
+import json
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -21,6 +22,7 @@ from maniskill_tomato.learning.rl.presets import (
     default_preset,
     preset_options,
 )
+from maniskill_tomato.plants.plant_generators import check_recorded_plant
 from maniskill_tomato.ray_jobs import jobs_on_ray
 from maniskill_tomato.task_registry import TASK_IDS, check_recorded_task, find_task, lasting_name
 
@@ -92,7 +94,13 @@ class Train:
             check_file("--reward-from", Path(self.config.reward_from))
         if self.resume is not None:
             self._check_resume(run_file)
-        env_options = merge_options(run_file.env_options, self.plants.env_options())
+        env_options = run_file.env_options
+        if self.resume is None:
+            env_options = merge_options(env_options, self.plants.env_options())
+        if self.resume is not None or self.config_file is not None:
+            check_recorded_plant(
+                env_options.get("plant"), self.resume or self.config_file, "name it with --plant {name}"
+            )
         if run_file.package_version is None:  # The file of a run says all there is to say.
             env_options = {**preset_options(self.preset, env_id), **env_options}
         seeds = parse_seeds(self.seeds)
@@ -133,6 +141,8 @@ class Train:
 
     def _check_resume(self, run_file: RunFile) -> None:
         """Refuses what would make the continued run another one."""
+        begun_options = merge_options(run_file.env_options, {})
+        asked_options = merge_options(begun_options, json.loads(json.dumps(self.plants.env_options())))
         changed = [
             name
             for name, given, begun in (
@@ -142,7 +152,7 @@ class Train:
                 ("--seeds", self.seeds, tuple(map(str, run_file.seeds))),
                 ("--out", self.out, None),
                 ("--overwrite", self.overwrite, False),
-                ("--plant...", self.plants, PlantOptions()),
+                ("--plant...", asked_options, begun_options),
             )
             if given not in (begun, None)
         ]

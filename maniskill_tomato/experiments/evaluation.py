@@ -32,6 +32,7 @@ from maniskill_tomato.experiments.training_runs import Run
 from maniskill_tomato.files import write_atomically, write_json
 from maniskill_tomato.learning.rl.envs import make_env
 from maniskill_tomato.learning.rl.history import load_history
+from maniskill_tomato.plants.plant_generators import check_recorded_plant
 from maniskill_tomato.policies.adapters import origin
 from maniskill_tomato.policies.opening import (
     RANDOM,
@@ -188,6 +189,12 @@ def evaluate_run(run: Run, episodes: int, seed: int) -> EvaluationResult:
             f"`maniskill-tomato train --resume {run.path}`, or compare without evaluating"
         )
     check_recorded_task(run.env_id, run.path)
+    check_recorded_plant(
+        run.config.get("env_options", {}).get("plant"),
+        run.path / "config.json",
+        f"evaluate it with `maniskill-tomato eval {run.env_id} --policy {policies[0]} --plant {{name}} "
+        f"--out {run.path / 'eval'}`",
+    )
     logger.info("evaluating %s", run.path)
     return evaluate(
         EvaluationConfig(

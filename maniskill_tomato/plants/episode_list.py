@@ -10,6 +10,7 @@ from typing import Any
 from maniskill_tomato.assets import asset_path
 from maniskill_tomato.errors import InvalidInputError
 from maniskill_tomato.files import write_atomically
+from maniskill_tomato.plants.plant_generators import check_recorded_plant
 from maniskill_tomato.text_files import read_json
 
 EPISODE_LISTS = ("validation", "held_out")
@@ -80,13 +81,15 @@ def listed_plant(name: str) -> dict[str, Any] | None:
         name: As for `load_episodes`.
 
     Raises:
-        InvalidInputError: There is no such list, or it names plants in another form.
+        InvalidInputError: There is no such list, or it names plants in another form, or a module of
+                plants that only it names.
     """
     path = episode_path(name)
     content = read_json(path)
     plant = content.get("plant") if isinstance(content, dict) else None
     if plant is not None and not isinstance(plant, dict):
         raise InvalidInputError(f"`plant` of {path} must be a table as the task option is, got {plant!r}")
+    check_recorded_plant(plant, path, "")
     return plant
 
 

@@ -18,6 +18,22 @@ PLANT_GENERATORS: Final = ExtensionPoint("plant generator", "maniskill_tomato.pl
 """By name; `generator.generate_plant` grows this package's own presets."""
 
 
+def check_recorded_plant(plant: object, source: object, instead: str) -> None:
+    """Accepts the task option `plant` of a file, unless its generator is a module that only the file names.
+
+    Args:
+        plant: The option, in any form that `PlantSpec.parse` takes; other forms are left to that.
+        source: The file or folder, for the message.
+        instead: What the user may do, for the message; `{name}` in it stands for the generator.
+
+    Raises:
+        InvalidInputError: See `ExtensionPoint.check_recorded`.
+    """
+    name = plant.get("generator") if isinstance(plant, Mapping) else plant
+    if isinstance(name, str):
+        PLANT_GENERATORS.check_recorded(name, source, instead.replace("{name}", name))
+
+
 def generated_plant(name: str, seed: int) -> Plant:
     """The plant of a seed from another package's generator.
 

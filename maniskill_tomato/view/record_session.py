@@ -12,6 +12,7 @@ from maniskill_tomato.experiments.episode_listing import ListedEpisode, failures
 from maniskill_tomato.experiments.episode_record import EpisodeRecord
 from maniskill_tomato.experiments.row_benchmark import CAMERA_OPTIONS
 from maniskill_tomato.experiments.stored_episodes import StoredEpisodes, read_stored_episodes
+from maniskill_tomato.plants.plant_generators import check_recorded_plant
 from maniskill_tomato.report_design import SERIES, rgb
 from maniskill_tomato.robot.inverse_kinematics import Reach
 from maniskill_tomato.robot.kinematics import link_transforms
@@ -174,6 +175,7 @@ class RecordSession:
         stored = self.conditions[self.condition]
         if self._made is None or self._made[0] != self.condition:
             check_recorded_task(stored.env_id, self._folder)
+            check_recorded_plant(stored.env_options.get("plant"), self._folder, "")
             known = option_names(stored.env_id) - set(CAMERA_OPTIONS)
             options = {name: value for name, value in stored.env_options.items() if name in known}
             env = make_vector_env(stored.env_id, arrays="torch", autoreset_mode="Disabled", **options)

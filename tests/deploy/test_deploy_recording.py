@@ -2,6 +2,8 @@
 
 import json
 import resource
+import sys
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +13,7 @@ import pytest
 
 from maniskill_tomato.cli import main
 from maniskill_tomato.deploy.clock import SimulatedClock
-from maniskill_tomato.deploy.deploy_errors import RecordingError
+from maniskill_tomato.deploy.deploy_errors import ProfileError, RecordingError
 from maniskill_tomato.deploy.interface import Frame
 from maniskill_tomato.deploy.policy_run import RunConfig, run
 from maniskill_tomato.deploy.profile import Profile, load_profile, parse_profile
@@ -19,8 +21,11 @@ from maniskill_tomato.deploy.recording import McapRecorder
 from maniskill_tomato.deploy.recording_reader import read_messages
 from maniskill_tomato.deploy.run_records import RunResult
 from maniskill_tomato.deploy.run_replay import load_recording, replay
+from maniskill_tomato.deploy.workcell import make_workcell
 from maniskill_tomato.errors import TomatoError
 from maniskill_tomato.robot.d435 import T_flange_camera_color_optical
+from maniskill_tomato.segmentation.colour_segmenter import ColourSegmenter
+from maniskill_tomato.segmentation.segmenter import SEGMENTERS
 
 TEXT = """
 [arm]
@@ -113,6 +118,40 @@ def test_replay_with_another_policy_or_envelope_says_where_it_differs(
     assert {d.what for d in found.differences} >= {"action"}
     assert str(found.differences[0]).startswith("look 0: action was [")
     assert all(d.what != "visible_fraction" for d in found.differences), "the pictures are the same"
+
+
+def test_no_module_is_imported_because_a_profile_or_a_recording_names_it(
+    finished: tuple[Path, RunResult], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "planted_eyes.py").write_text("raise SystemExit('the module ran')\n")
+    monkeypatch.chdir(tmp_path)
+    words = "names the {} planted_eyes:make, a module that is not imported because a file names it"
+    for old, new, kind in (
+        ('segmenter = "ground_truth"', 'segmenter = "planted_eyes:make"', "segmenter"),
+        ('[camera]\ndriver = "mock"', '[camera]\ndriver = "planted_eyes:make"', "driver of a camera"),
+        ('[arm]\ndriver = "mock"', '[arm]\ndriver = "planted_eyes:make"', "driver of an arm"),
+        ("[twin]\n", '[twin]\nmodel = "planted_eyes:make"\n', "model of an arm"),
+    ):
+        assert old in TEXT
+        with pytest.raises(ProfileError, match=words.format(kind)):
+            make_workcell(profile(TEXT.replace(old, new)))
+    recorded = load_recording(finished[0] / "run.mcap")
+    crafted = replace(recorded, info={**recorded.info, "policy": "planted_eyes:make"})
+    with pytest.raises(RecordingError, match=f"{words.format('policy')}.*--policy planted_eyes:make"):
+        replay(crafted)
+    assert "planted_eyes" not in sys.modules
+    assert replay(crafted, policy="nbv").differences == ()
+
+
+def make_own_eyes() -> ColourSegmenter:
+    return ColourSegmenter()
+
+
+def test_a_program_names_a_segmenter_of_its_own_for_a_profile() -> None:
+    name = f"{__name__}:make_own_eyes"
+    SEGMENTERS.load(name)
+    workcell = make_workcell(profile(TEXT.replace('"ground_truth"', f'"{name}"')))
+    assert workcell.perception.name.endswith(name)
 
 
 def test_a_disk_that_fills_up_ends_the_run_as_a_fault(tmp_path: Path) -> None:

@@ -91,6 +91,11 @@ def test_plant_flags_change_single_options_of_the_file() -> None:
         "motion": "kinematic",
         "plant_pose": (0.8, 0.0, 0.0),
     }
+    grown = {"plant": {"preset": "full", "seed": 3}}
+    assert merge_options(grown, {"plant": {"generator": "pots"}}) == {
+        "plant": {"generator": "pots", "seed": 3}
+    }
+    assert merge_options({"plant": "pots"}, {}) == {"plant": {"generator": "pots"}}
     assert merge_options({"plant": "full"}, {"plant": {"seed": 3}}) == {
         "plant": {"preset": "full", "seed": 3}
     }

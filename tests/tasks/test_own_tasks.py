@@ -13,16 +13,17 @@ import numpy as np
 import pytest
 import torch
 
-from maniskill_tomato import task_registry
+from maniskill_tomato import extension_points, task_registry
 from maniskill_tomato.cli import main
 from maniskill_tomato.errors import CheckpointError, InvalidInputError, PolicyError
 from maniskill_tomato.experiments.configs import EvaluationConfig
 from maniskill_tomato.experiments.evaluation import evaluate, evaluate_run
-from maniskill_tomato.experiments.training_runs import load_run
+from maniskill_tomato.experiments.training_runs import Run, load_run
 from maniskill_tomato.learning.rl.export import export_policy
 from maniskill_tomato.learning.rl.presets import PRESETS, default_preset
 from maniskill_tomato.learning.rl.train_config import TrainConfig
 from maniskill_tomato.learning.rl.trainer import train
+from maniskill_tomato.plants.episode_list import load_episodes, write_episodes
 from maniskill_tomato.policies.layout import has_belief
 from maniskill_tomato.policies.onnx_policy import OnnxPolicy
 from maniskill_tomato.policies.opening import open_policy
@@ -210,6 +211,61 @@ def test_no_module_is_imported_because_a_file_names_it(
     assert "planted" not in sys.modules
 
 
+def test_no_plants_are_imported_because_a_file_names_them(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "planted_pots.py").write_text("raise SystemExit('the module ran')\n")
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(extension_points, "_loaded", set())
+    plant = {"generator": "planted_pots:grow"}
+    written = {"env_id": GUIDED, "seed": 0, "config": {}, "env_options": {"plant": plant}}
+    (tmp_path / "config.json").write_text(json.dumps(written))
+    (tmp_path / "policy.pt").write_bytes(b"")
+    (tmp_path / "short.toml").write_text(f'env_id = "{GUIDED}"\n[env_options]\nplant = "planted_pots:grow"\n')
+    for command in (["train", "--resume", "."], ["train", "--config", "short.toml", "--out", "new"]):
+        with pytest.raises(SystemExit) as end:
+            main(command)
+        assert end.value.code == 2
+        error = " ".join(capsys.readouterr().err.split())
+        assert "planted_pots:grow, a module that is not imported because a file names it" in error
+        assert "name it with --plant planted_pots:grow, or give it an entry point" in error
+    run = Run(
+        path=tmp_path,
+        env_id=GUIDED,
+        seed=0,
+        config={"env_options": {"plant": plant}},
+        episodes={},
+        clock=None,
+        metrics=None,
+    )
+    with pytest.raises(InvalidInputError, match="eval TomatoViewpointGuided-v1 .*--plant planted_pots:grow"):
+        evaluate_run(run, 1, 0)
+    listed = tmp_path / "listed.json"
+    write_episodes(listed, load_episodes("held_out")[:1], plant)
+    with pytest.raises(InvalidInputError, match="listed.json names the plant generator planted_pots:grow"):
+        make_world(GENERAL, 1, episodes=str(listed))
+    assert "planted_pots" not in sys.modules
+
+
+@pytest.mark.usefixtures("extras")
+def test_a_run_on_plants_of_a_module_goes_on_where_the_command_names_it(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    name, out = "tomato_extras.potted_plant:potted_plant", str(tmp_path / "run")
+    few = ["--total-timesteps", "10", "--learning-starts", "8", "--batch-size", "8", "--out", out]
+    main(["train", "--plant", name, GUIDED, *few])
+    extension_points._loaded.clear()  # As in a process of its own.
+    with pytest.raises(SystemExit):
+        main(["train", "--resume", out, "--total-timesteps", "14"])
+    assert f"name it with --plant {name}" in " ".join(capsys.readouterr().err.split())
+    with pytest.raises(SystemExit):
+        main(["train", "--resume", out, "--total-timesteps", "14", "--plant", "potted"])
+    assert "cannot take --plant" in capsys.readouterr().err
+    main(["train", "--resume", out, "--total-timesteps", "14", "--plant", name])
+    actor = load_actor(tmp_path / "run" / "policy.pt")
+    assert actor.counters["steps"] == 14 and actor.env_options == {"plant": {"generator": name}}
+
+
 def test_the_benchmark_draws_the_episodes_of_another_task(trained: Path, tmp_path: Path) -> None:
     out = tmp_path / "benchmark"
     command = ["benchmark", "--env-id", BELOW, "--policies", f"spiral,own={trained}", "--episodes", "2"]
@@ -272,6 +328,11 @@ def test_wrong_rules_and_settings_are_named(monkeypatch: pytest.MonkeyPatch) -> 
     with pytest.raises(
         InvalidInputError, match=r"reward of Flat-v1 must .* shape \(2,\).*got one of shape \(2, 7\)"
     ):
+        world.reward()
+    register_task("Torn-v1", GUIDED, reward=lambda moved: 1.0 / torch.arange(float(len(moved.qpos))))
+    world = make_world("Torn-v1", 2)
+    world.reset(0)
+    with pytest.raises(InvalidInputError, match="reward of Torn-v1 must be finite; got inf in 1 of 2 env"):
         world.reward()
     register_task("Soft-v1", GUIDED, success=lambda moved: moved.visible_fraction)
     with pytest.raises(InvalidInputError, match="success of Soft-v1 must return a tensor of bool"):

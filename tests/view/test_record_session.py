@@ -10,6 +10,7 @@ import pytest
 from maniskill_tomato.cli import main
 from maniskill_tomato.errors import InvalidInputError
 from maniskill_tomato.experiments.episode_record import EpisodeRecord
+from maniskill_tomato.experiments.result_store import ABOUT
 from maniskill_tomato.view.page_plot import curves
 from maniskill_tomato.view.page_record import failure_beside, ways_side_by_side
 from maniskill_tomato.view.play_session import PlaySession
@@ -125,6 +126,19 @@ def test_an_episode_whose_plant_is_another_one_now_is_refused(record_folder: Pat
         line["result"]["visible_fraction"][0] += 0.1
     path.write_text("".join(json.dumps(line) + "\n" for line in lines))
     with pytest.raises(InvalidInputError, match=r"another one in this version .*run the episodes again"):
+        RecordSession(folder)
+
+
+def test_no_plants_are_imported_because_a_record_names_them(record_folder: Path, tmp_path: Path) -> None:
+    folder = tmp_path / "record"
+    shutil.copytree(record_folder, folder)
+    (path,) = folder.glob(f"results/*/{ABOUT}")
+    about = json.loads(path.read_text())
+    about["env_options"] = {"plant": "json:loads"}
+    path.write_text(json.dumps(about))
+    with pytest.raises(
+        InvalidInputError, match=r"record names the plant generator json:loads, .* give it an entry"
+    ):
         RecordSession(folder)
 
 

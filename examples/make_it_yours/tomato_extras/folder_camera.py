@@ -52,6 +52,12 @@ class FolderCamera(Camera):
         if not self._files or not (self._folder / "camera.json").is_file():
             self._files = []
             raise NotConnectedError(f"{self._folder} must hold color_*.png, depth_*.png and camera.json")
+        missing = [str(_depth_of(path)) for path in self._files if not _depth_of(path).is_file()]
+        if missing:
+            self._files = []
+            raise NotConnectedError(
+                f"every picture needs its depth, and there is no {', '.join(missing[:3])}"
+            )
 
     def disconnect(self) -> None:
         self._files = []
@@ -68,7 +74,7 @@ class FolderCamera(Camera):
         self._clock.sleep(self._period)
         path = self._files[self._number % len(self._files)]
         color = cv2.imread(str(path))
-        depth = cv2.imread(str(path.with_name(path.name.replace("color", "depth"))), cv2.IMREAD_UNCHANGED)
+        depth = cv2.imread(str(_depth_of(path)), cv2.IMREAD_UNCHANGED)
         if color is None or depth is None:
             raise ProtocolError(f"{path} or its depth is no picture")
         self._number += 1
@@ -79,6 +85,10 @@ class FolderCamera(Camera):
             stamp=self._clock.now(),
             number=self._number,
         )
+
+
+def _depth_of(color: Path) -> Path:
+    return color.with_name(color.name.replace("color", "depth"))
 
 
 def make_camera(options: Mapping[str, Any], context: DriverContext) -> FolderCamera:
