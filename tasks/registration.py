@@ -58,10 +58,14 @@ def register_task(
         max_episode_steps: Moves after which an episode is cut off; the base's if None.
 
     Raises:
-        InvalidInputError: There is no such base, or the ID is one of this package's.
+        InvalidInputError: There is no such base, a rule is no function, a number is not allowed, or the ID is
+            one of this package's.
     """
     if base not in TASK_IDS:
         raise InvalidInputError.choice("base", base, TASK_IDS)
+    for name, rule in (("reward", reward), ("starts", starts), ("success", success)):
+        if rule is not None and not callable(rule):
+            raise InvalidInputError(f"{name} must be a function; got {rule!r}")
     if success is not None and base == TASK_IDS[3]:
         raise InvalidInputError(
             f"a form of {base} has the row's success, all targets seen; leave out success= and set full_visibility"

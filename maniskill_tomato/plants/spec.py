@@ -197,6 +197,7 @@ class PlantSpec:
                 of_mesh = "; it goes with mesh=" if unknown[0] in RULE_NAMES else ""
                 raise InvalidInputError(
                     f"plant has no field {', '.join(map(repr, unknown))}{of_mesh}; the fields are {', '.join(names)}"
+                    f"{did_you_mean(unknown[0], names)}"
                 )
             replaced = dict(value)
             if replaced.get("preset") in KINDS:

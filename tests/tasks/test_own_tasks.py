@@ -329,6 +329,10 @@ def test_wrong_rules_and_settings_are_named(monkeypatch: pytest.MonkeyPatch) -> 
         InvalidInputError, match=r"reward of Flat-v1 must .* shape \(2,\).*got one of shape \(2, 7\)"
     ):
         world.reward()
+    with pytest.raises(InvalidInputError, match="reward must be a function; got 3"):
+        register_task("Flat-v1", GUIDED, reward=3)  # type: ignore[arg-type]
+    with pytest.raises(InvalidInputError, match="no field 'generater'; .*did you mean 'generator'"):
+        make_world(GUIDED, plant={"generater": "pots"})
     register_task("Torn-v1", GUIDED, reward=lambda moved: 1.0 / torch.arange(float(len(moved.qpos))))
     world = make_world("Torn-v1", 2)
     world.reset(0)
