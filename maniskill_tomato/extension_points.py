@@ -29,7 +29,7 @@ _loaded: set[tuple[str, str]] = set()
 """Kind and `package.module:attribute` of what this process was asked to load."""
 
 _foreign: dict[str, str] = {}
-"""What was loaded from others, in words, by the package or module that it is in."""
+"""What was loaded from others, in words, by the innermost package that it is in, or else its module."""
 
 
 @dataclass(frozen=True)
@@ -104,7 +104,8 @@ class ExtensionPoint:
                     "package.module:attribute of the one that you mean, or uninstall the other"
                 )
         if found.origin != OWN_PACKAGE:
-            _foreign[found.target.partition(":")[0].partition(".")[0]] = f"the {self.kind} {name!r}"
+            module = found.target.partition(":")[0]
+            _foreign[module.rpartition(".")[0] or module] = f"the {self.kind} {name!r}"
         try:
             made = EntryPoint(name, found.target, self.group).load()
         except (ImportError, AttributeError, SyntaxError) as error:
@@ -161,9 +162,11 @@ def whose_fault(error: BaseException) -> str | None:
     """Whose code an error that nobody expected comes from: what was loaded of others, in words; None if it is ours."""
     whose = None
     for frame, _ in walk_tb(error.__traceback__):
-        package = str(frame.f_globals.get("__name__")).partition(".")[0]
-        if package in (__name__.partition(".")[0], *_foreign):
-            whose = _foreign.get(package)
+        module = f"{frame.f_globals.get('__name__')}."
+        if module.startswith(f"{__name__.partition('.')[0]}."):
+            whose = None
+        for package, what in _foreign.items():
+            whose = what if module.startswith(f"{package}.") else whose
     return whose
 
 

@@ -263,17 +263,25 @@ def extras_site(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return site
 
 
+@pytest.fixture(autouse=True)
+def _no_code_of_others(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A test begins as a process does, in which nothing of others has been loaded."""
+    from maniskill_tomato import extension_points
+
+    monkeypatch.setattr(extension_points, "_foreign", {})
+    monkeypatch.setattr(extension_points, "_loaded", set())
+
+
 @pytest.fixture
 def extras(extras_site: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
     """Has that package in this process; what it registers is forgotten afterwards."""
     import gymnasium
 
-    from maniskill_tomato import extension_points, task_registry
+    from maniskill_tomato import task_registry
 
     monkeypatch.syspath_prepend(str(extras_site))
     monkeypatch.setattr(task_registry, "_registered", dict(task_registry._registered))
     monkeypatch.setattr(task_registry, "_of_path", {})
-    monkeypatch.setattr(extension_points, "_loaded", set())
     known = set(gymnasium.registry)
     yield extras_site
     for env_id in set(gymnasium.registry) - known:

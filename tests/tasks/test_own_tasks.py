@@ -216,7 +216,6 @@ def test_no_plants_are_imported_because_a_file_names_them(
 ) -> None:
     (tmp_path / "planted_pots.py").write_text("raise SystemExit('the module ran')\n")
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(extension_points, "_loaded", set())
     plant = {"generator": "planted_pots:grow"}
     written = {"env_id": GUIDED, "seed": 0, "config": {}, "env_options": {"plant": plant}}
     (tmp_path / "config.json").write_text(json.dumps(written))
