@@ -14,6 +14,7 @@ import pytest
 from gymnasium.utils.env_checker import check_env
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
 
+from maniskill_tomato.cli import main
 from maniskill_tomato.errors import InvalidInputError
 from maniskill_tomato.learning.rl.gymnasium_env import (
     CENTRE,
@@ -23,7 +24,9 @@ from maniskill_tomato.learning.rl.gymnasium_env import (
     make_gymnasium_env,
 )
 from maniskill_tomato.learning.rl.gymnasium_vec import make_gymnasium_vec
+from maniskill_tomato.policies.registry import PolicyContext
 from maniskill_tomato.tasks import THESIS_IDS
+from maniskill_tomato.tasks.making import make_world
 
 ROOT = Path(__file__).resolve().parent.parent
 SCALE = (0.35, 0.35, 0.35, 0.6, 0.6, 0.6)
@@ -313,3 +316,38 @@ def test_ap_gym_takes_a_prediction_of_what_is_visible_with_every_move() -> None:
         assert [terminated, truncated] == ended
     env.close()
     plain.close()
+
+
+def test_other_criteria_of_the_greedy_search_prefer_what_is_not_known_yet() -> None:
+    """Round the target, of views that the arm can take: what a look tells of is worth less afterwards."""
+    example = load_example("greedy_criteria")
+    world = make_world("TomatoViewpoint-v1", 1, plant={"seed": 3})
+    world.reset(0)
+    belief = world.belief
+    views = belief.lattice.positions(belief.target_position)
+    nearest = (views - belief.camera_position[:, None]).norm(dim=-1).argmin(dim=1)
+    far = (views - belief.camera_position[:, None]).norm(dim=-1) > 0.3
+    for name in ("coverage", "entropy"):
+        search = getattr(example, name)(PolicyContext())
+        gain = search.gain(belief, views)
+        assert gain.shape == views.shape[:2]
+        assert not bool(gain[~belief.reachable].any())
+        told = gain[belief.reachable]
+        assert bool((told >= 0).all()) and 0.0 < float(told.max()) <= 2 * example.STEPS
+        # The camera stands near one of them and has looked from there.
+        open_views = gain[belief.reachable & far]
+        assert float(gain[0, nearest]) < float(open_views.mean())
+
+
+def test_the_greedy_search_with_other_criteria_runs_in_the_benchmark(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(ROOT / "examples")
+    monkeypatch.syspath_prepend(str(ROOT / "examples"))
+    policies = "greedy_criteria:coverage,greedy_criteria:entropy"
+    main(
+        ["benchmark", "--policies", policies, "--episodes", "2", "--jobs", "1", "--no-pictures"]
+        + ["--out", str(tmp_path)]
+    )
+    text = capsys.readouterr().out
+    assert "| greedy_criteria:coverage |" in text and "| greedy_criteria:entropy |" in text

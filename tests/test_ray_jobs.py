@@ -1,5 +1,6 @@
 """Jobs on a Ray cluster of this machine's processes: results, errors, lost workers, and whole commands."""
 
+import importlib
 import json
 import math
 import os
@@ -58,10 +59,9 @@ def work(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Any]:
         patch.setenv("PYTHONPATH", f"{folder}{os.pathsep}{os.environ.get('PYTHONPATH', '')}")
         patch.delenv("RAY_ADDRESS", raising=False)
         patch.syspath_prepend(str(folder))
-        import ray_work  # pyright: ignore[reportMissingImports]
-
+        functions = importlib.import_module("ray_work")
         with jobs_on_ray():
-            yield ray_work
+            yield functions
     sys.modules.pop("ray_work", None)
 
 
