@@ -93,14 +93,15 @@ class D435CameraConfig(CameraConfig):  # type: ignore[misc]
 class LimitedKinematics(Kinematics):  # type: ignore[misc]
     """ManiSkill's inverse kinematics, of which solutions beyond the joints' limits count as none."""
 
-    def compute_ik(self, pose: Any, q0: torch.Tensor, **options: Any) -> torch.Tensor | None:
+    def compute_ik(self, pose: Any, q0: torch.Tensor, *arguments: Any, **options: Any) -> torch.Tensor | None:
         """Joint positions that reach a pose, those of `q0` for arms that do not. Shape (num_envs, 7)."""
-        solved: torch.Tensor | None = super().compute_ik(pose, q0, **options)
+        solved: Any = super().compute_ik(pose, q0, *arguments, **options)
         if solved is None:
             return None
         lower, upper = self.articulation.get_qlimits().unbind(-1)
         within = ((solved >= lower) & (solved <= upper)).all(dim=-1, keepdim=True)
-        return torch.where(within, solved, q0)
+        limited: torch.Tensor = torch.where(within, solved, q0)
+        return limited
 
 
 class EEPosController(PDEEPosController):  # type: ignore[misc]
