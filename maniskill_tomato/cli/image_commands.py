@@ -8,7 +8,6 @@ from typing import Annotated, ClassVar, Literal
 import tyro
 
 from maniskill_tomato.cli.early_checks import check_counts, check_folder, check_place, check_segmenter
-from maniskill_tomato.cli.shared_options import Ray
 from maniskill_tomato.errors import InvalidInputError
 from maniskill_tomato.ray_jobs import jobs_on_ray
 
@@ -41,7 +40,8 @@ class Dataset:
     """Share of the scenes in which another arm works; only some of their images show it."""
     jobs: int | None = None
     """Processes; by default one per processor core."""
-    ray: Ray = False
+    ray: bool = False
+    """Do the work on a Ray cluster (extra `ray`): the one at RAY_ADDRESS, else one of this machine's cores."""
 
     def run(self) -> None:
         """Renders what is missing and says where it is."""

@@ -14,7 +14,7 @@ from maniskill_tomato.cli.early_checks import (
     check_place,
     check_policies,
 )
-from maniskill_tomato.cli.shared_options import Ray, say
+from maniskill_tomato.cli.shared_options import say
 from maniskill_tomato.errors import InvalidInputError
 from maniskill_tomato.experiments.configs import (
     AblationConfig,
@@ -37,7 +37,8 @@ from maniskill_tomato.tasks import TASK_IDS
 class Benchmark(BenchmarkConfig):
     """Compare policies on the same held-out episodes: benchmark.json, plots and report.html."""
 
-    ray: Ray = False
+    ray: bool = False
+    """Do the work on a Ray cluster (extra `ray`): the one at RAY_ADDRESS, else one of this machine's cores."""
 
     def run(self) -> None:
         """Runs what is missing and says where the results are."""
@@ -119,7 +120,8 @@ class Reproduce(ReproductionConfig):
 
     experiment: Annotated[ExperimentName, tyro.conf.Positional]
     """guided: section 5-1; sparse: section 5-2."""
-    ray: Ray = False
+    ray: bool = False
+    """Do the work on a Ray cluster (extra `ray`): the one at RAY_ADDRESS, else one of this machine's cores."""
 
     def run(self) -> None:
         """Trains and judges what is missing, and says where the results are."""

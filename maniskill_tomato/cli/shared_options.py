@@ -23,12 +23,6 @@ TASK_HELP: Final = (
 
 EnvId = Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="ENV_ID", help=TASK_HELP)]
 
-RAY_HELP: Final = (
-    "Do the work on a Ray cluster (extra `ray`): the one at RAY_ADDRESS, else one of this machine's cores."
-)
-
-Ray = Annotated[bool, tyro.conf.arg(help=RAY_HELP)]
-
 
 @dataclass(frozen=True, kw_only=True)
 class PlantOptions:

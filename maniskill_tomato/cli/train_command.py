@@ -11,7 +11,7 @@ import tyro
 
 from maniskill_tomato.cli.arguments import Flat
 from maniskill_tomato.cli.early_checks import check_counts, check_env_id, check_file, task_word
-from maniskill_tomato.cli.shared_options import TASK_HELP, PlantOptions, Ray, merge_options
+from maniskill_tomato.cli.shared_options import TASK_HELP, PlantOptions, merge_options
 from maniskill_tomato.errors import InvalidInputError, SeedsFailedError
 from maniskill_tomato.learning.rl.config_file import RunFile, parse_seeds, read_run_config, read_run_file
 from maniskill_tomato.learning.rl.presets import (
@@ -51,7 +51,8 @@ class Train:
     """Train one run for each of these seeds, as in 0 1 2 or 0..4, each in a process of its own."""
     jobs: int | None = None
     """How many of them at a time; by default one per processor core."""
-    ray: Ray = False
+    ray: bool = False
+    """Do the work on a Ray cluster (extra `ray`): the one at RAY_ADDRESS, else one of this machine's cores."""
     out: Path | None = None
     """Folder of the run or runs; by default one below runs/ named after the task, the preset, the seed and the
     time."""

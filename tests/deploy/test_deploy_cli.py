@@ -44,6 +44,7 @@ finally:
         if name.split(".")[0] in ("mani_skill", "sapien") or name.startswith(
             ("maniskill_tomato.learning.rl.agent", "maniskill_tomato.learning.rl.trainer", "maniskill_tomato.tasks.")
         )
+        if name != "maniskill_tomato.tasks.registration"  # The names of the tasks, which come with the package.
     )
     print("LOADED", loaded)
 """
