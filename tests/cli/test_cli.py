@@ -319,6 +319,7 @@ def test_the_demo_names_its_report_and_its_policy(tmp_path: Path, capsys: pytest
 
 
 @pytest.mark.render
+@pytest.mark.slow
 def test_an_evaluation_films_an_episode_where_it_can_render(tmp_path: Path) -> None:
     main(["eval", GUIDED, "--out", str(tmp_path), "--episodes", "1", "--no-baseline"])
     reader = imageio.get_reader(tmp_path / "video.mp4")

@@ -347,6 +347,7 @@ def test_a_run_that_stopped_goes_on_bit_for_bit(tmp_path: Path, on_disk: bool) -
     assert whole["counters"]["updates"] == parts["counters"]["updates"] > 15
 
 
+@pytest.mark.slow
 def test_the_command_trains_evaluates_and_exports_with_the_pixel_preset(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
