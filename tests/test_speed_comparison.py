@@ -8,16 +8,15 @@ from typing import Any
 
 import pytest
 
-ROOT = Path(__file__).resolve().parents[1]
-sys.path.insert(0, str(ROOT / "scripts"))
-
-from benchmarking.comparison import (  # noqa: E402
+from benchmarking.comparison import (
     check_same_kind,
     compare_rates,
     comparison_text,
     read_run,
 )
-from maniskill_tomato.errors import InvalidInputError  # noqa: E402
+from maniskill_tomato.errors import InvalidInputError
+
+ROOT = Path(__file__).resolve().parents[1]
 
 
 def rates(**turns: list[float]) -> dict[str, dict[str, float]]:

@@ -317,10 +317,10 @@ class Scripted(PreTrainedPolicy):
         return {}
 
     def forward(self, batch: dict[str, Any]) -> tuple[torch.Tensor, None]:
-        raise NotImplementedError
+        raise NotImplementedError  # Of training, which LeRobot's evaluation does not ask for.
 
     def predict_action_chunk(self, batch: dict[str, Any], **kwargs: Any) -> torch.Tensor:
-        raise NotImplementedError
+        raise NotImplementedError  # Of policies that plan several moves; this one has `select_action` alone.
 
 
 def check_env(work: Path) -> dict[str, Any]:

@@ -105,7 +105,7 @@ def _read(path: Path, task: str | None) -> EpisodeSource:
         from maniskill_tomato.conversion.recorded_runs import read_run
 
         return read_run(path, task)
-    from maniskill_tomato.conversion.demonstrations import read_demonstrations
+    from maniskill_tomato.conversion.demonstration_episodes import read_demonstrations
 
     return read_demonstrations(path, task)
 

@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from maniskill_tomato.conversion.episodes import FLAG, Episode, Feature
-from maniskill_tomato.conversion.statistics import (
+from maniskill_tomato.conversion.feature_statistics import (
     PixelStatistics,
     Statistics,
     joined_statistics,

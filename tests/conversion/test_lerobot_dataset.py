@@ -21,24 +21,17 @@ from maniskill_tomato.deploy.policy_run import RunConfig, run
 from maniskill_tomato.deploy.profile import parse_profile
 from maniskill_tomato.deploy.run_replay import RecordedRun, load_recording
 from maniskill_tomato.errors import InvalidInputError, NotWrittenError, TomatoError
+from twin_profile import TWIN_PROFILE
 
 parquet = pytest.importorskip("pyarrow.parquet", reason="pyarrow is not installed")
 
-TWIN = """
-[arm]
-driver = "mock"
-[camera]
-driver = "mock"
-[twin]
-width = 160
-height = 120
-[perception]
-segmenter = "ground_truth"
-[target]
-source = "twin"
+TWIN = (
+    TWIN_PROFILE
+    + """
 [loop]
 max_moves = 3
 """
+)
 
 
 @pytest.fixture(scope="module")

@@ -10,26 +10,13 @@ from maniskill_tomato.deploy.arm_session import ArmSession
 from maniskill_tomato.deploy.deploy_errors import NotConnectedError, RefusedError, StoppedError
 from maniskill_tomato.deploy.profile import parse_profile
 from maniskill_tomato.deploy.workcell import make_workcell
-
-TWIN = """
-[arm]
-driver = "mock"
-[camera]
-driver = "mock"
-[twin]
-width = 160
-height = 120
-[perception]
-segmenter = "ground_truth"
-[target]
-source = "twin"
-"""
+from twin_profile import TWIN_PROFILE
 
 TURN = np.array([0.0, 0.02, 0.0, -0.02, 0.0, 0.01, 0.05])
 
 
 def session(may_move: bool = True, extra: str = "") -> ArmSession:
-    return ArmSession(make_workcell(parse_profile(TWIN + extra, Path("twin.toml"))), may_move)
+    return ArmSession(make_workcell(parse_profile(TWIN_PROFILE + extra, Path("twin.toml"))), may_move)
 
 
 def test_a_move_ends_where_it_was_sent_and_pictures_come_after_it() -> None:
@@ -92,7 +79,7 @@ def test_an_interrupted_move_is_stopped_and_none_follows_until_the_next_connecti
 
 
 def test_a_real_arm_moves_only_for_a_program_that_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
-    workcell = make_workcell(parse_profile(TWIN, Path("twin.toml")))
+    workcell = make_workcell(parse_profile(TWIN_PROFILE, Path("twin.toml")))
     monkeypatch.setattr(workcell.camera, "simulated", False)
     monkeypatch.setattr(workcell.arm, "simulated", False)  # As far as anybody can tell.
     arm = ArmSession(workcell, may_move=False)

@@ -30,25 +30,18 @@ from maniskill_tomato.plants.organs import Role
 from maniskill_tomato.policies.opening import open_policy
 from maniskill_tomato.sensing.image_layout import ImageLayout
 from maniskill_tomato.sensing.observation import ObservationLayout
+from twin_profile import TWIN_PROFILE
 
 TASK = "TomatoViewpoint-v1"
 SEED = 9
-PROFILE = """
-[arm]
-driver = "mock"
-[camera]
-driver = "mock"
-[twin]
-width = 160
-height = 120
-[perception]
-segmenter = "ground_truth"
-[target]
-source = "twin"
+PROFILE = (
+    TWIN_PROFILE
+    + """
 [loop]
 max_moves = 5
 threshold = 0.999
 """
+)
 
 
 def saved(path: Path, bound: float = 1.0) -> Path:

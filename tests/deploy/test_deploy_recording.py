@@ -26,22 +26,15 @@ from maniskill_tomato.errors import TomatoError
 from maniskill_tomato.robot.d435 import T_flange_camera_color_optical
 from maniskill_tomato.segmentation.colour_segmenter import ColourSegmenter
 from maniskill_tomato.segmentation.segmenter import SEGMENTERS
+from twin_profile import TWIN_PROFILE
 
-TEXT = """
-[arm]
-driver = "mock"
-[camera]
-driver = "mock"
-[twin]
-width = 160
-height = 120
-[perception]
-segmenter = "ground_truth"
-[target]
-source = "twin"
+TEXT = (
+    TWIN_PROFILE
+    + """
 [loop]
 max_moves = 4
 """
+)
 
 
 def profile(text: str = TEXT) -> Profile:

@@ -30,6 +30,7 @@ from maniskill_tomato.robot.iiwa14 import IIWA14, LINK_NAMES, READY_QPOS
 from maniskill_tomato.robot.kinematics import forward_kinematics, link_transforms
 from maniskill_tomato.robot.robot_description import link_meshes, urdf_path
 from maniskill_tomato.sensing.belief import Belief
+from twin_profile import TWIN_PROFILE
 
 mj: Any = mujoco
 
@@ -222,24 +223,16 @@ class Scripted(Planner):
         return torch.tensor([next(self.actions)])
 
 
-LEAVES = """
-[arm]
-driver = "mock"
-[camera]
-driver = "mock"
-[twin]
-width = 160
-height = 120
-[perception]
-segmenter = "ground_truth"
-[target]
-source = "twin"
+LEAVES = (
+    TWIN_PROFILE
+    + """
 [loop]
 threshold = 0.95
 max_moves = 4
 [safety]
 plant_clearance = 0.02
 """
+)
 
 
 def test_the_loop_goes_round_the_leaves_that_stop_a_move_without_touching_them(

@@ -149,7 +149,13 @@ PUBLIC: Final[dict[str, tuple[str, ...]]] = {
         "sim2real",
         "deploy_errors",
     ),
-    "conversion": ("lerobot_conversion", "lerobot_dataset", "episodes", "demonstrations", "recorded_runs"),
+    "conversion": (
+        "lerobot_conversion",
+        "lerobot_dataset",
+        "episodes",
+        "demonstration_episodes",
+        "recorded_runs",
+    ),
 }
 """The public modules of each room, the most useful first; rooms in the order of the map in CONTRIBUTING.md."""
 
