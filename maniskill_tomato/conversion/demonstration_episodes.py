@@ -20,11 +20,14 @@ from maniskill_tomato.conversion.episodes import (
 )
 from maniskill_tomato.conversion.recorded_runs import MOVE_NAMES, ONE_FRUIT, WHOLE_ROW
 from maniskill_tomato.errors import InvalidInputError
-from maniskill_tomato.learning.imitation.trajectory_arrays import opened_trajectories, stored_array
+from maniskill_tomato.learning.imitation.trajectory_arrays import (
+    opened_trajectories,
+    read_description,
+    stored_array,
+)
 from maniskill_tomato.policies.layout import ACTION_NAMES, OBSERVATION_NAMES
 from maniskill_tomato.robot.iiwa14 import JOINT_NAMES
 from maniskill_tomato.task_registry import GENERAL_IDS, base_of
-from maniskill_tomato.text_files import read_json
 
 ROBOT: Final = "iiwa14_d435"
 """ManiSkill's name of the robot of this package's tasks."""
@@ -88,15 +91,8 @@ def _action_names(about: Mapping[str, Any]) -> tuple[str, ...] | None:
 
 def _about(path: Path) -> dict[str, Any]:
     """What the description says of the task, and the control mode of the first episode."""
-    description = path.with_suffix(".json")
-    for file in (path, description):
-        if not file.is_file():
-            raise InvalidInputError(
-                f"there is no file {file}; demonstrations are a .h5 file and a .json file of the same name"
-            )
-    content = read_json(description)
-    about = content.get("env_info") if isinstance(content, dict) else None
-    episodes = content.get("episodes") if isinstance(content, dict) else None
+    content = read_description(path)
+    about, episodes = content.get("env_info"), content.get("episodes")
     first = episodes[0] if isinstance(episodes, list) and episodes else None
     mode = first.get("control_mode") if isinstance(first, dict) else None
     return {**(about if isinstance(about, dict) else {}), "control_mode": mode}

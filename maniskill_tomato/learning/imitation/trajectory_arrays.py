@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from maniskill_tomato.errors import InvalidInputError, MissingPackageError
+from maniskill_tomato.text_files import read_json
 
 
 @contextmanager
@@ -70,3 +71,19 @@ def stored_array(path: Path, episode: Any, name: str) -> Any | None:
     if found.is_virtual or found.external:
         raise InvalidInputError(f"{path}: {episode.name}/{name} must lie in the file itself")
     return found
+
+
+def read_description(path: Path) -> dict[str, Any]:
+    """What the .json file beside demonstrations says; empty where it holds something else than names and values.
+
+    Raises:
+        InvalidInputError: One of the two files is not there, or the description is no JSON.
+    """
+    description = path.with_suffix(".json")
+    for file in (path, description):
+        if not file.is_file():
+            raise InvalidInputError(
+                f"there is no file {file}; demonstrations are a .h5 file and a .json file of the same name"
+            )
+    content = read_json(description)
+    return content if isinstance(content, dict) else {}

@@ -11,9 +11,12 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from maniskill_tomato.errors import InvalidInputError
-from maniskill_tomato.learning.imitation.trajectory_arrays import opened_trajectories, stored_array
+from maniskill_tomato.learning.imitation.trajectory_arrays import (
+    opened_trajectories,
+    read_description,
+    stored_array,
+)
 from maniskill_tomato.task_registry import is_same_task
-from maniskill_tomato.text_files import read_json
 
 LARGEST_OBSERVATIONS: Final = 1_000_000_000
 """Of all episodes of a file together, unpacked, in [bytes]."""
@@ -67,14 +70,7 @@ def read_demonstrations(path: Path, env_id: str) -> DemonstratedViews:
 
 def _check_task(path: Path, env_id: str) -> None:
     """Refuses a file that is not there, or of another task."""
-    description = path.with_suffix(".json")
-    for file in (path, description):
-        if not file.is_file():
-            raise InvalidInputError(
-                f"there is no file {file}; demonstrations are a .h5 file and a .json file of the same name"
-            )
-    content = read_json(description)
-    about = content.get("env_info") if isinstance(content, dict) else None
+    about = read_description(path).get("env_info")
     recorded = about.get("env_id") if isinstance(about, dict) else None
     if not is_same_task(str(recorded), env_id):
         raise InvalidInputError(
