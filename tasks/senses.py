@@ -35,7 +35,7 @@ VIEWS_A_SEED = 256
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class ViewMeasurement:
-    """What N environments sense in a view."""
+    """What N environments sense in a view; rows of those that do not look mean nothing."""
 
     rays: ViewRays
     """The pattern about where the targets are believed to be."""
@@ -230,8 +230,10 @@ class ExactSenses:
         """Casts rays."""
         world = self._world
         target, T_w_plant = world.state.target, world.plant_batch.T_world_plant
-        seen = world.scene.visibility(view.T_w_camera, target, T_w_plant, view.T_w_links)
-        rays = world.scene.view_rays(view.T_w_camera, target, self.known_target(), T_w_plant, view.T_w_links)
+        seen = world.scene.visibility(view.T_w_camera, target, T_w_plant, view.T_w_links, view.mask)
+        rays = world.scene.view_rays(
+            view.T_w_camera, target, self.known_target(), T_w_plant, view.T_w_links, view.mask
+        )
         if self._errors.are_in_rays:
             rays = self._errors.rays(rays, view.seeds(world.state.noise_seed))
         fraction = seen.visible_fraction
@@ -404,11 +406,11 @@ class CameraSenses:
         """What was sensed, with the truth about the targets and about the fruits that were taken for them."""
         world = self._world
         target, T_w_plant = world.state.target, world.plant_batch.T_world_plant
-        seen = world.scene.visibility(view.T_w_camera, target, T_w_plant, view.T_w_links)
+        seen = world.scene.visibility(view.T_w_camera, target, T_w_plant, view.T_w_links, view.mask)
         at = torch.where(chosen == NO_FRUIT, target, chosen)
         of_chosen = seen
         if not torch.equal(at, target):
-            of_chosen = world.scene.visibility(view.T_w_camera, at, T_w_plant, view.T_w_links)
+            of_chosen = world.scene.visibility(view.T_w_camera, at, T_w_plant, view.T_w_links, view.mask)
         return ViewMeasurement(
             rays=self._perception.rays(),
             visible_fraction=self._perception.sure_fraction,

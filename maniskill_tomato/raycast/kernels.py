@@ -69,6 +69,8 @@ class Views:
     """Plant frame to world. Shape (B,)."""
     link_poses: wp.array2d[wp.mat44]
     """Link frames to world. Shape (B, 9)."""
+    asked: wp.array[wp.int32]
+    """0 for views that nobody asks about, of which nothing is worked out. Shape (B,)."""
 
     plant_rotations: wp.array[wp.mat33]
     """Optical frame to plant frame. Shape (B,)."""
@@ -211,6 +213,8 @@ def links_between(scene: Scene, views: Views, view: int, centre: wp.vec3, radius
 def prepare(scene: Scene, views: Views):
     """Relative poses, the links to be considered and the target's rectangle of one view."""
     view = wp.tid()
+    if views.asked[view] == 0:
+        return
     camera = rotation(views.camera_poses[view])
     position = translation(views.camera_poses[view])
     plant_pose = views.plant_poses[view]

@@ -119,7 +119,12 @@ class RayScene:
             self._plants[env_index] = plant
 
     def visibility(
-        self, T_w_camera: Tensor, target_fruit: Tensor, T_w_plant: Tensor, T_w_links: Tensor | None = None
+        self,
+        T_w_camera: Tensor,
+        target_fruit: Tensor,
+        T_w_plant: Tensor,
+        T_w_links: Tensor | None = None,
+        mask: Tensor | None = None,
     ) -> Visibility:
         """What each environment's camera sees of its target.
 
@@ -129,14 +134,16 @@ class RayScene:
                 exist gives NaN. Shape (N,).
             T_w_plant: Poses of the plants. Shape (N, 4, 4).
             T_w_links: Poses of `iiwa14.LINK_NAMES`; None for no robot. Shape (N, 9, 4, 4).
+            mask: The environments that are asked about, all if None; the answers of the others mean nothing.
+                Shape (N,), bool.
 
         Raises:
             InvalidInputError: A tensor has the wrong shape or a target does not exist.
         """
-        self._check_views(T_w_camera, target_fruit, T_w_plant, T_w_links)
+        self._check_views(T_w_camera, target_fruit, T_w_plant, T_w_links, mask)
         if self._device.type == "cpu":
             self._check_targets(target_fruit)
-        return self._rays.visibility(T_w_camera, target_fruit, T_w_plant, T_w_links)
+        return self._rays.visibility(T_w_camera, target_fruit, T_w_plant, T_w_links, mask)
 
     def visible_fraction_from(
         self,
@@ -188,6 +195,7 @@ class RayScene:
         target_position: Tensor,
         T_w_plant: Tensor,
         T_w_links: Tensor | None = None,
+        mask: Tensor | None = None,
     ) -> ViewRays:
         """Looks along the pattern of `view_rays.ray_pattern` in each environment.
 
@@ -199,13 +207,14 @@ class RayScene:
                 frame, in [m]. Shape (N, 3).
             T_w_plant: Poses of the plants. Shape (N, 4, 4).
             T_w_links: Poses of `iiwa14.LINK_NAMES`; None for no robot. Shape (N, 9, 4, 4).
+            mask: As in `visibility`.
 
         Raises:
             InvalidInputError: A tensor has the wrong shape.
         """
-        self._check_views(T_w_camera, target_fruit, T_w_plant, T_w_links)
+        self._check_views(T_w_camera, target_fruit, T_w_plant, T_w_links, mask)
         _check_shape("target_position", target_position, (self.num_envs, 3))
-        return self._rays.view_rays(T_w_camera, target_fruit, target_position, T_w_plant, T_w_links)
+        return self._rays.view_rays(T_w_camera, target_fruit, target_position, T_w_plant, T_w_links, mask)
 
     def image(
         self,
@@ -305,7 +314,12 @@ class RayScene:
         return self._rays.clearance(link_transforms(qpos)[:, None], T_w_plant, env_idx, CLEARANCE_RANGE)
 
     def _check_views(
-        self, T_w_camera: Tensor, target_fruit: Tensor, T_w_plant: Tensor, T_w_links: Tensor | None
+        self,
+        T_w_camera: Tensor,
+        target_fruit: Tensor,
+        T_w_plant: Tensor,
+        T_w_links: Tensor | None,
+        mask: Tensor | None = None,
     ) -> None:
         """Checks the arguments that describe one view in each environment."""
         _check_shape("T_w_camera", T_w_camera, self._poses_shape)
@@ -313,6 +327,8 @@ class RayScene:
         _check_shape("T_w_plant", T_w_plant, self._poses_shape)
         if T_w_links is not None:
             _check_shape("T_w_links", T_w_links, self._links_shape)
+        if mask is not None:
+            _check_shape("mask", mask, self._row_shape)
 
     def _check_targets(self, target_fruit: Tensor) -> None:
         for env, (target, plant) in enumerate(zip(target_fruit.tolist(), self._plants, strict=True)):

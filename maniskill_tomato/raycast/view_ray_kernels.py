@@ -71,6 +71,8 @@ def trace_view_rays(
 ):
     """One ray of the pattern: its direction in the optical frame, what it meets and how far away."""
     view, ray = wp.tid()
+    if views.asked[view] == 0:
+        return
     camera_pose = views.camera_poses[view]
     camera_position = translation(camera_pose)
     target_position = target_positions[view]

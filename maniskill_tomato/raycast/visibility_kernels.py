@@ -50,6 +50,8 @@ class Counts:
 def trace_target(scene: Scene, views: Views, camera: FieldOfView, pattern: wp.array[wp.vec2], counts: Counts):
     """One ray through the target's rectangle: whether it belongs to the silhouette, and whether it is visible."""
     view, ray = wp.tid()
+    if views.asked[view] == 0:
+        return
     box = views.rectangles[view]
     if box[2] <= box[0] or box[3] <= box[1]:
         return
@@ -71,6 +73,8 @@ def trace_target(scene: Scene, views: Views, camera: FieldOfView, pattern: wp.ar
 def trace_others(scene: Scene, views: Views, camera: FieldOfView, pattern: wp.array[wp.vec2], counts: Counts):
     """Whether another ripe fruit is seen, asked only where nothing of the target is."""
     view, fruit = wp.tid()
+    if views.asked[view] == 0:
+        return
     env = views.environments[view]
     if counts.visible[view] > 0 or scene.fruit_is_ripe[env, fruit] == 0 or fruit == views.targets[view]:
         return
@@ -107,6 +111,8 @@ def summarise(
 ):
     """Rays to fractions and pixels, for one view; the rows of `results` are those of `RESULTS`. Counts begin anew."""
     view = wp.tid()
+    if views.asked[view] == 0:
+        return
     seen = float(counts.visible[view])
     total = float(counts.silhouette[view])
     any_seen = counts.any_seen[view]

@@ -110,10 +110,15 @@ class WarpScene:
             self._write_rows(list(meshes))
 
     def visibility(
-        self, T_w_camera: Tensor, target_fruit: Tensor, T_w_plant: Tensor, T_w_links: Tensor | None
+        self,
+        T_w_camera: Tensor,
+        target_fruit: Tensor,
+        T_w_plant: Tensor,
+        T_w_links: Tensor | None,
+        mask: Tensor | None,
     ) -> Visibility:
         """See `RayScene.visibility`."""
-        self._views.place(T_w_camera, target_fruit, T_w_plant, T_w_links)
+        self._views.place(T_w_camera, target_fruit, T_w_plant, T_w_links, mask)
         recorded = self._recorded(self._record_visibility, self._views)
         recorded.launch()
         return Visibility(recorded.outputs[0].clone())
@@ -150,10 +155,11 @@ class WarpScene:
         target_position: Tensor,
         T_w_plant: Tensor,
         T_w_links: Tensor | None,
+        mask: Tensor | None,
     ) -> ViewRays:
         """See `RayScene.view_rays`."""
         recorded = self._recorded(self._record_view_rays)
-        self._views.place(T_w_camera, target_fruit, T_w_plant, T_w_links)
+        self._views.place(T_w_camera, target_fruit, T_w_plant, T_w_links, mask)
         recorded.inputs[0].copy_(target_position)
         recorded.launch()
         directions, distances, labels = recorded.outputs
@@ -443,6 +449,8 @@ class _Views:
         self._links_away[..., :3, 3] = _FAR_AWAY
         self._link_poses = self._links_away.clone()
         self._robot_present = False
+        self._asked = torch.ones(count, dtype=torch.int32, device=device)
+        self._all_asked = True
 
         def floats(dtype: Any, *shape: int) -> Any:
             return wp.from_torch(torch.zeros(shape, device=device), dtype=dtype)
@@ -453,6 +461,7 @@ class _Views:
         views.camera_poses = wp.from_torch(self._camera_poses, dtype=wp.mat44)
         views.plant_poses = wp.from_torch(self._plant_poses, dtype=wp.mat44)
         views.link_poses = wp.from_torch(self._link_poses, dtype=wp.mat44)
+        views.asked = wp.from_torch(self._asked)
         views.plant_rotations = floats(wp.mat33, count, 3, 3)
         views.plant_positions = floats(wp.vec3, count, 3)
         views.link_rotations = floats(wp.mat33, count, links, 3, 3)
@@ -463,7 +472,12 @@ class _Views:
         self.struct = views
 
     def place(
-        self, T_w_camera: Tensor, target_fruit: Tensor | int, T_w_plant: Tensor, T_w_links: Tensor | None
+        self,
+        T_w_camera: Tensor,
+        target_fruit: Tensor | int,
+        T_w_plant: Tensor,
+        T_w_links: Tensor | None,
+        mask: Tensor | None = None,
     ) -> None:
         """Fills the first K views.
 
@@ -472,7 +486,13 @@ class _Views:
             target_fruit: Shape (K,), or one for all.
             T_w_plant: Shape (K, 4, 4), or (4, 4) for all.
             T_w_links: Shape (K, 9, 4, 4), or (9, 4, 4) for one; None for no robot.
+            mask: Which are asked about; all if None. Shape (B,), bool.
         """
+        if mask is not None:
+            self._asked.copy_(mask)
+        elif not self._all_asked:
+            self._asked.fill_(1)
+        self._all_asked = mask is None
         count = T_w_camera.shape[0] if T_w_camera.dim() == 3 else 1
         tables = self._camera_poses, self._plant_poses, self._targets, self._link_poses
         cameras, plants, targets, links = (

@@ -13,7 +13,7 @@ import warp as wp
 from maniskill_tomato.raycast.kernels import rotation, translation
 from maniskill_tomato.raycast.view_ray_kernels import OTHER, OUTSIDE, look_axes
 
-wp.set_module_options({"enable_backward": False, "max_unroll": 4})
+wp.set_module_options({"enable_backward": False, "max_unroll": 8})
 
 CELLS = wp.constant(32)
 """Voxels along each edge of the grid."""
@@ -23,6 +23,8 @@ PASS_UNIT = wp.constant(256.0)
 """Passed lengths are kept as integers of this many to a voxel edge: their sum does not depend on the order."""
 KNOWN_LENGTH = wp.constant(64)
 """A voxel without a hit through which less than this has passed (a quarter of its edge) is unknown."""
+VOXELS = wp.constant(32768)
+"""Of the grid, a power of two."""
 BLOCK = wp.constant(4)
 """Voxels along each edge of the largest block whose density stands in for what is not seen of it."""
 BLOCKS = wp.constant(512)
@@ -34,6 +36,7 @@ MAX_VISITS = wp.constant(64)
 
 
 vec8 = wp.types.vector(length=8, dtype=wp.float32)
+ints8 = wp.types.vector(length=8, dtype=wp.int32)
 
 
 @wp.struct
@@ -46,6 +49,12 @@ class Grid:
     """Length that rays went through the voxel, in `PASS_UNIT`. Shape (B, 32768)."""
     densities: wp.array2d[wp.float32]
     """Estimated hits per voxel edge, less than 0 (its negative) where the voxel is unknown. Shape (B, 32768)."""
+    hit_rows: wp.array2d[wp.vec4i]
+    """The same memory as `hits`, four voxels each. Shape (B, 8192)."""
+    pass_rows: wp.array2d[wp.vec4i]
+    density_rows: wp.array2d[wp.vec4]
+    changed: wp.array2d[wp.int32]
+    """1 for blocks whose densities are older than their hits and passes. Shape (B, 512)."""
     centres: wp.array[wp.vec3]
     """The target, in the world frame, in [m]. Shape (B,)."""
     visited: wp.array2d[wp.vec3]
@@ -130,6 +139,12 @@ def voxel_of(walk: Walk) -> int:
 
 
 @wp.func
+def block_of(walk: Walk) -> int:
+    side = CELLS // BLOCK
+    return ((walk.x // BLOCK) * side + walk.y // BLOCK) * side + walk.z // BLOCK
+
+
+@wp.func
 def is_in_grid(walk: Walk) -> bool:
     return (
         walk.x >= 0 and walk.x < CELLS and walk.y >= 0 and walk.y < CELLS and walk.z >= 0 and walk.z < CELLS
@@ -194,6 +209,7 @@ def integrate(
     while is_in_grid(walk):
         voxel = voxel_of(walk)
         before = walk.travelled
+        grid.changed[env, block_of(walk)] = 1
         walk = next_voxel(walk, direction, inverse_direction)
         passed = wp.min(walk.travelled, end) - before
         wp.atomic_add(grid.passes, env, voxel, int(passed * PASS_UNIT + 0.5))
@@ -219,41 +235,47 @@ def first_voxel(block: int) -> int:
 
 @wp.kernel
 def estimate(grid: Grid, foliage: Foliage):
-    """The densities of one block's voxels: leaves are larger than voxels, so that neighbours tell of each other."""
+    """The densities of one block, where out of date. Leaves are larger than voxels: neighbours tell of each other."""
     env, block = wp.tid()
-    first = first_voxel(block)
+    if grid.changed[env, block] == 0:
+        return
+    grid.changed[env, block] = 0
+    first = first_voxel(block) // BLOCK
     half = BLOCK // 2
-    hits = vec8()
-    passes = vec8()
+    hits = ints8()
+    passes = ints8()
     for i in range(BLOCK):
         for j in range(BLOCK):
-            row = first + (i * CELLS + j) * CELLS
+            row = first + (i * CELLS + j) * (CELLS // BLOCK)
+            hit = grid.hit_rows[env, row]
+            passed = grid.pass_rows[env, row]
             part = (i // half) * 4 + (j // half) * 2
-            for k in range(BLOCK):
-                hits[part + k // half] += float(grid.hits[env, row + k])
-                passes[part + k // half] += float(grid.passes[env, row + k])
+            for k in range(half):
+                hits[part + k] = hits[part + k] + hit[k * half] + hit[k * half + 1]
+                passes[part + k] = passes[part + k] + passed[k * half] + passed[k * half + 1]
     all_hits = wp.float32(0.0)
     all_passes = wp.float32(0.0)
     for part in range(8):
-        all_hits += hits[part]
-        all_passes += passes[part]
+        all_hits += float(hits[part])
+        all_passes += float(passes[part])
     whole = posterior(all_hits, all_passes, foliage.density, foliage.block_weight)
     around = vec8()
     for part in range(8):
-        around[part] = posterior(hits[part], passes[part], whole, foliage.block_weight)
+        around[part] = posterior(float(hits[part]), float(passes[part]), whole, foliage.block_weight)
     for i in range(BLOCK):
         for j in range(BLOCK):
-            row = first + (i * CELLS + j) * CELLS
+            row = first + (i * CELLS + j) * (CELLS // BLOCK)
+            hit = grid.hit_rows[env, row]
+            passed = grid.pass_rows[env, row]
             part = (i // half) * 4 + (j // half) * 2
+            densities = wp.vec4()
             for k in range(BLOCK):
-                density = around[part + k // half]
-                hit = grid.hits[env, row + k]
-                passed = grid.passes[env, row + k]
-                if hit != 0 or passed != 0:
-                    density = posterior(float(hit), float(passed), density, foliage.voxel_weight)
-                if hit == 0 and passed < KNOWN_LENGTH:
-                    density = -density
-                grid.densities[env, row + k] = density
+                expected = around[part + k // half]
+                own = posterior(float(hit[k]), float(passed[k]), expected, foliage.voxel_weight)
+                density = wp.where(hit[k] == 0 and passed[k] == 0, expected, own)
+                is_unknown = hit[k] == 0 and passed[k] < KNOWN_LENGTH
+                densities[k] = wp.where(is_unknown, -density, density)
+            grid.density_rows[env, row] = densities
 
 
 @wp.func
@@ -266,13 +288,29 @@ def disc_point(index: int) -> wp.vec2:
 
 @wp.func
 def predicted_view(grid: Grid, foliage: Foliage, env: int, position: wp.vec3) -> wp.vec2:
-    """Expected visible share of the target's disc from a position, and the unknown share of the way there."""
+    """Expected visible share of the target's disc from a position, and the unknown share of the way there.
+
+    All rays go from voxel to voxel in step and without branches, so that a processor works on them at once.
+    """
     target = grid.centres[env]
     axes = look_axes(position, target)
-    seen = wp.float32(0.0)
-    unknown = wp.float32(0.0)
-    whole = wp.float32(0.0)
     goal = in_grid(position, target)
+    borders_x = vec8()
+    borders_y = vec8()
+    borders_z = vec8()
+    across_x = vec8()
+    across_y = vec8()
+    across_z = vec8()
+    steps_x = ints8()
+    steps_y = ints8()
+    steps_z = ints8()
+    voxels = ints8()
+    travelled = vec8()
+    ends = vec8()
+    depths = vec8()
+    unknown = vec8()
+    whole = wp.float32(0.0)
+    left = wp.float32(0.0)
     for ray in range(DISC_RAYS):
         point = foliage.radius * disc_point(ray)
         bulge = wp.sqrt(wp.max(foliage.radius * foliage.radius - wp.dot(point, point), 0.0))
@@ -280,20 +318,48 @@ def predicted_view(grid: Grid, foliage: Foliage, env: int, position: wp.vec3) ->
         length = wp.length(goal - start)
         direction = (goal - start) / wp.max(length, 1.0e-6)
         inverse_direction = wp.vec3(inverse(direction[0]), inverse(direction[1]), inverse(direction[2]))
-        depth = wp.float32(0.0)
         walk = begin_walk(start, direction, inverse_direction, 0.0)
-        while is_in_grid(walk) and walk.travelled < length:
-            voxel = voxel_of(walk)
-            before = walk.travelled
-            walk = next_voxel(walk, direction, inverse_direction)
-            stretch = wp.min(walk.travelled, length) - before
-            density = grid.densities[env, voxel]
-            depth += wp.abs(density) * stretch
-            whole += stretch
-            if density < 0.0:
-                unknown += stretch
-        seen += wp.exp(-depth)
-    return wp.vec2(seen / float(DISC_RAYS), unknown / wp.max(whole, 1.0e-6))
+        borders_x[ray] = walk.borders[0]
+        borders_y[ray] = walk.borders[1]
+        borders_z[ray] = walk.borders[2]
+        across_x[ray] = wp.abs(inverse_direction[0])
+        across_y[ray] = wp.abs(inverse_direction[1])
+        across_z[ray] = wp.abs(inverse_direction[2])
+        steps_x[ray] = wp.where(direction[0] > 0.0, CELLS * CELLS, -CELLS * CELLS)
+        steps_y[ray] = wp.where(direction[1] > 0.0, CELLS, -CELLS)
+        steps_z[ray] = wp.where(direction[2] > 0.0, 1, -1)
+        voxels[ray] = voxel_of(walk)
+        ends[ray] = wp.min(length, inside_stretch(start, inverse_direction)[1])
+        whole += ends[ray]
+        left = wp.max(left, ends[ray])
+    while left > 0.0:
+        left = wp.float32(0.0)
+        for ray in range(DISC_RAYS):
+            x = borders_x[ray]
+            y = borders_y[ray]
+            z = borders_z[ray]
+            goes_x = x <= y and x <= z
+            goes_y = y <= z and not goes_x
+            goes_z = not (goes_x or goes_y)
+            border = wp.min(wp.max(travelled[ray], wp.min(x, wp.min(y, z))), ends[ray])
+            stretch = border - travelled[ray]
+            # Rounding may take a ray that ends on the grid's edge one voxel further, for a length of nothing.
+            density = grid.densities[env, voxels[ray] & (VOXELS - 1)]
+            depths[ray] = depths[ray] + wp.abs(density) * stretch
+            unknown[ray] = unknown[ray] + wp.where(density < 0.0, stretch, 0.0)
+            travelled[ray] = border
+            left = wp.max(left, ends[ray] - border)
+            borders_x[ray] = x + wp.where(goes_x, across_x[ray], 0.0)
+            borders_y[ray] = y + wp.where(goes_y, across_y[ray], 0.0)
+            borders_z[ray] = z + wp.where(goes_z, across_z[ray], 0.0)
+            along = wp.where(goes_y, steps_y[ray], steps_z[ray])
+            voxels[ray] = voxels[ray] + wp.where(goes_x, steps_x[ray], along)
+    seen = wp.float32(0.0)
+    hidden = wp.float32(0.0)
+    for ray in range(DISC_RAYS):
+        seen += wp.exp(-depths[ray])
+        hidden += unknown[ray]
+    return wp.vec2(seen / float(DISC_RAYS), hidden / wp.max(whole, 1.0e-6))
 
 
 @wp.kernel

@@ -179,7 +179,7 @@ class ViewpointObserver:
             rays: What the cameras see.
             visible_fraction: V_f as they measure it. Shape (B,).
             moves_left: Moves until the episode ends. Shape (B,).
-            mask: The environments that looked anew, all if None; the memory of the others stays as it is.
+            mask: The environments that looked anew, all if None; memory and vector of the others stay as they are.
                 Shape (B,), bool.
             qpos: Joint positions, in [rad]; None if no arm holds the cameras. Shape (B, 7).
 
@@ -210,6 +210,10 @@ class ViewpointObserver:
         self._directions.copy_(rays.direction_c)
         self._distances.copy_(rays.distance)
         self._labels.copy_(rays.label)
+        if mask is None:
+            self._looked.fill_(1)
+        else:
+            self._looked.copy_(mask)
         if self._needs_memory:
             self.memory.estimate()
         self._launch()
@@ -262,6 +266,7 @@ class ViewpointObserver:
         self._distances = torch.zeros(b, n, device=device)
         self._labels = torch.zeros(b, n, dtype=torch.int8, device=device)
         self._reachable = torch.zeros(b, self.lattice.size, dtype=torch.uint8, device=device)
+        self._looked = torch.ones(b, dtype=torch.int32, device=device)
         self._observation = torch.zeros(b, self.layout.size, device=device)
         belief: Any = kernels.Belief()
         belief.viewpoints = wp.from_torch(self._viewpoints)
@@ -272,6 +277,7 @@ class ViewpointObserver:
         belief.distances = wp.from_torch(self._distances)
         belief.labels = wp.from_torch(self._labels)
         belief.reachable = wp.from_torch(self._reachable)
+        belief.looked = wp.from_torch(self._looked)
         layout: Any = kernels.Layout()
         slices = self.layout.slices
         for part in PART_SHAPES:

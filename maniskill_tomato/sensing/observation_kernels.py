@@ -53,6 +53,8 @@ class Belief:
     labels: wp.array2d[wp.int8]
     reachable: wp.array2d[wp.uint8]
     """By candidate of the view lattice."""
+    looked: wp.array[wp.int32]
+    """0 where nothing has changed, so that the vector stays as it is."""
 
 
 @wp.struct
@@ -191,6 +193,8 @@ def unreachable_share(belief: Belief, env: int, target: wp.vec3, position: wp.ve
 def observe(belief: Belief, grid: Grid, foliage: Foliage, layout: Layout, out: wp.array2d[wp.float32]):
     """One thread writes the numbers, one each cell of the patch and each direction of the maps."""
     env, part = wp.tid()
+    if belief.looked[env] == 0:
+        return
     target = grid.centres[env]
     position = translation(belief.camera_poses[env])
     patch_cells = PATCH * PATCH

@@ -72,6 +72,8 @@ class OcclusionMemory:
         self._hits = torch.zeros(num_envs, voxels, dtype=torch.int32, device=self.device)
         self._passes = torch.zeros(num_envs, voxels, dtype=torch.int32, device=self.device)
         self._densities = torch.zeros(num_envs, voxels, device=self.device)
+        blocks = int(memory_kernels.BLOCKS)
+        self._changed = torch.ones(num_envs, blocks, dtype=torch.int32, device=self.device)
         self._is_estimated = False
         self._centres = torch.zeros(num_envs, 3, device=self.device)
         self._visited = torch.full((num_envs, MAX_VISITS, 3), math.nan, device=self.device)
@@ -81,6 +83,13 @@ class OcclusionMemory:
         grid.hits = wp.from_torch(self._hits)
         grid.passes = wp.from_torch(self._passes)
         grid.densities = wp.from_torch(self._densities)
+        for name, tensor, dtype in (
+            ("hit_rows", self._hits, wp.vec4i),
+            ("pass_rows", self._passes, wp.vec4i),
+            ("density_rows", self._densities, wp.vec4),
+        ):
+            setattr(grid, name, wp.from_torch(tensor.view(num_envs, -1, 4), dtype=dtype))
+        grid.changed = wp.from_torch(self._changed)
         grid.centres = wp.from_torch(self._centres, dtype=wp.vec3)
         grid.visited = wp.from_torch(self._visited, dtype=wp.vec3)
         grid.visits = wp.from_torch(self._visits)
@@ -94,7 +103,7 @@ class OcclusionMemory:
         """The same as the kernels see it."""
         self._estimate = RecordedLaunch(
             self.device,
-            (memory_kernels.estimate, (num_envs, int(memory_kernels.BLOCKS)), [grid, foliage]),
+            (memory_kernels.estimate, (num_envs, blocks), [grid, foliage]),
         )
         self._integrations: dict[int, _Integration] = {}
         self._predictions: dict[int, _Prediction] = {}
@@ -157,6 +166,7 @@ class OcclusionMemory:
                 f"got {tuple(target_position.shape)}"
             )
         self._is_estimated = False
+        self._changed[env_idx] = 1
         self._hits[env_idx] = 0
         self._passes[env_idx] = 0
         self._visited[env_idx] = math.nan
@@ -261,8 +271,10 @@ class OcclusionMemory:
                 found = tuple(state[name].shape) if name in state else "nothing"
                 raise InvalidInputError(f"state[{name!r}] must have shape {wanted}, got {found}")
         self._is_estimated = False
+        rows_of = slice(None) if env_idx is None else env_idx
         for name, tensor in own.items():
-            tensor[slice(None) if env_idx is None else env_idx] = state[name].to(tensor)
+            tensor[rows_of] = state[name].to(tensor)
+        self._changed[rows_of] = 1
 
     def _tensors(self) -> dict[str, Tensor]:
         return {

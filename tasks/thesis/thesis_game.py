@@ -165,16 +165,23 @@ class ThesisGame:
             self._others, self._others_exist = _other_ripe_fruits(
                 self._world.plant_batch.ripe_fruits, self._world.state.target, self._other_targets
             )
-        self._look()
+        mask = torch.zeros(self._world.num_envs, dtype=torch.bool, device=self._world.device)
+        mask[env_idx] = True
+        self._look(mask)
 
-    def _look(self) -> None:
+    def _look(self, mask: Tensor | None = None) -> None:
+        """Looks from where the arms stand; without a mask of shape (N,) in all environments."""
         state = self._world.state
-        self._view = self._judge_truth(state.target, state.fraction_before)
+        self._view = self._judge_truth(state.target, state.fraction_before, mask, self._view)
         state.visible_fraction = self._view["visible_fraction"]
         if self._other_targets:
             others = self._others.unbind(-1)
             before = self._others_before or [state.fraction_before] * len(others)
-            self._views_of_others = [self._judge_truth(*pair) for pair in zip(others, before, strict=True)]
+            views = self._views_of_others or [{}] * len(others)
+            self._views_of_others = [
+                self._judge_truth(fruit, earlier, mask, view)
+                for fruit, earlier, view in zip(others, before, views, strict=True)
+            ]
 
     def _measure(self, camera: CameraSenses, view: ViewPoses) -> None:
         """Takes in a camera's view of some environments."""
@@ -191,18 +198,24 @@ class ThesisGame:
             camera.known_target(),
         ) | camera_info(measured, self.task.full_visibility)
 
-    def _judge_truth(self, target: Tensor, before: Tensor) -> dict[str, Tensor]:
-        """The present view as one of `target`, indices in `Plant.fruits`, of which V_f was `before`. Shape (N,)."""
+    def _judge_truth(
+        self, target: Tensor, before: Tensor, mask: Tensor | None, last: Mapping[str, Tensor]
+    ) -> dict[str, Tensor]:
+        """The present view as one of `target`, indices in `Plant.fruits`, of which V_f was `before`; where the mask is
+        False, and there was a last view, that one. Each of shape (N,)."""
         world = self._world
+        mask = mask if last else None
         seen = world.scene.visibility(
-            world.T_w_camera, target, world.plant_batch.T_world_plant, world.T_w_links
+            world.T_w_camera, target, world.plant_batch.T_world_plant, world.T_w_links, mask
         )
+        fraction, tomato_seen = seen.visible_fraction, seen.any_visible
+        if mask is not None:
+            fraction = torch.where(mask, fraction, last["visible_fraction"])
+            tomato_seen = torch.where(mask, tomato_seen, last["tomato_seen"])
         position = world.target_position_w
         if target is not world.state.target and self.task.own.success is not None:
             position = world.plant_batch.fruit_position_w(target)
-        return self._judge(
-            seen.visible_fraction, seen.visible_fraction > 0.0, seen.any_visible, before, position
-        )
+        return self._judge(fraction, fraction > 0.0, tomato_seen, before, position)
 
     def _judge(
         self, fraction: Tensor, target_seen: Tensor, tomato_seen: Tensor, before: Tensor, position: Tensor

@@ -309,6 +309,35 @@ def test_views_of_several_environments_at_once_have_the_visible_fractions_of_eac
     assert 0.05 < float(seen.mean()) < 0.95
 
 
+def test_environments_that_are_asked_about_get_the_same_answers_as_all(device: str) -> None:
+    plants = [generate_plant("full", seed, "training") for seed in range(3)]
+    scene = RayScene(plants, color_intrinsics(), device=device)
+    targets = torch.tensor(
+        [next(i for i, fruit in enumerate(plant.fruits) if fruit.ripeness == "ripe") for plant in plants],
+        device=device,
+    )
+    centres = torch.stack(
+        [torch.from_numpy(p.fruits[int(t)].centre) for p, t in zip(plants, targets, strict=True)]
+    ).to(device)
+    stand = torch.eye(4, device=device).expand(3, 4, 4)
+    mask = torch.tensor([True, False, True], device=device)
+    for shift in (0.0, 0.15):
+        cameras = look_at_pose(centres + torch.tensor([-0.45, shift, 0.05], device=device), centres)
+        few = scene.visibility(cameras, targets, stand, mask=mask).rows
+        some = scene.view_rays(cameras, targets, centres, stand, mask=mask)
+        every = scene.visibility(cameras, targets, stand).rows
+        rays = scene.view_rays(cameras, targets, centres, stand)
+        assert_close(few[:, mask], every[:, mask], rtol=0.0, atol=0.0)
+        for found, expected in (
+            (some.direction_c, rays.direction_c),
+            (some.distance, rays.distance),
+            (some.label, rays.label),
+        ):
+            assert torch.equal(found[mask], expected[mask])
+    with pytest.raises(InvalidInputError, match=r"mask must have shape \(3,\), got \(2,\)"):
+        scene.visibility(cameras, targets, stand, mask=mask[:2])
+
+
 def test_views_that_do_not_exist_are_refused() -> None:
     scene = RayScene([ball_plant([(0.5, 0, 0)])], WIDE)
     pose = torch.eye(4)

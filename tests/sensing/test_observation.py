@@ -250,7 +250,9 @@ def test_environments_that_did_not_look_remember_nothing_new(device: str) -> Non
     episode = Episode(device, num_envs=2)
     episode.look((-0.5, -0.2, -0.1))
     first = episode.observer.memory.hits.clone()
-    episode.look((-0.4, 0.25, 0.1), mask=torch.tensor([True, False], device=device))
+    before = episode.observer.belief.observation
+    after = episode.look((-0.4, 0.25, 0.1), mask=torch.tensor([True, False], device=device))
+    assert torch.equal(after[1], before[1]) and not torch.equal(after[0], before[0])
     assert episode.observer.memory.visits.tolist() == [2, 1]
     assert_close(episode.observer.memory.hits[1], first[1])
     assert int((episode.observer.memory.hits[0] - first[0]).sum()) > 0

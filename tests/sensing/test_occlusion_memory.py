@@ -238,6 +238,21 @@ def test_predictions_are_those_of_a_plain_loop() -> None:
         assert found.tolist() == pytest.approx(expected, abs=4e-3)
 
 
+def test_densities_that_are_read_between_views_are_those_of_all_views_at_once(device: str) -> None:
+    often, once = begun((0.7, 0.1, 1.0), device), begun((0.0, 0.0, 0.0), device)
+    for seed in range(5):
+        points, pose, label = random_view(100, seed)
+        often.integrate(pose[None].to(device), rays_to(points, pose, label, device))
+        if seed == 2:
+            saved = often.state()
+            often.begin(torch.tensor([0], device=device), torch.tensor([[0.1, 0.1, 1.0]], device=device))
+            assert float(often.density.std()) == 0.0 and not bool(often.known.any())
+            often.load_state(saved)
+        assert float(often.density.std()) > 0.0
+    once.load_state(often.state())
+    assert torch.equal(often.density, once.density) and torch.equal(often.known, once.known)
+
+
 def test_environments_remember_on_their_own(device: str) -> None:
     targets = torch.tensor([[0.7, 0.1, 1.0], [0.6, -0.1, 0.9], [0.7, 0.1, 1.0]], device=device)
     memory = OcclusionMemory(3, device)
