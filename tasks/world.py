@@ -4,6 +4,7 @@ A step is plan, move, look: `World.plan` says where the arms should go, a shell 
 joints), and `World.look` measures from where they are. `World.step` does all three.
 """
 
+import math
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, Protocol
 
@@ -386,7 +387,16 @@ class World:
         Raises:
             InvalidInputError: The action cannot be used; nothing was changed.
         """
-        self._finish(self.plan(self.check_action(action)), move)
+        size = ACTION_SIZES[self.moves.control]
+        batch = action_batch(action, self.num_envs, size, self.device)
+        # The inverse kinematics refuses NaN, and asks the device for that once. To ask here too would wait twice.
+        batch = batch.nan_to_num(math.nan, math.nan, math.nan)
+        try:
+            plan = self.plan(batch)
+        except InvalidInputError:
+            check_finite(batch)
+            raise
+        self._finish(plan, move)
 
     def arrive(self, qpos: Tensor, move: Callable[[Plan], Tensor] | None = None) -> None:
         """A step in which somebody else moved the arms to joint positions of shape (N, 7), in [rad]."""
@@ -575,6 +585,27 @@ def check_action(action: Any, num_envs: int, size: int, device: torch.device) ->
     Raises:
         InvalidInputError: They are something else, or not finite.
     """
+    batch = action_batch(action, num_envs, size, device)
+    check_finite(batch)
+    return batch
+
+
+def check_finite(batch: Tensor) -> None:
+    """Checks that actions are finite, which waits for the device.
+
+    Raises:
+        InvalidInputError: One is not.
+    """
+    if not bool(batch.isfinite().all()):
+        raise InvalidInputError("an action must be finite; got NaN or infinity")
+
+
+def action_batch(action: Any, num_envs: int, size: int, device: torch.device) -> Tensor:
+    """Actions as of `check_action`, which may yet hold NaN or infinity.
+
+    Raises:
+        InvalidInputError: They are something else.
+    """
     if isinstance(action, Mapping):
         raise InvalidInputError(
             "an action is an array; choose its meaning with control_mode in gymnasium.make"
@@ -592,6 +623,4 @@ def check_action(action: Any, num_envs: int, size: int, device: torch.device) ->
         raise InvalidInputError(
             f"an action must have shape ({num_envs}, {size}){single}; got {tuple(batch.shape)}"
         )
-    if not bool(batch.isfinite().all()):
-        raise InvalidInputError("an action must be finite; got NaN or infinity")
     return batch

@@ -77,6 +77,8 @@ class IkSolution:
     """Values of `Reach`. Shape (B,), int64."""
     T_base_ee: torch.Tensor
     """The pose that `qpos` gives, in the base frame, in [m]. Shape (B, 4, 4), float64."""
+    all_reachable: bool
+    """Whether all poses are REACHABLE: told here since the solver asks the device once anyway."""
 
 
 class InverseKinematics:
@@ -162,16 +164,22 @@ class InverseKinematics:
             )
         if batch == 0:
             reach = torch.zeros(0, dtype=torch.int64, device=self.device)
-            return IkSolution(qpos_ref.double(), reach, T_base_ee.double())
+            return IkSolution(qpos_ref.double(), reach, T_base_ee.double(), all_reachable=True)
         qpos, reach, reached = self._kernels[neighbour](T_base_ee, self.chain_joints(qpos_ref))
-        if int(reach.min()) < 0:
+        lowest, highest = torch.stack(reach.aminmax()).tolist()
+        if lowest < 0:
             row = int(reach.argmin())
             raise InvalidInputError(
                 "T_base_ee must hold finite rigid transforms (rotation, position, last row 0 0 0 1) and "
                 f"qpos_ref finite angles; row {row} has T_base_ee = {T_base_ee[row].tolist()}, "
                 f"qpos_ref = {qpos_ref[row].tolist()}"
             )
-        return IkSolution(self.chain_joints(qpos.clone()), reach.clone(), reached.clone())
+        return IkSolution(
+            self.chain_joints(qpos.clone()),
+            reach.clone(),
+            reached.clone(),
+            all_reachable=highest == Reach.REACHABLE,
+        )
 
     def chain_joints(self, qpos: torch.Tensor) -> torch.Tensor:
         """Joint angles of the arm as the chain counts them, and the reverse. Shape (B, 7)."""

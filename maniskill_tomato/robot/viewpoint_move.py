@@ -83,7 +83,7 @@ class ViewpointMover:
             viewpoint_transform(asked), qpos, neighbour=self._neighbour_poses
         )
         reach, target_qpos = solution.reach, solution.qpos
-        if int(reach.max()) == Reach.REACHABLE:
+        if solution.all_reachable:
             return ViewpointMove(target_qpos.float(), reach, asked)
         taken = asked.double()
         neighbour = (reach == Reach.NEIGHBOUR)[:, None]
