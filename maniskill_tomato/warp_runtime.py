@@ -17,6 +17,13 @@ from maniskill_tomato.errors import UnsoundEnvironmentError
 
 logger = logging.getLogger(__name__)
 
+SIMULTANEOUS_LANES: Final = (
+    "-march=native -mllvm=-inline-threshold=9000 -mllvm=-inline-cold-callsite-threshold=3000 "
+    "-mllvm=-slp-recursion-max-depth=12"
+)
+"""The module option `cpu_compiler_flags` of kernels that do the same for eight lanes: Warp's default flags but for the
+depth to which LLVM looks for operations to do at once. Warp's 4 saves compile time and splits such loops up again."""
+
 CACHE_VARIABLE: Final = "WARP_CACHE_PATH"
 """Names the folder in which Warp keeps its kernels; by default it is one below the home."""
 

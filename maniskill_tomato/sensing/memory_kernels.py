@@ -12,8 +12,9 @@ import warp as wp
 
 from maniskill_tomato.raycast.kernels import rotation, translation
 from maniskill_tomato.raycast.view_ray_kernels import OTHER, OUTSIDE, look_axes
+from maniskill_tomato.warp_runtime import SIMULTANEOUS_LANES
 
-wp.set_module_options({"enable_backward": False, "max_unroll": 8})
+wp.set_module_options({"enable_backward": False, "max_unroll": 8, "cpu_compiler_flags": SIMULTANEOUS_LANES})
 
 CELLS = wp.constant(32)
 """Voxels along each edge of the grid."""

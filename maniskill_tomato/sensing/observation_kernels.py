@@ -11,8 +11,9 @@ from maniskill_tomato.raycast.kernels import rotation, translation
 from maniskill_tomato.raycast.view_ray_kernels import OTHER, OUTSIDE, TARGET, look_axes
 from maniskill_tomato.sensing import view_lattice
 from maniskill_tomato.sensing.memory_kernels import MAX_VISITS, Foliage, Grid, predicted_view
+from maniskill_tomato.warp_runtime import SIMULTANEOUS_LANES
 
-wp.set_module_options({"enable_backward": False})
+wp.set_module_options({"enable_backward": False, "cpu_compiler_flags": SIMULTANEOUS_LANES})
 
 PATCH = wp.constant(8)
 """Cells along each side of the patch, each of 2 x 2 rays."""
