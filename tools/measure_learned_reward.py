@@ -1,7 +1,9 @@
 """The reward learned from demonstrations, beside the designed one, behaviour cloning and constant rewards.
 
 `designed` is the reward of the preset `td3`, which all trainings share, and `cloned` fits its actor to the demonstrated
-moves. A constant reward shows what the end of episodes teaches by itself: `plus` and `minus` take the last view of an
+moves. All others have the same demonstrated moves beside their own in every batch. `learned` is what `--reward-from`
+does. `told` pays 1 for demonstrated moves and 0 for the learner's own, as in SQIL (Reddy et al., ICLR 2020). A constant
+reward shows what the moves and the end of episodes teach by themselves: `plus` and `minus` take the last view of an
 episode to stay, as the learned reward does (`learning/rl/demonstrated_reward.py`), and `bare-plus` and `bare-minus` let
 an episode end without a value, as is usual.
 
@@ -43,7 +45,7 @@ from maniskill_tomato.policies.actor import ObservationNormalizer
 from maniskill_tomato.policies.opening import open_policy
 from maniskill_tomato.tasks import THESIS_IDS
 
-Teacher = Literal["designed", "learned", "cloned", "plus", "minus", "bare-plus", "bare-minus"]
+Teacher = Literal["designed", "learned", "cloned", "told", "plus", "minus", "bare-plus", "bare-minus"]
 TASKS: dict[str, str] = dict(zip(("guided", "sparse"), THESIS_IDS, strict=True))
 
 
@@ -60,20 +62,27 @@ class Options:
     tasks: tuple[str, ...] = tuple(TASKS)
     seeds: tuple[int, ...] = (0, 1, 2)
     """Of the trainings."""
-    steps: int = 8000
+    steps: int = 15_000
     """Environment steps of each training; the exploration ends after five eighths of them."""
     episodes: int = 100
-    """That each policy is judged on, from seed 1000."""
+    """That each policy is judged on."""
+    first_seed: int = 1000
+    """Of these episodes."""
 
 
-@dataclass(frozen=True)
-class ConstantReward:
-    """A reward model that thinks the same of all views."""
+@dataclass
+class FixedReward:
+    """A reward model that learns nothing."""
 
     value: float
+    """Of every view that the learner reaches."""
+    shown_value: float
+    """Of every view that a demonstrated move reaches."""
     gamma: float
     held: bool
     """Whether the last view of an episode counts for ever."""
+    own: int = 0
+    """Transitions of the learner at the head of a batch."""
 
     def to(self, device: torch.device) -> None:
         """Holds no tensors."""
@@ -81,12 +90,14 @@ class ConstantReward:
     def update(
         self, batch: Batch, normalizer: ObservationNormalizer, generator: torch.Generator | None
     ) -> dict[str, Tensor]:
-        """Learns nothing."""
+        """Sees how many transitions of a batch are the learner's own."""
+        self.own = len(batch.rewards)
         return {}
 
     def judge(self, batch: Batch, normalizer: ObservationNormalizer) -> Batch:
-        """The same for all transitions, of the size of the learned reward."""
+        """The same for all transitions of one origin, of the size of the learned reward."""
         rewards = torch.full_like(batch.rewards, (1.0 - self.gamma) * self.value)
+        rewards[self.own :] = (1.0 - self.gamma) * self.shown_value
         return batch._replace(
             rewards=rewards * stays(batch.terminations, self.gamma) if self.held else rewards
         )
@@ -105,11 +116,12 @@ def train(env_id: str, teacher: Teacher, file: Path, run_dir: Path, seed: int, s
         get_preset("td3"), total_timesteps=steps, exploration_steps=steps * 5 // 8, checkpoint_seconds=None
     )
     model = None
-    if teacher == "learned":
+    if teacher != "designed":
         config = dataclasses.replace(config, reward_from=str(file))
-    elif teacher != "designed":
-        value = 1.0 if teacher.endswith("plus") else -1.0
-        model = ConstantReward(value, config.gamma, held=not teacher.startswith("bare"))
+    if teacher not in ("designed", "learned"):
+        shown = -1.0 if teacher.endswith("minus") else 1.0
+        own = 0.0 if teacher == "told" else shown
+        model = FixedReward(own, shown, config.gamma, held=not teacher.startswith("bare"))
     clear_run(run_dir)
     env = make_training_env(env_id, config, {})
     try:
@@ -145,11 +157,11 @@ def clone(env_id: str, file: Path, run_dir: Path, seed: int) -> None:
     write_tensors(run_dir / "policy.pt", checkpoint)
 
 
-def judge(env_id: str, policy: Path, episodes: int) -> dict[str, float]:
+def judge(env_id: str, policy: Path, episodes: int, first_seed: int) -> dict[str, float]:
     """Success and length of episodes without exploration."""
     env = make_env(env_id)
     try:
-        records = run_episodes(env, open_policy(policy, env_id=env_id), episodes, 1000)
+        records = run_episodes(env, open_policy(policy, env_id=env_id), episodes, first_seed)
     finally:
         env.close()
     return {
@@ -177,7 +189,7 @@ def main(options: Options) -> None:
                     train(TASKS[task], teacher, file, run_dir, seed, options.steps)
                 seconds = {"seconds": time.perf_counter() - wall, "cpu_seconds": time.process_time() - cpu}
                 results[name] = {
-                    **judge(TASKS[task], run_dir / "policy.pt", options.episodes),
+                    **judge(TASKS[task], run_dir / "policy.pt", options.episodes, options.first_seed),
                     **{key: round(value, 1) for key, value in seconds.items()},
                 }
                 write_json(path, results)

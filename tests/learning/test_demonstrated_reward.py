@@ -14,8 +14,12 @@ from torch import Tensor, nn
 
 from maniskill_tomato.errors import CheckpointError, InvalidInputError
 from maniskill_tomato.learning.imitation.demonstrations import record_demonstrations
-from maniskill_tomato.learning.imitation.trajectory_file import DemonstratedViews, read_demonstrations
-from maniskill_tomato.learning.rl.demonstrated_reward import DemonstratedReward, gradient_penalty
+from maniskill_tomato.learning.imitation.trajectory_file import DemonstratedMoves, read_demonstrations
+from maniskill_tomato.learning.rl.demonstrated_reward import (
+    DemonstratedReward,
+    DemonstratedTransitions,
+    gradient_penalty,
+)
 from maniskill_tomato.learning.rl.envs import make_simulated_env
 from maniskill_tomato.learning.rl.presets import TrainConfig, get_preset
 from maniskill_tomato.learning.rl.replay import Batch
@@ -94,33 +98,47 @@ class Approach:
         }
 
 
-def shown(count: int = 200) -> DemonstratedViews:
+def shown(count: int = 200) -> DemonstratedMoves:
     """Someone walks straight to the target, from random places, and stops where it is near."""
     generator = torch.Generator().manual_seed(7)
-    views, ends = [], []
+    places, moves, views, ends = [], [], [], []
     for _ in range(count):
         place = 0.9 * SIZE * (2.0 * torch.rand(9, generator=generator) - 1.0)
         place[6:] = torch.tensor(TARGET)
         for _ in range(HORIZON):
+            move = torch.zeros(6)
+            move[:3] = (place[6:] - place[:3]).clamp(-1.0, 1.0)
+            places.append(place)
+            moves.append(move)
             place = place.clone()
-            place[:3] += (place[6:] - place[:3]).clamp(-1.0, 1.0)
+            place[:6] += move
             views.append(place)
             ends.append(bool((place[:3] - place[6:]).norm() < NEAR))
             if ends[-1]:
                 break
-    return DemonstratedViews(
-        views=torch.stack(views), terminations=torch.tensor(ends).float(), episodes=count
+    return DemonstratedMoves(
+        observations=torch.stack(places),
+        actions=torch.stack(moves),
+        views=torch.stack(views),
+        terminations=torch.tensor(ends).float(),
+        episodes=count,
     )
 
 
-def write(path: Path, demonstrations: DemonstratedViews, env_id: str = TOY) -> Path:
+def write(path: Path, demonstrations: DemonstratedMoves, env_id: str = TOY) -> Path:
     """A file as ManiSkill's recorder writes it, with one move in every episode."""
     with h5py.File(path, "w") as file:
-        for i, (view, ended) in enumerate(
-            zip(demonstrations.views, demonstrations.terminations, strict=True)
-        ):
+        moves = zip(
+            demonstrations.observations,
+            demonstrations.actions,
+            demonstrations.views,
+            demonstrations.terminations,
+            strict=True,
+        )
+        for i, (before, action, view, ended) in enumerate(moves):
             episode = file.create_group(f"traj_{i}")
-            episode["obs"] = np.stack((np.zeros_like(view), view.numpy()))
+            episode["obs"] = np.stack((before.numpy(), view.numpy()))
+            episode["actions"] = action.numpy()[None]
             episode["terminated"] = np.array([bool(ended)])
     path.with_suffix(".json").write_text(json.dumps({"env_info": {"env_id": env_id}, "episodes": []}))
     return path
@@ -245,6 +263,24 @@ def test_a_view_with_which_an_episode_ended_counts_as_if_it_stayed_for_ever() ->
     torch.testing.assert_close(rewards + config.gamma * (1.0 - terminations) * 2.0, torch.full((4,), 2.0))
 
 
+def test_a_batch_gets_demonstrated_moves_in_units_of_the_action_scale() -> None:
+    demonstrations, config = shown(5), toy_config(action_scale=(0.8, 0.8, 0.5, 1.0, 1.0, 1.0))
+    own = transitions(torch.arange(36.0).reshape(4, 9))
+    mixed = DemonstratedTransitions(demonstrations, config).beside(own, torch.Generator().manual_seed(3))
+    assert len(mixed.rewards) == 5 and mixed.visible_fractions is None
+    for name, part in own._asdict().items():
+        if part is not None:
+            torch.testing.assert_close(getattr(mixed, name)[:4], part)
+    (row,) = [
+        i for i, view in enumerate(demonstrations.views) if torch.equal(view, mixed.next_observations[4])
+    ]
+    assert torch.equal(mixed.observations[4], demonstrations.observations[row])
+    assert float(mixed.terminations[4]) == float(demonstrations.terminations[row])
+    move = demonstrations.actions[row]
+    expected = [*(move[:2] / 0.8).clamp(-1.0, 1.0), (2.0 * move[2]).clamp(-1.0, 1.0), 0.0, 0.0, 0.0]
+    torch.testing.assert_close(mixed.actions[4], torch.tensor(expected))
+
+
 def test_what_the_task_pays_and_calls_a_success_changes_nothing(tmp_path: Path) -> None:
     config = toy_config(reward_from=str(write(tmp_path / "shown.h5", shown(20))), total_timesteps=600)
     policies = [
@@ -332,6 +368,17 @@ def a_view_short(path: Path) -> None:
         file["traj_1/obs"] = np.zeros((1, 9), np.float32)
 
 
+def without_actions(path: Path) -> None:
+    with h5py.File(path, "a") as file:
+        del file["traj_1/actions"]
+
+
+def an_action_short(path: Path) -> None:
+    with h5py.File(path, "a") as file:
+        del file["traj_1/actions"]
+        file["traj_1/actions"] = np.zeros((0, 6), np.float32)
+
+
 def not_finite(path: Path) -> None:
     with h5py.File(path, "a") as file:
         observations: Any = file["traj_1/obs"]
@@ -360,6 +407,8 @@ def views_elsewhere(path: Path) -> None:
         (damaged, "cannot be read as demonstrations"),
         (empty, f"holds no episode; record some with `maniskill-tomato demonstrations {TOY}`"),
         (with_images, "must hold obs as an array; record with obs_mode 'state'"),
+        (without_actions, "must hold actions as an array"),
+        (an_action_short, r"actions of shape \(T, A\)"),
         (a_view_short, r"shape \(T \+ 1, D\)"),
         (not_finite, "not finite"),
         (elsewhere, "must lie in the file itself"),
@@ -378,9 +427,12 @@ def test_demonstrations_of_something_else_are_refused_before_the_training(tmp_pa
     path = write(tmp_path / "shown.h5", shown(5))
     with pytest.raises(InvalidInputError, match=f"demonstrations of {TOY}, not of {GUIDED}"):
         train(GUIDED, toy_config(reward_from=str(path)), tmp_path / "run", 0, {}, show_progress=False)
-    short = replace(shown(5), views=shown(5).views[:, :7])
+    short = replace(shown(5), observations=shown(5).observations[:, :7], views=shown(5).views[:, :7])
     write(path, short)
     with pytest.raises(InvalidInputError, match="observations of 7 values, and the task has 9"):
+        learn(tmp_path / "run", toy_config(reward_from=str(path)))
+    write(path, replace(shown(5), actions=shown(5).actions[:, :3]))
+    with pytest.raises(InvalidInputError, match="actions of 3 values, and the task has 6"):
         learn(tmp_path / "run", toy_config(reward_from=str(path)))
     assert not (tmp_path / "run").exists()
 

@@ -23,9 +23,13 @@ LARGEST_OBSERVATIONS: Final = 1_000_000_000
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class DemonstratedViews:
-    """The N views that the moves of demonstrations led to; neither actions nor rewards are read."""
+class DemonstratedMoves:
+    """The N moves of demonstrations and the views that they led to; rewards are not read."""
 
+    observations: Tensor
+    """Observations before each move. Shape (N, D), float32."""
+    actions: Tensor
+    """As the task takes them. Shape (N, A), float32."""
     views: Tensor
     """Observations after each move. Shape (N, D), float32."""
     terminations: Tensor
@@ -36,11 +40,11 @@ class DemonstratedViews:
     @property
     def digest(self) -> str:
         """Tells these demonstrations from others."""
-        content = self.views.numpy().tobytes() + self.terminations.numpy().tobytes()
-        return hashlib.sha256(content).hexdigest()
+        parts = self.observations, self.actions, self.views, self.terminations
+        return hashlib.sha256(b"".join(part.numpy().tobytes() for part in parts)).hexdigest()
 
 
-def read_demonstrations(path: Path, env_id: str) -> DemonstratedViews:
+def read_demonstrations(path: Path, env_id: str) -> DemonstratedMoves:
     """Reads every episode of a file.
 
     Args:
@@ -48,8 +52,8 @@ def read_demonstrations(path: Path, env_id: str) -> DemonstratedViews:
         env_id: The task that they must be of.
 
     Raises:
-        InvalidInputError: A file is missing or damaged, is of another task, or holds no move, or observations that are
-            no state vectors.
+        InvalidInputError: A file is missing or damaged, is of another task, or holds no move, observations that are no
+            state vectors, or actions that are no vectors.
         MissingPackageError: h5py, which comes with ManiSkill, is not installed.
     """
     _check_task(path, env_id)
@@ -58,12 +62,17 @@ def read_demonstrations(path: Path, env_id: str) -> DemonstratedViews:
         raise InvalidInputError(
             f"{path} holds no episode; record some with `maniskill-tomato demonstrations {env_id}`"
         )
-    views = np.concatenate([observations[1:] for observations, _ in episodes])
-    if len({observations.shape[1] for observations, _ in episodes}) != 1 or not np.isfinite(views).all():
-        raise InvalidInputError(f"{path} holds observations of several lengths, or that are not finite")
-    return DemonstratedViews(
-        views=torch.from_numpy(views),
-        terminations=torch.from_numpy(np.concatenate([ended for _, ended in episodes])),
+    for name, rows in (
+        ("observations", [observations for observations, _, _ in episodes]),
+        ("actions", [actions for _, actions, _ in episodes]),
+    ):
+        if len({part.shape[1] for part in rows}) != 1 or not all(np.isfinite(part).all() for part in rows):
+            raise InvalidInputError(f"{path} holds {name} of several lengths, or that are not finite")
+    return DemonstratedMoves(
+        observations=torch.from_numpy(np.concatenate([seen[:-1] for seen, _, _ in episodes])),
+        actions=torch.from_numpy(np.concatenate([actions for _, actions, _ in episodes])),
+        views=torch.from_numpy(np.concatenate([seen[1:] for seen, _, _ in episodes])),
+        terminations=torch.from_numpy(np.concatenate([ended for _, _, ended in episodes])),
         episodes=len(episodes),
     )
 
@@ -79,8 +88,12 @@ def _check_task(path: Path, env_id: str) -> None:
         )
 
 
-def _episodes(path: Path) -> list[tuple[NDArray[np.float32], NDArray[np.float32]]]:
-    """Observations of shape (T + 1, D) and terminations of shape (T,) of every episode with a move, in their order."""
+_Episode = tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]
+"""Observations of shape (T + 1, D), actions of shape (T, A) and terminations of shape (T,)."""
+
+
+def _episodes(path: Path) -> list[_Episode]:
+    """Every episode with a move, in their order."""
     room = LARGEST_OBSERVATIONS
 
     def array(episode: Any, name: str) -> NDArray[np.float32]:
@@ -88,7 +101,7 @@ def _episodes(path: Path) -> list[tuple[NDArray[np.float32], NDArray[np.float32]
         stored = stored_array(path, episode, name)
         if stored is None:
             raise InvalidInputError(
-                f"{path}: {episode.name} must hold {name} as an array; record with obs_mode 'state'"
+                f"{path}: {episode.name} must hold {name} as an array; record with obs_mode 'state' and one arm"
             )
         room -= stored.nbytes
         if room < 0:
@@ -98,12 +111,18 @@ def _episodes(path: Path) -> list[tuple[NDArray[np.float32], NDArray[np.float32]
     episodes = []
     with opened_trajectories(path) as groups:
         for name, group in groups.items():
-            observations, ended = array(group, "obs"), array(group, "terminated")
-            if observations.ndim != 2 or ended.shape != (len(observations) - 1,):
+            observations, actions, ended = (array(group, part) for part in ("obs", "actions", "terminated"))
+            moves = len(observations) - 1
+            if (
+                observations.ndim != 2
+                or actions.ndim != 2
+                or len(actions) != moves
+                or ended.shape != (moves,)
+            ):
                 raise InvalidInputError(
-                    f"{path}: {name} must have observations of shape (T + 1, D) and terminations of shape (T,), got "
-                    f"{observations.shape} and {ended.shape}"
+                    f"{path}: {name} must have observations of shape (T + 1, D), actions of shape (T, A) and "
+                    f"terminations of shape (T,), got {observations.shape}, {actions.shape} and {ended.shape}"
                 )
-            if len(ended):
-                episodes.append((observations, ended))
+            if moves:
+                episodes.append((observations, actions, ended))
     return episodes

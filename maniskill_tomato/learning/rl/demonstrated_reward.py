@@ -4,6 +4,10 @@ A discriminator D tells demonstrated views from those of the learner, and is tra
 off-policy as Discriminator-Actor-Critic, Kostrikov et al., 2019). The reward of a view is log D - log(1 - D), the
 discriminator's logit (AIRL, Fu et al., 2018), of the present discriminator, whenever a transition is drawn.
 
+Each batch of the learner holds demonstrated moves beside its own (`DemonstratedTransitions`), as in DDPG from
+Demonstrations (Vecerik et al., 2017), with rewards of the same discriminator. Without them the critics know nothing of
+views that the learner does not reach by itself, however much these are worth.
+
 Where an episode ends for good, the view is taken to stay for ever. This goes for demonstrations and learner, reward and
 discriminator alike, so that neither ending early nor going on earns anything by itself: a reward that is the same for
 all views makes all policies equal.
@@ -16,13 +20,17 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from maniskill_tomato.errors import CheckpointError, InvalidInputError
-from maniskill_tomato.learning.imitation.trajectory_file import DemonstratedViews
+from maniskill_tomato.learning.imitation.trajectory_file import DemonstratedMoves
 from maniskill_tomato.learning.rl.replay import Batch
 from maniskill_tomato.learning.rl.train_config import TrainConfig
 from maniskill_tomato.policies.actor import ObservationNormalizer
 
 GRADIENT_PENALTY = 10.0
 """Weight of the gradient penalty (Gulrajani et al., 2017), as in Discriminator-Actor-Critic."""
+
+
+DEMONSTRATED_SHARE = 0.25
+"""Demonstrated moves in a batch over the learner's own; they are drawn beside the batch that is configured."""
 
 
 class RewardModel(Protocol):
@@ -75,10 +83,66 @@ def gradient_penalty(network: nn.Module, some: Tensor, others: Tensor, mix: Tens
     return penalty
 
 
+class DemonstratedTransitions:
+    """Demonstrated moves as a learner's transitions, whose rewards a `RewardModel` is to say."""
+
+    def __init__(self, demonstrations: DemonstratedMoves, config: TrainConfig) -> None:
+        """Takes over the moves.
+
+        Args:
+            demonstrations: What is shown.
+            config: Of the learner.
+        """
+        count = len(demonstrations.actions)
+        scale = torch.tensor(config.action_scale)
+        fits = demonstrations.actions.shape[1] == len(scale)
+        self._transitions = Batch(
+            demonstrations.observations,
+            (demonstrations.actions / scale).clamp(-1.0, 1.0) if fits else demonstrations.actions,
+            torch.zeros(count),
+            demonstrations.views,
+            demonstrations.terminations,
+        )
+
+    def check_fits(self, observation_dim: int, action_dim: int) -> None:
+        """Accepts the observations and actions of an environment.
+
+        Raises:
+            InvalidInputError: Those of the demonstrations have another length.
+        """
+        shown = self._transitions
+        for name, values, wanted in (
+            ("observations", shown.observations, observation_dim),
+            ("actions", shown.actions, action_dim),
+        ):
+            if values.shape[1] != wanted:
+                raise InvalidInputError(
+                    f"the demonstrations have {name} of {values.shape[1]} values, and the task has {wanted}; record "
+                    "them with the options of the training"
+                )
+
+    def to(self, device: torch.device) -> None:
+        """Moves to where the learner's transitions are."""
+        self._transitions = Batch(*(None if part is None else part.to(device) for part in self._transitions))
+
+    def beside(self, batch: Batch, generator: torch.Generator | None) -> Batch:
+        """A batch with demonstrated moves, a quarter as many, behind its own transitions."""
+        count = round(DEMONSTRATED_SHARE * len(batch.rewards))
+        drawn = torch.randint(
+            len(self._transitions.rewards), (count,), generator=generator, device=batch.rewards.device
+        )
+        return Batch(
+            *(
+                None if own is None or shown is None else torch.cat((own, shown[drawn]))
+                for own, shown in zip(batch, self._transitions, strict=True)
+            )
+        )
+
+
 class DemonstratedReward:
     """A discriminator of views with its optimiser; it has the width and the step size of the critics."""
 
-    def __init__(self, demonstrations: DemonstratedViews, config: TrainConfig, seed: int) -> None:
+    def __init__(self, demonstrations: DemonstratedMoves, config: TrainConfig, seed: int) -> None:
         """Begins without knowledge.
 
         Args:
@@ -99,18 +163,6 @@ class DemonstratedReward:
         self._optimizer = torch.optim.Adam(
             self.network.parameters(), lr=config.critic_learning_rate, fused=True
         )
-
-    def check_fits(self, observation_dim: int) -> None:
-        """Accepts the observations of an environment.
-
-        Raises:
-            InvalidInputError: Those of the demonstrations have another length.
-        """
-        if self._views.shape[1] != observation_dim:
-            raise InvalidInputError(
-                f"the demonstrations have observations of {self._views.shape[1]} values, and the task has "
-                f"{observation_dim}; record them with the options of the training"
-            )
 
     def to(self, device: torch.device) -> None:
         """See `RewardModel.to`."""

@@ -20,7 +20,11 @@ from maniskill_tomato.learning.imitation.trajectory_file import read_demonstrati
 from maniskill_tomato.learning.interrupt import StopRequest, stop_on_signals
 from maniskill_tomato.learning.rl.agent import begin_with, check_fits, update
 from maniskill_tomato.learning.rl.checkpoint import make_checkpoint
-from maniskill_tomato.learning.rl.demonstrated_reward import DemonstratedReward, RewardModel
+from maniskill_tomato.learning.rl.demonstrated_reward import (
+    DemonstratedReward,
+    DemonstratedTransitions,
+    RewardModel,
+)
 from maniskill_tomato.learning.rl.envs import LearnerEnv, make_learner_env
 from maniskill_tomato.learning.rl.observations import columns_of, device_of, eyes_of
 from maniskill_tomato.learning.rl.presets import TrainConfig
@@ -120,10 +124,12 @@ class Trainer:
             self._given = load_actor(config.initial_policy, env_id=env_id)
             check_fits(self._given, config, observation_dim)
         self._reward_model = reward_model
-        if config.reward_from is not None and reward_model is None:
+        self._shown: DemonstratedTransitions | None = None
+        if config.reward_from is not None:
             demonstrations = read_demonstrations(Path(config.reward_from), env_id)
-            self._reward_model = DemonstratedReward(demonstrations, config, seed)
-            self._reward_model.check_fits(observation_dim)
+            self._shown = DemonstratedTransitions(demonstrations, config)
+            self._shown.check_fits(observation_dim, action_dim)
+            self._reward_model = reward_model or DemonstratedReward(demonstrations, config, seed)
         if not resume:
             check_run_dir(run_dir)
         elif not (run_dir / "config.json").is_file():
@@ -190,6 +196,8 @@ class Trainer:
         )
         write_config(self._run_dir, self._env_id, self._seed, self._env_options, self._config.to_dict())
         self._scale = torch.tensor(self._config.action_scale, device=device_of(observations))
+        if self._shown is not None:
+            self._shown.to(self._scale.device)
         self._start = self._checkpoint_time = time.perf_counter()
         if self._given is not None:
             begin_with(state.agent, self._given)
@@ -298,6 +306,8 @@ class Trainer:
             logs = {}
             if state.reward_model is not None:
                 logs = state.reward_model.update(batch, state.agent.normalizer, state.generator)
+                if self._shown is not None:
+                    batch = self._shown.beside(batch, state.generator)
                 batch = state.reward_model.judge(batch, state.agent.normalizer)
             logs |= update(state.agent, batch, state.updates, state.generator)
             state.updates += 1
