@@ -123,7 +123,7 @@ class DemonstratedTransitions:
 
     def to(self, device: torch.device) -> None:
         """Moves to where the learner's transitions are."""
-        self._transitions = Batch(*(None if part is None else part.to(device) for part in self._transitions))
+        self._transitions = Batch(*(part.to(device) for part in self._transitions[:5]))
 
     def beside(self, batch: Batch, generator: torch.Generator | None) -> Batch:
         """A batch with demonstrated moves, a quarter as many, behind its own transitions."""
@@ -131,11 +131,13 @@ class DemonstratedTransitions:
         drawn = torch.randint(
             len(self._transitions.rewards), (count,), generator=generator, device=batch.rewards.device
         )
+        shown = self._transitions
         return Batch(
-            *(
-                None if own is None or shown is None else torch.cat((own, shown[drawn]))
-                for own, shown in zip(batch, self._transitions, strict=True)
-            )
+            torch.cat((batch.observations, shown.observations[drawn])),
+            torch.cat((batch.actions, shown.actions[drawn])),
+            torch.cat((batch.rewards, shown.rewards[drawn])),
+            torch.cat((batch.next_observations, shown.next_observations[drawn])),
+            torch.cat((batch.terminations, shown.terminations[drawn])),
         )
 
 
