@@ -44,6 +44,7 @@ NAVIGATION: Final[dict[str, tuple[str, ...]]] = {
         "results/td3",
         "results/pixels",
         "results/ppo",
+        "results/learned_reward",
         "results/thesis",
         "results/perception",
         "results/segmenters",
