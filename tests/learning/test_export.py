@@ -26,9 +26,11 @@ from maniskill_tomato.experiments.rollout import run_episodes
 from maniskill_tomato.files import write_tensors
 from maniskill_tomato.learning.rl.agent import make_agent
 from maniskill_tomato.learning.rl.checkpoint import make_checkpoint
+from maniskill_tomato.learning.rl.dense_actor import DenseActor
 from maniskill_tomato.learning.rl.envs import make_env
-from maniskill_tomato.learning.rl.export import DenseActor, export_actor, export_policy, rounding_tolerance
+from maniskill_tomato.learning.rl.export import export_actor, export_policy
 from maniskill_tomato.learning.rl.presets import PRESETS, TrainConfig, get_preset
+from maniskill_tomato.learning.rl.rounding import rounding_tolerance
 from maniskill_tomato.policies.actor import ObservationNormalizer
 from maniskill_tomato.policies.adapters import ObservationPolicy, origin
 from maniskill_tomato.policies.description import INPUT_NAME, PolicyDescription

@@ -20,7 +20,8 @@ from maniskill_tomato.errors import MissingPackageError
 from maniskill_tomato.files import write_json, write_tensors
 from maniskill_tomato.folder_lock import only_writer
 from maniskill_tomato.learning.interrupt import stop_on_signals
-from maniskill_tomato.learning.rl.export import DenseActor, export_actor
+from maniskill_tomato.learning.rl.dense_actor import DenseActor
+from maniskill_tomato.learning.rl.export import export_actor
 from maniskill_tomato.learning.rl.gymnasium_env import Array, make_gymnasium_env, normalize_observation
 from maniskill_tomato.learning.rl.history import TrainingHistory
 from maniskill_tomato.learning.rl.ppo_config import PpoConfig
