@@ -69,14 +69,23 @@ _registered: dict[str, Task] = {task.env_id: task for task in (GUIDED, SPARSE, G
 _of_path: dict[str, Task] = {}
 
 
+def check_id(env_id: str) -> None:
+    """Accepts the ID of a task of somebody's own.
+
+    Raises:
+        InvalidInputError: It is one of this package's.
+    """
+    if env_id in TASK_IDS:
+        raise InvalidInputError(f"{env_id} is a task of this package; give yours another ID")
+
+
 def keep_task(task: Task) -> None:
     """Makes a task known to this process by its ID.
 
     Raises:
         InvalidInputError: The ID is one of this package's.
     """
-    if task.env_id in TASK_IDS:
-        raise InvalidInputError(f"{task.env_id} is a task of this package; give yours another ID")
+    check_id(task.env_id)
     _registered[task.env_id] = task
 
 

@@ -4,9 +4,10 @@ from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
 from gymnasium.envs.registration import WrapperSpec, register, registry
+from gymnasium.error import Error as GymnasiumError
 
 from maniskill_tomato.errors import InvalidInputError
-from maniskill_tomato.task_registry import TASK_IDS, TASKS, Task, find_task, keep_task
+from maniskill_tomato.task_registry import TASK_IDS, TASKS, Task, check_id, find_task, keep_task
 
 if TYPE_CHECKING:
     from maniskill_tomato.tasks.own_rules import RewardFunction, StartFunction, SuccessRule
@@ -59,7 +60,7 @@ def register_task(
 
     Raises:
         InvalidInputError: There is no such base, a rule is no function, a number is not allowed, or the ID is
-            one of this package's.
+            one of this package's or none that Gymnasium takes.
     """
     if base not in TASK_IDS:
         raise InvalidInputError.choice("base", base, TASK_IDS)
@@ -85,9 +86,15 @@ def register_task(
         starts=starts,
         success=success,
     )
+    check_id(env_id)
+    before = registry.pop(env_id, None)
+    try:
+        _register_other(env_id, steps)
+    except GymnasiumError as error:
+        if before is not None:
+            registry[env_id] = before
+        raise InvalidInputError(f"Gymnasium cannot register {env_id}: {error} Choose another ID") from error
     keep_task(task)
-    registry.pop(env_id, None)
-    _register_other(env_id, steps)
     return task
 
 

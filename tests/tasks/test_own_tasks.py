@@ -360,6 +360,21 @@ def test_wrong_rules_and_settings_are_named(monkeypatch: pytest.MonkeyPatch) -> 
     assert option_names("Flat-v1") == option_names(GENERAL)
 
 
+def test_an_id_that_gymnasium_does_not_take_is_refused_and_leaves_nothing() -> None:
+    gym.register("Unversioned", entry_point="somewhere:make")
+    try:
+        with pytest.raises(InvalidInputError, match="cannot register Unversioned-v1: .*already exists"):
+            register_task("Unversioned-v1", GENERAL)
+        with pytest.raises(InvalidInputError, match="cannot register not an ID"):
+            register_task("not an ID", GENERAL)
+        for name in ("Unversioned-v1", "not an ID"):
+            assert name not in gym.registry
+            with pytest.raises(InvalidInputError):
+                find_task(name)
+    finally:
+        del gym.registry["Unversioned"]
+
+
 def test_a_row_pays_a_reward_of_ones_own() -> None:
     register_task("PaidRow-v1", ROW, reward=lambda moved: moved.info["target_done"].float() - 0.5)
     world = make_world("PaidRow-v1")
