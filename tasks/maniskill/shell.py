@@ -227,7 +227,12 @@ class TomatoEnv(BaseEnv):  # type: ignore[misc]
             first = int(np.atleast_1d(np.asarray(seed))[0])
             self._np_random, self._np_random_seed = seeding.np_random(first)
         if options is not None and "env_idx" in options:
-            options = {**options, "env_idx": self.world.env_rows(options["env_idx"])}
+            rows = self.world.env_rows(options["env_idx"])
+            due = self.reconfiguration_freq != 0 and self._reconfig_counter == 0
+            shell_options.check_partial_reset(
+                len(rows), self.num_envs, builds_anew=due or bool(options.get("reconfigure"))
+            )
+            options = {**options, "env_idx": rows}
         result: tuple[Any, dict[str, Any]] = super().reset(seed=seed, options=options)
         return result
 

@@ -138,3 +138,23 @@ def pick_reconfiguration_freq(freq: int | None, *, new_actors: bool, follows_lis
             "out or set it to 1, or do not render (obs_mode='state', render_mode=None)"
         )
     return freq
+
+
+def check_partial_reset(count: int, num_envs: int, *, builds_anew: bool) -> None:
+    """Accepts a reset of some environments unless it would build the scenes of all anew.
+
+    Args:
+        count: How many are to be reset.
+        num_envs: How many there are.
+        builds_anew: Whether the reset builds the scenes anew.
+
+    Raises:
+        InvalidInputError: It would end the episodes of the others.
+    """
+    if builds_anew and count < num_envs:
+        raise InvalidInputError(
+            f"a reset of {count} of {num_envs} environments would build the scenes of all anew, since every episode "
+            "has a plant of its own that is rendered (reconfiguration_freq=1); reset all at once, keep one plant "
+            "(plant={'seed': 3}), or observe what needs no renderer (obs_mode='state', or gymnasium.make_vec with "
+            "'depth+segmentation')"
+        )

@@ -9,7 +9,7 @@ import torch
 import maniskill_tomato  # noqa: F401
 from maniskill_tomato.errors import InvalidInputError
 from maniskill_tomato.tasks import TASK_IDS
-from maniskill_tomato.tasks.maniskill.shell_options import pick_reconfiguration_freq
+from maniskill_tomato.tasks.maniskill.shell_options import check_partial_reset, pick_reconfiguration_freq
 from maniskill_tomato.tasks.vector_env import make_vector_env
 
 OPTIONS: dict[str, dict[str, Any]] = {
@@ -70,6 +70,13 @@ def test_plants_that_would_never_be_shown_are_refused_with_what_to_do() -> None:
         gym.make(
             "TomatoViewpoint-v1", obs_mode="rgb", episodes="validation", reconfiguration_freq=0, num_envs=1
         )
+
+
+def test_a_reset_of_some_that_would_build_the_scenes_of_all_is_refused() -> None:
+    with pytest.raises(InvalidInputError, match="3 of 16 environments would build the scenes of all anew"):
+        check_partial_reset(3, 16, builds_anew=True)
+    check_partial_reset(16, 16, builds_anew=True)
+    check_partial_reset(3, 16, builds_anew=False)
 
 
 def test_an_option_of_another_task_is_refused_with_the_tasks_that_take_it() -> None:
