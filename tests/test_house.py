@@ -72,7 +72,6 @@ SIMULATOR_USERS = (
     "tasks.maniskill",
     "learning.rl.envs",
     "learning.rl.gymnasium_env",
-    "learning.imitation.demonstrations",
     "deploy.mock.sapien_view",
     "deploy.real_agent",
     "deploy.sim2real",

@@ -1,28 +1,31 @@
 """Demonstrations: a policy's successful episodes in ManiSkill's trajectory format.
 
-`FOLDER/trajectory.h5` and `.json`, as `mani_skill.utils.wrappers.record.RecordEpisode` writes them: observations,
-actions, rewards and states of every episode, and how to reset the environment to its start. ManiSkill's
-`replay_trajectory` makes other observations of them, images too; `replay_of` says how it makes the task.
+`FOLDER/trajectory.h5` and `.json` hold observations, actions, rewards and states of every episode, and how to reset the
+environment to its start. ManiSkill's `replay_trajectory` makes other observations of them, images too;
+`trajectory_writer.replay_of` says how it makes the task.
 """
 
-from collections.abc import Callable, Iterable, Iterator
-from contextlib import contextmanager
-from dataclasses import dataclass, replace
+import copy
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
 import torch
-from gymnasium.envs.registration import EnvSpec
 
 from maniskill_tomato.errors import InvalidInputError
 from maniskill_tomato.folder_lock import only_writer
+from maniskill_tomato.learning.imitation.trajectory_writer import (
+    NAME,
+    RecordedEpisode,
+    Source,
+    TrajectoryWriter,
+    replay_of,
+)
 from maniskill_tomato.policies.adapters import as_state_policy
 from maniskill_tomato.policies.protocol import Policy, reseed
-from maniskill_tomato.tasks import TASK_IDS
-
-NAME = "trajectory"
-PACKAGE = "maniskill_tomato"
+from maniskill_tomato.tasks.gymnasium_form import numpy_of
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -56,7 +59,9 @@ def record_demonstrations(
 
     Raises:
         InvalidInputError: The folder holds demonstrations.
+        MissingPackageError: h5py, which comes with ManiSkill, is not installed.
         CheckpointError: Another process records in the folder, or it cannot be made.
+        NotWrittenError: A file cannot be written.
     """
     with only_writer(folder, "records"):
         return _record(env, policy, episodes, folder, reset_options)
@@ -69,59 +74,42 @@ def _record(
     folder: Path,
     reset_options: Callable[[int], dict[str, Any] | None],
 ) -> Demonstrations:
-    from mani_skill.utils.wrappers.record import RecordEpisode
-
     path = folder / f"{NAME}.h5"
     if path.exists():
         raise InvalidInputError(f"{path} exists; choose another folder, or delete it")
-    with _described_for_replays(env):
-        task: Any = env
-        recorder = RecordEpisode(
-            task,
-            output_dir=str(folder),
-            save_video=False,
-            save_on_reset=False,
-            trajectory_name=NAME,
-            source_type="motionplanning",
-            source_desc=f"moves of the policy {policy.name!r} of maniskill-tomato",
-        )
+    inner: Any = env.unwrapped
+    source = Source(
+        spec=None if inner.spec is None else replay_of(inner.spec),
+        source_type="motionplanning",
+        source_desc=f"moves of the policy {policy.name!r} of maniskill-tomato",
+    )
+    writer = TrajectoryWriter(folder, source)
     acting = as_state_policy(policy, env)
-    recorded = tried = moves = 0
-    for episode in episodes:
-        options = reset_options(episode)
-        observations, _ = recorder.reset(seed=episode, options=options)
-        reseed(policy, episode)
-        done, success, steps = False, False, 0
-        while not done:
-            observations, _, terminated, truncated, info = recorder.step(acting.act(observations))
-            steps += 1
-            done = bool(torch.as_tensor(terminated).any()) or bool(torch.as_tensor(truncated).any())
-            success = bool(torch.as_tensor(info["success"]).any())
-        recorder.flush_trajectory(save=success)
-        tried += 1
-        recorded += int(success)
-        moves += steps if success else 0
-    recorder.close()
-    return Demonstrations(path=path, recorded=recorded, tried=tried, moves=moves)
-
-
-def replay_of(spec: EnvSpec) -> EnvSpec:
-    """How a program that knows Gymnasium and ManiSkill only makes a task of this package again.
-
-    The id names the package, which Gymnasium then imports, and nothing says whether pictures are drawn: the tasks draw
-    where the observation mode asks for it.
-    """
-    kwargs = {name: value for name, value in spec.kwargs.items() if name != "render_backend"}
-    return replace(spec, id=f"{PACKAGE}:{spec.id}" if spec.id in TASK_IDS else spec.id, kwargs=kwargs)
-
-
-@contextmanager
-def _described_for_replays(env: gym.Env[Any, Any]) -> Iterator[None]:
-    """Within it, whoever asks the environment what it is gets `replay_of` that."""
-    inner = env.unwrapped
-    spec = inner.spec
-    inner.spec = None if spec is None else replay_of(spec)
+    tried = 0
     try:
-        yield
+        for seed in episodes:
+            options = reset_options(seed)
+            observations, _ = env.reset(seed=seed, options=options)
+            reseed(policy, seed)
+            episode = RecordedEpisode(
+                seed, inner.control_mode, _copied(observations), options, _copied(inner.get_state_dict())
+            )
+            done = False
+            while not done:
+                action = acting.act(observations)
+                observations, reward, terminated, truncated, info = env.step(action)
+                told = (_copied(part) for part in (action, observations, reward, terminated, truncated, info))
+                episode.add(*told, state=_copied(inner.get_state_dict()))
+                done = bool(torch.as_tensor(terminated).any()) or bool(torch.as_tensor(truncated).any())
+            tried += 1
+            if episode.is_solved:
+                writer.add(episode)
     finally:
-        inner.spec = spec
+        writer.save()
+    env.close()
+    return Demonstrations(path=path, recorded=len(writer.episodes), tried=tried, moves=writer.moves)
+
+
+def _copied(values: Any) -> Any:
+    """What an environment or a policy told, as arrays of its own: tensors may be written to in the next step."""
+    return copy.deepcopy(numpy_of(values))
