@@ -13,12 +13,13 @@ logger = logging.getLogger(__name__)
 
 
 @contextlib.contextmanager
-def only_writer(folder: Path, does: str = "writes") -> Iterator[None]:
+def only_writer(folder: Path, does: str = "writes", option: str = "--out") -> Iterator[None]:
     """Holds a folder, which is made if it is missing; one that was made and stays empty goes again after an error.
 
     Args:
         folder: Which.
         does: What the processes do that must not meet there, for the message.
+        option: Names the folder, likewise.
 
     Raises:
         CheckpointError: Another process holds it, or it cannot be made.
@@ -29,7 +30,7 @@ def only_writer(folder: Path, does: str = "writes") -> Iterator[None]:
         descriptor = os.open(folder, os.O_RDONLY)
     except OSError as error:
         raise CheckpointError(
-            f"cannot write to {folder}: {error.strerror or error}; choose another --out"
+            f"cannot write to {folder}: {error.strerror or error}; choose another {option}"
         ) from error
     try:
         try:

@@ -2,6 +2,7 @@
 
 import signal
 import threading
+from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -10,9 +11,10 @@ from maniskill_tomato.cli.arguments import Flat
 from maniskill_tomato.cli.early_checks import check_choice, check_env_id, check_policy
 from maniskill_tomato.cli.shared_options import EnvId, PlantOptions, camera_options, say
 from maniskill_tomato.errors import InvalidInputError
+from maniskill_tomato.folder_lock import only_writer
 from maniskill_tomato.plants.episode_list import EPISODE_LISTS
 from maniskill_tomato.policies.opening import shipped_policy
-from maniskill_tomato.task_registry import task_ids
+from maniskill_tomato.task_registry import THESIS_IDS, task_ids
 from maniskill_tomato.view.page_address import check_port
 from maniskill_tomato.view.play_settings import LISTED_ID, PERCEPTIONS, SHIPPED, PlaySettings
 from maniskill_tomato.view.record_kinds import EpisodeFolder, RunFile, find_record
@@ -53,16 +55,32 @@ class Play:
     """Address to listen at. 0.0.0.0 lets every machine that reaches this one steer the page."""
     port: int = 8080
     """Port of the page; 0 takes a free one."""
+    demonstrations: Path | None = None
+    """Folder that keeps the episodes which you solve by hand on the page (tab Hand), as trajectory.h5 and
+    trajectory.json, for `train --reward-from`; it may hold such episodes of the same task and options already.
+    TomatoViewpoint-v1 then has the plants of trainings."""
     export: Path | None = None
     """Write the whole episode to this HTML file instead, which needs no server."""
 
     def run(self) -> None:
         """Serves the page until it is stopped, or writes the file."""
         self._check_export()
+        self._check_demonstrations()
+        with ExitStack() as held:
+            self._run(held)
+
+    def _run(self, held: ExitStack) -> None:
+        """Does it; what must be given back at the end is entered in `held`."""
         settings = self._settings() if self.record is None else None
         kind = None if self.record is None else self._kind_of_record(self.record)
         if self.export is None:
             check_port(self.host, self.port)
+        shown = None
+        if settings is not None and self.demonstrations is not None:
+            from maniskill_tomato.view.demonstrating import PersonsDemonstrations
+
+            held.enter_context(only_writer(self.demonstrations, "records", "--demonstrations"))
+            shown = PersonsDemonstrations(self.demonstrations, settings)
 
         from maniskill_tomato.view.player import Player
 
@@ -70,7 +88,7 @@ class Play:
         if settings is not None:
             from maniskill_tomato.view.play_session import PlaySession
 
-            player = Player(PlaySession, settings)
+            player = Player(lambda chosen: PlaySession(chosen, shown), settings)
         elif isinstance(kind, RunFile):
             from maniskill_tomato.view.run_recording import read_run
 
@@ -97,10 +115,22 @@ class Play:
             stop.wait()
         finally:
             page.close()
+            if shown is not None:
+                say(f"{shown.path}: {shown.episodes} episodes, {shown.moves} moves")
 
     def _check_export(self) -> None:
         if self.export is not None and self.export.suffix.lower() not in (".html", ".htm"):
             raise InvalidInputError(f"--export must name an .html file, got {self.export}")
+
+    def _check_demonstrations(self) -> None:
+        if self.demonstrations is None:
+            return
+        for name, is_given in (("--record", self.record is not None), ("--export", self.export is not None)):
+            if is_given:
+                raise InvalidInputError(
+                    f"--demonstrations keeps what you do on the page of a task; leave out {name}"
+                )
+        check_env_id(self.env_id, (*THESIS_IDS, LISTED_ID))
 
     def _kind_of_record(self, record: Path) -> "RunFile | EpisodeFolder":
         """What a record is, by what it holds.
@@ -151,6 +181,7 @@ class Play:
             target=self.target,
             plant_options=self.plants.env_options(),
             episode_list=self.episode_list,
+            is_demonstrated=self.demonstrations is not None,
         )
 
 

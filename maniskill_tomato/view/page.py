@@ -223,6 +223,7 @@ class PlayPage:
         elif not self.player.is_stored:
             self._choices.tell()
             self.target.tell()
+            self.hand.tell()
             snapshot = recording.at(shown)
             self._fruits.content = fruit_list(snapshot, has_map=snapshot.measured is not None)
 

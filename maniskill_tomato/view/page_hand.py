@@ -1,4 +1,4 @@
-"""A camera that one drags through the scene, always turned to the target."""
+"""A camera that one drags through the scene, always turned to the target, and to which the arm's camera can follow."""
 
 from collections.abc import Callable
 from typing import Any, Final
@@ -6,6 +6,7 @@ from typing import Any, Final
 import numpy as np
 import viser
 
+from maniskill_tomato.view.page_choices import by_hand
 from maniskill_tomato.view.page_head import picture_tag
 from maniskill_tomato.view.page_scene import Rgb, pose, vector
 from maniskill_tomato.view.player import Player
@@ -37,11 +38,15 @@ class HandCamera:
         self._words = server.gui.add_markdown(
             "Drag it by its arrows: V_f from there is counted with rays at once."
         )
+        self._move = server.gui.add_button("Move the arm there", visible=False)
+        self._move.on_click(by_hand(ask, lambda _: self.move()))
         self._picture = server.gui.add_html("", visible=False)
+        self._demonstrated = server.gui.add_markdown("", visible=False)
+        self.tell()
 
     def take(self, is_taken: bool) -> None:
         """Puts up the camera, where the wrist camera is now, or takes it away."""
-        self._picture.visible = is_taken
+        self._picture.visible = self._move.visible = is_taken
         if not is_taken:
             self._scene.remove_by_name("/hand")
             self._scene.remove_by_name("/hand_view")
@@ -56,6 +61,22 @@ class HandCamera:
                 position=vector(snapshot.T_w_camera[:3, 3]),
             )
             self._handle.on_update(lambda _: self._ask_look())
+            self.look()
+
+    def tell(self) -> None:
+        """Says what becomes of the episode as a demonstration."""
+        words = self._player.demonstrated
+        self._demonstrated.content, self._demonstrated.visible = words or "", words is not None
+
+    def move(self) -> None:
+        """Moves the arm's camera to where this one is held, or as far as one move goes.
+
+        Raises:
+            InvalidInputError: The episode is over, or no move leads there.
+            NotWrittenError: A demonstration that the move completes cannot be saved.
+        """
+        if self._handle is not None:
+            self._player.move_camera(np.array(self._handle.position, dtype=np.float64))
             self.look()
 
     def look(self) -> None:

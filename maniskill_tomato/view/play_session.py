@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from maniskill_tomato.errors import InvalidInputError
+from maniskill_tomato.learning.imitation.demonstrations import copied_arrays
 from maniskill_tomato.plants.organs import Plant, with_fruit_at
 from maniskill_tomato.policies.adapters import as_state_policy
 from maniskill_tomato.policies.lattice_planner import LatticePlanner
@@ -18,6 +19,7 @@ from maniskill_tomato.robot.kinematics import link_transforms
 from maniskill_tomato.sensing.camera_perception import CameraPerception
 from maniskill_tomato.sensing.occlusion_memory import CELL_SIZE, OcclusionMemory
 from maniskill_tomato.tasks.vector_env import make_vector_env
+from maniskill_tomato.view.demonstrating import POLICY_MOVED, TARGET_MOVED, PersonsDemonstrations
 from maniskill_tomato.view.episode_recording import (
     Candidates,
     EpisodeRecording,
@@ -29,9 +31,13 @@ from maniskill_tomato.view.episode_recording import (
     Snapshot,
     Voxel,
 )
+from maniskill_tomato.view.hand_move import hand_move
 from maniskill_tomato.view.play_settings import SHIPPED, PlaySettings
 from maniskill_tomato.view.player import NO_DRAG
 from maniskill_tomato.view.world_camera import WorldCamera, as_double
+
+OVER: Final = "the episode is over; *Reset* begins it again, and another seed begins another one"
+"""Why no move is made."""
 
 STANDS_STILL: Final = 1e-4
 """A camera that moved less has not moved, in [m]."""
@@ -44,14 +50,21 @@ class PlaySession:
     decisions are those that an evaluation of the same seed makes.
     """
 
-    def __init__(self, settings: PlaySettings) -> None:
+    def __init__(self, settings: PlaySettings, demonstrations: PersonsDemonstrations | None = None) -> None:
         """Opens the task and the policy and begins the episode.
 
+        Args:
+            settings: Which.
+            demonstrations: Keeps what a person shows; None where nothing is kept.
+
         Raises:
-            InvalidInputError: An option cannot be used.
+            InvalidInputError: An option cannot be used, or the demonstrations are of something else.
             PolicyError: The policy cannot be used.
         """
+        if demonstrations is not None:
+            demonstrations.check(settings)
         self.settings = settings
+        self._demonstrations = demonstrations
         self._env = make_vector_env(
             settings.env_id, arrays="torch", autoreset_mode="Disabled", **settings.world_options()
         )
@@ -73,6 +86,8 @@ class PlaySession:
         self._policy = self._open_policy(seed)
         self._acting = as_state_policy(self._policy, self._env)
         observations, info = self._env.reset(seed=seed)
+        if self._demonstrations is not None:
+            self._demonstrations.begin(seed, self._world.control_mode, copied_arrays(observations))
         world, settings = self._world, self.settings
         seen = "" if settings.perception == "ground_truth" else f", {settings.perception}"
         self.recording = EpisodeRecording(
@@ -98,8 +113,35 @@ class PlaySession:
         """
         if self._action is None:
             return False
+        if self._demonstrations is not None:
+            self._demonstrations.object(POLICY_MOVED)
+        self._make(self._action)
+        return True
+
+    def move_camera(self, position: Float64) -> None:
+        """Makes a move of a person in place of the policy's: to a place, or a part of the way there.
+
+        Args:
+            position: Of the camera, in the world frame, in [m]. Shape (3,).
+
+        Raises:
+            InvalidInputError: The episode is over, or no move of the arm leads there.
+            NotWrittenError: A demonstration that the move completes cannot be saved.
+        """
+        if self._action is None:
+            raise InvalidInputError(OVER)
+        self._make(hand_move(self._world, position))
+
+    @property
+    def demonstrated(self) -> str | None:
+        """What becomes of the episode as a demonstration, in words; None where nothing is kept."""
+        return None if self._demonstrations is None else self._demonstrations.in_words
+
+    def _make(self, action: Tensor) -> None:
+        """Makes a move and lets the policy decide on the new view."""
         before = self._world.T_w_camera[0, :3, 3].clone()
-        observations, _, terminated, truncated, info = self._env.step(self._action)
+        result = self._env.step(action)
+        observations, _, terminated, truncated, info = result
         event = move_in_words(info, float((self._world.T_w_camera[0, :3, 3] - before).norm()))
         if bool(terminated[0]) or bool(truncated[0]):
             self._action = None
@@ -107,7 +149,8 @@ class PlaySession:
         else:
             self._decide(observations)
         self.recording.snapshots.append(self._snapshot(info, event))
-        return True
+        if self._demonstrations is not None:
+            self._demonstrations.add(copied_arrays(action), copied_arrays(result))
 
     def move_target(self, position: Float64) -> None:
         """Hangs the target elsewhere: the last view is seen again as it is now, and the episode goes on from there.
@@ -122,6 +165,8 @@ class PlaySession:
         """
         if self.target_place() is None:
             raise InvalidInputError(NO_DRAG)
+        if self._demonstrations is not None:
+            self._demonstrations.object(TARGET_MOVED)
         world = self._world
         plant = world.plant_batch.plants[0]
         if self._own_plant is None:

@@ -41,7 +41,10 @@ class PlaySettings:
     plant_options: Mapping[str, Any] = field(default_factory=dict)
     """Options of the task about other plants than its own."""
     episode_list: str | None = None
-    """A list of episodes, for the task that has some; held-out ones if None, unless the plants are others."""
+    """A list of episodes, for the task that has some; held-out ones if None, unless the plants are others
+    or somebody demonstrates."""
+    is_demonstrated: bool = False
+    """Whether a person shows learners what to do, who must not see the plants on which they are judged."""
 
     def __post_init__(self) -> None:
         check_task_name(self.env_id, "env_id")
@@ -57,8 +60,11 @@ class PlaySettings:
     def world_options(self) -> dict[str, Any]:
         """Options of the task, as `tasks.making.make_world` takes them."""
         options = dict(self.plant_options)
-        if self.env_id == LISTED_ID and (self.episode_list is not None or not options):
-            options["episodes"] = self.episode_list or "held_out"
+        listed = self.episode_list
+        if listed is None and not options and not self.is_demonstrated:
+            listed = "held_out"
+        if self.env_id == LISTED_ID and listed is not None:
+            options["episodes"] = listed
         if self.perception != "ground_truth":
             options["perception"] = self.perception
             if self.target is not None and base_of(self.env_id) == LISTED_ID:

@@ -58,6 +58,15 @@ class PlayedSession(Session, Protocol):
         """Lets the policy decide on the last view as it is now."""
         ...
 
+    def move_camera(self, position: Float64) -> None:
+        """Makes a move of a person: to a place, or a part of the way there. Shape (3,), in [m]."""
+        ...
+
+    @property
+    def demonstrated(self) -> str | None:
+        """What becomes of the episode as a demonstration, in words; None where nothing is kept."""
+        ...
+
 
 class StoredSession:
     """An episode that happened elsewhere: all that can be done is to look at it."""
@@ -138,6 +147,25 @@ class Player:
         """Lets the policy decide on where the target was left."""
         if not self.is_stored:
             cast(PlayedSession, self._session).decide_again()
+
+    def move_camera(self, position: Float64) -> None:
+        """Makes a move of a person from the last view, and shows where it led. Shape (3,), in [m].
+
+        Raises:
+            InvalidInputError: The episode is over, or no move leads there.
+            NotWrittenError: A demonstration that the move completes cannot be saved.
+        """
+        if not self.is_stored:
+            self.show(self.recording.moves)
+            try:
+                cast(PlayedSession, self._session).move_camera(position)
+            finally:
+                self.shown = self.recording.moves
+
+    @property
+    def demonstrated(self) -> str | None:
+        """What becomes of the episode as a demonstration, in words; None where nothing is kept."""
+        return None if self.is_stored else cast(PlayedSession, self._session).demonstrated
 
     @property
     def is_at_end(self) -> bool:

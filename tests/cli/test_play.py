@@ -1,5 +1,6 @@
 """`maniskill-tomato play` on the command line: it serves, ends at a signal, and refuses what cannot be."""
 
+import json
 import os
 import re
 import signal
@@ -31,6 +32,9 @@ def run(*arguments: str) -> "subprocess.CompletedProcess[str]":
         (["--episode-list", "heldout"], "did you mean 'held_out'"),
         (["TomatoViewpointRow-v1", "--episode-list", "held_out"], "--episode-list is for TomatoViewpoint-v1"),
         (["--export", "page.txt"], "--export must name an .html file"),
+        (["--demonstrations", "shown", "--export", "page.html"], "leave out --export"),
+        (["--demonstrations", "shown", "--record", "runs"], "leave out --record"),
+        (["TomatoViewpointRow-v1", "--demonstrations", "shown"], "ENV_ID must be one of"),
     ],
 )
 def test_what_cannot_be_played_is_refused_before_torch_loads(arguments: list[str], message: str) -> None:
@@ -43,6 +47,14 @@ def test_what_cannot_be_played_is_refused_before_torch_loads(arguments: list[str
     )
     assert result.returncode == 2, result.stderr
     assert message in result.stderr and "Traceback" not in result.stderr
+
+
+def test_a_folder_of_other_demonstrations_is_refused_before_torch_loads(tmp_path: Path) -> None:
+    about = {"env_info": {"env_id": "maniskill_tomato:TomatoViewpointGuided-v1"}, "episodes": []}
+    (tmp_path / "trajectory.json").write_text(json.dumps(about))
+    (tmp_path / "trajectory.h5").write_bytes(b"")
+    arguments = ["TomatoViewpointSparse-v1", "--demonstrations", str(tmp_path), "--port", "0"]
+    test_what_cannot_be_played_is_refused_before_torch_loads(arguments, "choose another folder")
 
 
 def test_a_port_that_is_taken_is_refused() -> None:

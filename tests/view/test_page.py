@@ -109,6 +109,19 @@ def test_the_camera_in_the_hand_stands_in_the_scene_while_it_is_taken(page: Play
     assert page.server.scene.get_handle_by_name("/hand") is None
 
 
+def test_the_arm_goes_to_where_the_camera_is_held_when_it_is_told_to(page: PlayPage) -> None:
+    page.ask(lambda: page.hand.take(True)).result(PATIENCE_S)
+    handle = node(page, "/hand")
+    first = np.array(handle.position)
+    held = first + [0.0, 0.0, 0.05]
+    handle.position = tuple(held)
+    page.ask(page.hand.look).result(PATIENCE_S)
+    np.testing.assert_allclose(node(page, "/camera").position, first, atol=1e-6)
+    page.ask(page.hand.move).result(PATIENCE_S)
+    assert page.player.shown == page.player.recording.moves == 1
+    np.testing.assert_allclose(node(page, "/camera").position, held, atol=1e-3)
+
+
 def test_a_target_that_is_dragged_moves_its_fruit_and_nothing_else(page: PlayPage) -> None:
     page.ask(lambda: page.target.take(True)).result(PATIENCE_S)
     place = page.player.target_place()

@@ -92,14 +92,18 @@ def _record(
             observations, _ = env.reset(seed=seed, options=options)
             reseed(policy, seed)
             episode = RecordedEpisode(
-                seed, inner.control_mode, _copied(observations), options, _copied(inner.get_state_dict())
+                seed,
+                inner.control_mode,
+                copied_arrays(observations),
+                options,
+                copied_arrays(inner.get_state_dict()),
             )
             done = False
             while not done:
                 action = acting.act(observations)
-                observations, reward, terminated, truncated, info = env.step(action)
-                told = (_copied(part) for part in (action, observations, reward, terminated, truncated, info))
-                episode.add(*told, state=_copied(inner.get_state_dict()))
+                step = env.step(action)
+                observations, _, terminated, truncated, _ = step
+                episode.add(copied_arrays(action), copied_arrays(step), copied_arrays(inner.get_state_dict()))
                 done = bool(torch.as_tensor(terminated).any()) or bool(torch.as_tensor(truncated).any())
             tried += 1
             if episode.is_solved:
@@ -110,6 +114,8 @@ def _record(
     return Demonstrations(path=path, recorded=len(writer.episodes), tried=tried, moves=writer.moves)
 
 
-def _copied(values: Any) -> Any:
-    """What an environment or a policy told, as arrays of its own: tensors may be written to in the next step."""
+def copied_arrays(values: Any) -> Any:
+    """What an environment or a policy told, as arrays that the next step cannot write to."""
+    if isinstance(values, tuple):
+        return tuple(map(copied_arrays, values))
     return copy.deepcopy(numpy_of(values))

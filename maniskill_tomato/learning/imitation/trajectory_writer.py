@@ -26,6 +26,9 @@ PACKAGE: Final = "maniskill_tomato"
 FLAGS: Final = ("success", "fail")
 """What of a step's info is stored."""
 
+StepResult = tuple[Any, Any, Any, Any, Mapping[str, Any]]
+"""Observation, reward, termination, truncation and info of a Gymnasium step."""
+
 WHOSE: Final = {"motionplanning": "a policy", "teleoperation": "a person"}
 """Who made the moves, by ManiSkill's word for it."""
 
@@ -88,18 +91,10 @@ class RecordedEpisode:
         self.actions: list[Any] = []
         self.steps: list[dict[str, Any]] = []
 
-    def add(
-        self,
-        action: Any,
-        observation: Any,
-        reward: Any,
-        terminated: Any,
-        truncated: Any,
-        info: Mapping[str, Any],
-        state: Mapping[str, Any] | None = None,
-    ) -> None:
-        """Takes a move and what came of it, in the order in which a step returns it; arrays are copied."""
-        self.actions.append(np.array(action, np.float32).reshape(-1))
+    def add(self, action: Any, step: StepResult, state: Mapping[str, Any] | None = None) -> None:
+        """Takes a move, what the step returned, and the state after it, which are kept as they are."""
+        observation, reward, terminated, truncated, info = step
+        self.actions.append(np.asarray(action, np.float32).reshape(-1))
         self.observations.append(observation)
         flags = {name: info[name] for name in FLAGS if name in info}
         self.steps.append({"terminated": terminated, "truncated": truncated, **flags, "rewards": reward})
@@ -180,14 +175,14 @@ class TrajectoryWriter:
         """Takes an episode with a move or more; `save` writes it."""
         stored = episode.arrays()
         number = 1 + max((int(entry["episode_id"]) for entry in self.episodes), default=-1)
-        entry = {
+        entry: dict[str, Any] = {
             "episode_id": number,
             "episode_seed": episode.seed,
             "control_mode": episode.control_mode,
             "elapsed_steps": episode.moves,
             "reset_kwargs": {"options": episode.options, "seed": episode.seed},
-            **{name: bool(stored[name][-1]) for name in FLAGS if name in stored},
         }
+        entry |= {name: bool(stored[name][-1]) for name in FLAGS if name in stored}
         _put(self._file, _group(entry), stored)
         self.episodes.append(entry)
 
