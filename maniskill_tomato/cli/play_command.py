@@ -116,7 +116,7 @@ class Play:
         finally:
             page.close()
             if shown is not None:
-                say(f"{shown.path}: {shown.episodes} episodes, {shown.moves} moves")
+                say(f"{self.demonstrations}: {shown.episodes} demonstrations, {shown.moves} moves")
 
     def _check_export(self) -> None:
         if self.export is not None and self.export.suffix.lower() not in (".html", ".htm"):

@@ -44,11 +44,6 @@ class PersonsDemonstrations:
         self._objection = ""
 
     @property
-    def path(self) -> Path:
-        """The .h5 file, which is there after the first episode that is kept."""
-        return self._writer.path
-
-    @property
     def episodes(self) -> int:
         """How many are kept, those of earlier times too."""
         return len(self._writer.episodes)
@@ -111,7 +106,7 @@ class PersonsDemonstrations:
             present = "this one is kept"
         else:
             present = "this one counts if you reach success by your own moves alone"
-        return f"**{self.episodes}** demonstrations in `{self.path.parent}`; {present}."
+        return f"**{self.episodes}** demonstrations in `{self._writer.path.parent}`; {present}."
 
 
 def _source(settings: PlaySettings) -> Source:

@@ -33,6 +33,8 @@ class HandCamera:
         self._ask = ask
         self._handle: Any = None
         self._is_asked = False
+        self._demonstrated = server.gui.add_markdown("", visible=False)
+        self.tell()
         box = server.gui.add_checkbox("Take a camera in the hand", False)
         box.on_update(self._taken)
         self._words = server.gui.add_markdown(
@@ -41,8 +43,6 @@ class HandCamera:
         self._move = server.gui.add_button("Move the arm there", visible=False)
         self._move.on_click(by_hand(ask, lambda _: self.move()))
         self._picture = server.gui.add_html("", visible=False)
-        self._demonstrated = server.gui.add_markdown("", visible=False)
-        self.tell()
 
     def take(self, is_taken: bool) -> None:
         """Puts up the camera, where the wrist camera is now, or takes it away."""

@@ -137,6 +137,11 @@ class PlaySession:
         """What becomes of the episode as a demonstration, in words; None where nothing is kept."""
         return None if self._demonstrations is None else self._demonstrations.in_words
 
+    @property
+    def _hides_policy(self) -> bool:
+        """Whether a person shows what to do, whom the policy's choice would lead."""
+        return self._demonstrations is not None
+
     def _make(self, action: Tensor) -> None:
         """Makes a move and lets the policy decide on the new view."""
         before = self._world.T_w_camera[0, :3, 3].clone()
@@ -252,7 +257,12 @@ class PlaySession:
 
     def _candidates(self) -> Candidates | None:
         policy = self._policy
-        if self._action is None or not isinstance(policy, LatticePlanner) or policy.judged is None:
+        if (
+            self._hides_policy
+            or self._action is None
+            or not isinstance(policy, LatticePlanner)
+            or policy.judged is None
+        ):
             return None
         judged = policy.judged
         return Candidates(
@@ -263,7 +273,7 @@ class PlaySession:
 
     def _next_camera(self) -> Float64 | None:
         """Where the decided move takes the camera, by kinematics alone."""
-        if self._action is None:
+        if self._hides_policy or self._action is None:
             return None
         world, state = self._world, self._world.state
         plan = world.moves.plan(
