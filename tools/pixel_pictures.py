@@ -1,10 +1,11 @@
-"""Draws what a policy of images sees in a search, and the curves of its trainings.
+"""Draws and films what a policy of images sees in a search, and draws the curves of its trainings.
 
 Usage:
     python tools/pixel_pictures.py --runs runs/pixels-0 runs/pixels-1 --out docs/images
 """
 
 import sys
+import tempfile
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -15,8 +16,14 @@ import matplotlib as mpl
 import numpy as np
 import tyro
 from numpy.typing import NDArray
+from PIL import Image
 
-from maniskill_tomato.experiments.film import make_film_options, wrist_picture
+from maniskill_tomato.experiments.film import (
+    FRAMES_PER_SECOND,
+    film_episodes,
+    make_film_options,
+    wrist_picture,
+)
 from maniskill_tomato.experiments.rollout import run_batch
 from maniskill_tomato.learning.rl.envs import make_env
 from maniskill_tomato.learning.rl.history import load_history
@@ -48,6 +55,11 @@ LINES = ("-", "--", ":", "-.")
 SIDE = 320
 """Width of a picture, in [px]."""
 
+FILM_WIDTH = 800
+"""Of the film, in [px]."""
+EVERY = 2
+"""Of the frames of the film that this package makes, every second one is kept, to be shown for twice as long."""
+
 
 @dataclass(frozen=True, kw_only=True)
 class Args:
@@ -56,9 +68,11 @@ class Args:
     runs: tuple[Path, ...]
     """Folders of the trainings; the first one's policy is shown."""
     out: Path = Path("docs/images")
-    """Folder of `pixel_search.jpg` and `pixel_training.png`."""
+    """Folder of `pixel_search.jpg`, `pixel_search.webp` and `pixel_training.png`."""
     seed: int = 9
     """Which episode of the held-out list."""
+    curves: bool = True
+    """Whether to draw the curves."""
 
 
 class _Views:
@@ -84,16 +98,35 @@ class _Views:
         self.columns.append(np.concatenate(parts).astype(np.uint8))
 
 
+def film(env: Any, policy: PixelPolicy, seed: int, path: Path) -> None:
+    """Films the search as an animated picture, which pages show without a player."""
+    with tempfile.TemporaryDirectory() as folder:
+        whole = Path(folder) / "film.mp4"
+        film_episodes(env, policy, [seed], whole)
+        frames = iio.imread(whole)[::EVERY]
+    height = round(FILM_WIDTH * frames.shape[1] / frames.shape[2])
+    shown = [
+        Image.fromarray(cv2.resize(f, (FILM_WIDTH, height), interpolation=cv2.INTER_AREA)) for f in frames
+    ]
+    milliseconds = round(1000 * EVERY / FRAMES_PER_SECOND)
+    shown[0].save(
+        path, save_all=True, append_images=shown[1:], duration=milliseconds, loop=0, quality=55, method=6
+    )
+
+
 def main(args: Args) -> int:
-    """Draws both pictures."""
+    """Draws the pictures."""
     args.out.mkdir(parents=True, exist_ok=True)
     policy = open_policy(args.runs[0] / "policy.pt", env_id=TASK)
     assert isinstance(policy, PixelPolicy)
     env = make_env(TASK, **make_film_options({"episodes": "held_out"}))
     views = _Views(env.unwrapped, policy)
     run_batch(env, policy, [args.seed], watcher=views)
-    env.close()
     iio.imwrite(args.out / "pixel_search.jpg", np.concatenate(views.columns, axis=1), quality=88)
+    film(env, policy, args.seed, args.out / "pixel_search.webp")
+    env.close()
+    if not args.curves:
+        return 0
     figure, (success, steps) = plt.subplots(1, 2, figsize=(9.0, 3.2), layout="constrained")
     for run, line in zip(args.runs, LINES, strict=False):
         episodes = load_history(run).episodes
