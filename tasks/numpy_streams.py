@@ -1,10 +1,11 @@
 """Random generators of environments: seeds for many from one, and states as plain data."""
 
-from collections.abc import Sequence
+from collections.abc import MutableSequence, Sequence
 from typing import Any
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 
 from maniskill_tomato.errors import InvalidInputError
 
@@ -27,6 +28,24 @@ def spread_seed(seed: int | Sequence[int], count: int) -> list[int]:
             f"seed must be one number or {count}, one for each environment; got {len(seeds)}"
         )
     return seeds
+
+
+def seed_some(
+    rngs: list[np.random.RandomState],
+    seeds: MutableSequence[int] | NDArray[np.int64],
+    rows: Sequence[int],
+    seed: int | Sequence[int],
+) -> None:
+    """Seeds the generators of some environments and leaves those of the others as they are.
+
+    Args:
+        rngs: Of all environments.
+        seeds: What they were last seeded with.
+        rows: Which are seeded.
+        seed: As for `spread_seed`.
+    """
+    for i, one in zip(rows, spread_seed(seed, len(rows)), strict=True):
+        rngs[i], seeds[i] = np.random.RandomState(one), one
 
 
 def random_state(rng: np.random.RandomState) -> dict[str, Any]:

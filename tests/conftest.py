@@ -195,6 +195,12 @@ LONG_FILES = (
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    if cuda_problem() is None and any(item.get_closest_marker("gpu") is not None for item in items):
+        # PhysX takes a GPU only before anything else was simulated in the process.
+        import sapien
+
+        if not sapien.physx.is_gpu_enabled():
+            sapien.physx.enable_gpu()
     rank = {name: k for k, name in enumerate(LONG_FILES)}
     items.sort(key=lambda item: rank.get(item.path.name, len(LONG_FILES)))
 

@@ -341,7 +341,9 @@ def _training(preset: PresetName, setting: Setting) -> Findings:
         _must(trained.updates > 0, "a training must update its networks within its time")
         env = make_env(GUIDED, 64)
         with closing(env):
-            policy = open_policy(str(trained.policy_path), env_id=GUIDED)
+            policy = open_policy(
+                str(trained.policy_path), env_id=GUIDED, device=cast(Any, env.unwrapped).device
+            )
             episodes = run_episodes(env, policy, 64, 10_000)
         yield "success_rate_of_64_episodes", sum(e.success for e in episodes) / len(episodes)
 

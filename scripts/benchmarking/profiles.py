@@ -126,7 +126,7 @@ LOOK: Final[Stages] = {
     "scaling images": [torch.nn.functional.interpolate],
     "boxes": [light_segmenter.find_fruits, light_segmenter.voted_boxes],
     "masks": [light_segmenter.full_maps, light_segmenter.split_by_votes],
-    "fitting circles": [FruitDetector.measure],
+    "measuring each fruit": [FruitDetector.measure],
     "the map of fruits": [CameraPerception.add],
     "rays from the picture": [CameraPerception.rays],
 }

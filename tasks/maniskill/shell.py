@@ -37,6 +37,7 @@ from maniskill_tomato.tasks.maniskill import scenery, shell_options
 from maniskill_tomato.tasks.maniskill.flat_state import checked_rows, unflatten
 from maniskill_tomato.tasks.maniskill.iiwa14_agent import Iiwa14D435
 from maniskill_tomato.tasks.maniskill.motion import drive_to
+from maniskill_tomato.tasks.numpy_streams import seed_some
 from maniskill_tomato.tasks.plant_batch import PlantBatch
 from maniskill_tomato.tasks.row.search_game import SearchGame
 from maniskill_tomato.tasks.world import World, check_action
@@ -233,6 +234,11 @@ class TomatoEnv(BaseEnv):  # type: ignore[misc]
                 len(rows), self.num_envs, builds_anew=due or bool(options.get("reconfigure"))
             )
             options = {**options, "env_idx": rows}
+            if seed is not None and len(rows) < self.num_envs:
+                # ManiSkill would drop the generators of the others.
+                generators: Any = self._batched_episode_rng
+                seed_some(generators.rngs, self._episode_seed, rows.tolist(), seed)
+                seed = None
         result: tuple[Any, dict[str, Any]] = super().reset(seed=seed, options=options)
         return result
 

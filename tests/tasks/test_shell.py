@@ -3,13 +3,16 @@
 from typing import Any
 
 import gymnasium as gym
+import numpy as np
 import pytest
 import torch
+from mani_skill.envs.utils.randomization.batched_rng import BatchedRNG
 
 import maniskill_tomato  # noqa: F401
 from maniskill_tomato.errors import InvalidInputError
 from maniskill_tomato.tasks import TASK_IDS
 from maniskill_tomato.tasks.maniskill.shell_options import check_partial_reset, pick_reconfiguration_freq
+from maniskill_tomato.tasks.numpy_streams import seed_some
 from maniskill_tomato.tasks.vector_env import make_vector_env
 
 OPTIONS: dict[str, dict[str, Any]] = {
@@ -77,6 +80,15 @@ def test_a_reset_of_some_that_would_build_the_scenes_of_all_is_refused() -> None
         check_partial_reset(3, 16, builds_anew=True)
     check_partial_reset(16, 16, builds_anew=True)
     check_partial_reset(3, 16, builds_anew=False)
+
+
+def test_seeds_for_some_environments_leave_the_generators_of_the_others_alone() -> None:
+    generators, seeds = BatchedRNG.from_seeds([10, 11, 12, 13]), np.array([10, 11, 12, 13])
+    seed_some(generators.rngs, seeds, [1, 3], [50, 51])
+    assert seeds.tolist() == [10, 50, 12, 51]
+    expected = [np.random.RandomState(seed).randint(10**6) for seed in (10, 50, 12, 51)]
+    drawn: Any = generators.randint(10**6)
+    assert drawn.tolist() == expected
 
 
 def test_an_option_of_another_task_is_refused_with_the_tasks_that_take_it() -> None:
