@@ -97,6 +97,12 @@ def load_kernels() -> None:
 LARGEST_KEPT_BATCH: Final = 4096
 """Tensors of larger batches are not kept between calls."""
 
+
+def room_for(rows: int) -> int:
+    """The power of two in which this number of rows fits: a batch whose size changes needs few recorded launches."""
+    return 1 << max(rows - 1, 0).bit_length()
+
+
 RowType = tuple[tuple[int, ...], torch.dtype, Any]
 """Shape and type of a row of a batch in torch, and what Warp takes it for."""
 
@@ -104,8 +110,8 @@ RowType = tuple[tuple[int, ...], torch.dtype, Any]
 class BatchKernel:
     """A Warp kernel over the rows of a batch: inputs, then constants, then outputs.
 
-    The tensors and the recorded launch of each batch size are kept, so that a call costs about ten microseconds. Not
-    for use from several threads at once.
+    The tensors and the recorded launch of each `room_for` a batch are kept, so that a call costs about ten
+    microseconds. Not for use from several threads at once.
     """
 
     def __init__(
@@ -133,11 +139,15 @@ class BatchKernel:
             The outputs; the next call writes into the same tensors.
         """
         batch, device = len(inputs[0]), inputs[0].device
-        prepare = self._kept if batch <= LARGEST_KEPT_BATCH else self._prepare
-        launch, own, outputs = prepare(batch, device)
+        room = room_for(batch)
+        launch, own, outputs = (
+            self._kept(room, device) if room <= LARGEST_KEPT_BATCH else self._prepare(batch, device)
+        )
+        if batch < room <= LARGEST_KEPT_BATCH:
+            own, outputs = (tuple(tensor[:batch] for tensor in tensors) for tensors in (own, outputs))
         for tensor, given in zip(own, inputs, strict=True):
             tensor.copy_(given.detach())
-        launch()
+        launch(batch)
         return outputs
 
     def _prepare(

@@ -5,11 +5,14 @@ import multiprocessing
 import multiprocessing.connection
 import os
 import signal
+import subprocess
+import sys
 import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from contextvars import ContextVar
+from multiprocessing.connection import Connection
 from multiprocessing.process import BaseProcess
 from typing import Any, Final, TypeVar
 
@@ -118,6 +121,48 @@ def start_process(
     finally:
         signal.pthread_sigmask(signal.SIG_SETMASK, before)
     return process
+
+
+def start_worker(
+    function: Callable[..., None], *arguments: Any
+) -> tuple["subprocess.Popen[bytes]", Connection]:
+    """Calls a function in a new interpreter at the other end of a pipe, which closes when this process ends.
+
+    Nothing of this process's script is run again there, other than by the processes of `multiprocessing`. The process
+    computes with one thread. Ctrl-C does not reach it.
+
+    Args:
+        function: A function of a module, since the process must find it. Its first argument is the process's end of
+            the pipe; it returns when receiving raises `EOFError`.
+        arguments: What else it is called with.
+
+    Returns:
+        The process and this one's end of the pipe.
+    """
+    ours, theirs = multiprocessing.Pipe()
+    paths = os.pathsep.join(path for path in sys.path if path)
+    with contextlib.closing(theirs):
+        process = subprocess.Popen(
+            [sys.executable, "-P", "-c", f"from {__name__} import serve; serve({theirs.fileno()})"],
+            stdin=subprocess.DEVNULL,
+            env={**ONE_THREAD, **os.environ, "PYTHONPATH": paths},
+            pass_fds=[theirs.fileno()],
+            start_new_session=True,
+        )
+    with contextlib.suppress(BrokenPipeError):  # It ended at once, which whoever receives is told.
+        ours.send((function, arguments))
+    return process, ours
+
+
+def serve(handle: int) -> None:
+    """The work of a process of `start_worker`.
+
+    Args:
+        handle: The file descriptor of its end of the pipe.
+    """
+    with contextlib.closing(Connection(handle)) as connection, contextlib.suppress(EOFError, BrokenPipeError):
+        function, arguments = connection.recv()
+        function(connection, *arguments)
 
 
 def _run_alone(function: Callable[..., None], arguments: tuple[Any, ...], grace: float) -> None:

@@ -7,6 +7,7 @@ Usage:
     python scripts/benchmark.py --device cuda --out gpu.json
     python scripts/benchmark.py --parts vector shell --envs 1 16 --shells 4
     python scripts/benchmark.py --parts profiles
+    python scripts/benchmark.py --plants --out plants.json
 """
 
 import json
@@ -28,6 +29,7 @@ import tyro
 from benchmarking.comparison import check_same_kind, compare_rates, comparison_text, read_run
 from benchmarking.detectors import check_detection
 from benchmarking.parts import ERROR, LIMITS, profile_tables, run_parts
+from benchmarking.plants_and_processes import plants_and_processes
 from benchmarking.rivals import rival_results, rival_tables
 from benchmarking.simulator import images, kinematics, look_times, memory, simulated, vectors
 from benchmarking.turns import Measurement, in_turns
@@ -65,6 +67,9 @@ class Args:
     rivals: bool = False
     """Measure other libraries beside this package's parts instead (extra `rivals`; those that are not installed are
     left out), and write their tables as Markdown beside the JSON."""
+    plants: bool = False
+    """Measure resets with kept and with new plants, how fast plants grow, and two processes beside one, instead;
+    much of it by the clock, so that it wants a machine of its own."""
     device: str = "cpu"
     """`cuda` does all `--parts` but `profiles`, in about eight minutes, and none of what is measured in turns."""
     parts: tuple[Part, ...] = ()
@@ -107,9 +112,9 @@ class Args:
         ):
             if getattr(self, name) < 1:
                 raise InvalidInputError(f"{name} must be at least 1, got {getattr(self, name)}")
-        if self.rivals and self.compare is not None:
+        if self.rivals + self.plants + (self.compare is not None) > 1:
             raise InvalidInputError(
-                "--rivals writes tables and --compare compares rates of this package; give one"
+                "--rivals and --plants measure something else than the rates that --compare compares; give one of them"
             )
         if not self.rivals and (self.photos is not None or self.yolo is not None):
             raise InvalidInputError("--photos and --yolo go with --rivals")
@@ -127,9 +132,9 @@ class Args:
             raise InvalidInputError(
                 "PyTorch finds no CUDA device here; leave out --device to measure the CPU"
             )
-        if self.all_parts and (self.rivals or self.compare is not None):
+        if self.all_parts and (self.rivals or self.plants or self.compare is not None):
             raise InvalidInputError(
-                "--rivals and --compare go with what is measured in turns, not with --parts or --device cuda"
+                "--rivals, --plants and --compare go with what is measured in turns, not with --parts or --device cuda"
             )
 
     @property
@@ -249,6 +254,8 @@ def main(args: Args) -> int:
         return int(bool(results["failed"]))
     if args.rivals:
         results |= rival_results(args.repeats, args.poses, args.counts, args.photos, args.yolo)
+    elif args.plants:
+        results |= plants_and_processes(args.repeats)
     else:
         results |= own_results(args)
     sys.stdout.write(write())

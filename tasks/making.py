@@ -276,6 +276,7 @@ def make_world(
     control: Control | None = None,
     intrinsics: CameraIntrinsics | None = None,
     pictures: Pictures | None = None,
+    growers: int = 0,
     **options: Any,
 ) -> World:
     """N environments of a task without a simulator.
@@ -287,19 +288,29 @@ def make_world(
         control: What an action is; the task's own if None.
         intrinsics: Of the wrist's camera; the task's at `IMAGE_SIZE` if None.
         pictures: A renderer, for perception that needs colours.
+        growers: Processes that grow the plants of coming resets ahead; see `World.grow_ahead`.
         options: `ThesisOptions`, `SearchOptions` or `RowOptions`.
 
     Raises:
         InvalidInputError: An option cannot be used.
     """
     setup = make_setup(env_id, **options)
-    return setup.build(
+    check_integer("growers", growers, 0)
+    if growers and not setup.plant.changes:
+        raise InvalidInputError(
+            f"growers={growers} have nothing to grow, because every episode has the plant of seed {setup.plant.seed}; "
+            "leave them out, or draw plants with plant={'seed': 'train'}"
+        )
+    world = setup.build(
         num_envs,
         device,
         control=control or default_control(env_id),
         intrinsics=intrinsics or wrist_intrinsics(calibration=setup.calibration),
         pictures=pictures,
     )
+    if growers:
+        world.grow_ahead(growers)
+    return world
 
 
 def make_setup(env_id: str, **options: Any) -> TaskSetup:

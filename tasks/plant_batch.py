@@ -7,15 +7,10 @@ import torch
 from torch import Tensor
 from torch.nn.functional import pad
 
+from maniskill_tomato.plants.growers import PlantGrowers, grow
 from maniskill_tomato.plants.organs import Plant
-from maniskill_tomato.plants.plant_store import PLANT_STORE, plant_bytes
 from maniskill_tomato.plants.spec import PlantSpec
 from maniskill_tomato.tasks.world_state import WorldState
-
-
-def grow(spec: PlantSpec, seed: int) -> Plant:
-    """The plant of a spec and seed; the last ones are kept, as environments often share them."""
-    return PLANT_STORE.get((spec, seed), lambda: spec.grow(seed), plant_bytes)
 
 
 class PlantBatch:
@@ -39,6 +34,8 @@ class PlantBatch:
         """The plant of each environment."""
         self.ripe_fruits: list[list[int]] = []
         """Indices of the ripe fruits of each environment's plant."""
+        self.growers: PlantGrowers | None = None
+        """Who grows plants ahead, if anybody does."""
         self._fruit_centre_p = torch.zeros(n, 1, 3, device=device)
         self._fruit_organ = torch.zeros(n, 1, dtype=torch.int64, device=device)
         seed = spec.first_seed
@@ -62,7 +59,10 @@ class PlantBatch:
 
     def show(self, seeds: Mapping[int, int]) -> dict[int, Plant]:
         """Gives environments the plants of seeds, by the environment's index, and returns the plants."""
-        shown = {env_index: grow(self.spec, seed) for env_index, seed in seeds.items()}
+        if self.growers is None:
+            shown = {env_index: grow(self.spec, seed) for env_index, seed in seeds.items()}
+        else:
+            shown = self.growers.plants(seeds)
         self.put(shown)
         rows = torch.tensor(list(shown), dtype=torch.int64, device=self._device)
         self._state.plant_seed[rows] = torch.tensor(list(seeds.values()), device=self._device)

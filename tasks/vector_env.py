@@ -178,7 +178,8 @@ class VectorEnv(gym.vector.VectorEnv[Any, Any, Any]):
         return self._told(observation, reward, terminated, truncated, info, final)
 
     def close_extras(self, **kwargs: Any) -> None:
-        """Nothing: a world holds no simulation."""
+        """Ends the processes that grow plants ahead; a world holds no simulation."""
+        self.world.close()
 
     def _ended(self) -> Tensor | None:
         """The environments that only begin anew in this step. Shape (N,), bool; None if there are none."""
@@ -337,6 +338,7 @@ def make_vector_env(
     image_size: tuple[int, int] = (64, 48),
     eyes: LearnerEyes | None = None,
     max_episode_steps: int | None = None,
+    growers: int = 0,
     **options: Any,
 ) -> VectorEnv:
     """N environments of a task without a simulator; what `gymnasium.make_vec` makes.
@@ -354,6 +356,8 @@ def make_vector_env(
         image_size: Their width and height, in [px].
         eyes: The same with more to choose, instead of `obs_mode`.
         max_episode_steps: Steps after which an episode is cut off; the task's own if None.
+        growers: Worker processes that grow the plants of coming resets; with 0 a reset waits for its new plants.
+            Episodes are the same either way.
         options: Of the task: `making.ThesisOptions`, `SearchOptions` or `RowOptions`.
 
     Raises:
@@ -388,7 +392,12 @@ def make_vector_env(
             )
         eyes = LearnerEyes(images=images)
     world = make_world(
-        env_id, num_envs, device, control=CONTROL_MODES[control_mode] if control_mode else None, **options
+        env_id,
+        num_envs,
+        device,
+        control=CONTROL_MODES[control_mode] if control_mode else None,
+        growers=growers,
+        **options,
     )
     return VectorEnv(
         world, steps, autoreset_mode=AutoresetMode(mode), arrays=arrays, env_id=env_id, eyes=eyes

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from maniskill_tomato.errors import InvalidInputError
+from maniskill_tomato.plants.growers import PlantGrowers
 from maniskill_tomato.plants.organs import Plant
 from maniskill_tomato.plants.spec import PlantPose, PlantSpec
 from maniskill_tomato.raycast.scene import RayScene
@@ -261,6 +262,34 @@ class World:
         pose, noise = self._plant_pose.as_array(), self._plant_pose_noise
         self.place_plants(env_idx, np.stack([pose + noise * rng.uniform(-1.0, 1.0, 3) for rng in rngs]))
         self.game.begin(env_idx, rngs, options)
+        self._expect_plants(indices)
+
+    def grow_ahead(self, processes: int) -> None:
+        """Has the plants of coming resets grown by worker processes; the plants stay the same.
+
+        An episode draws from its generator while it begins and not later, so that its next plant is known by then. It
+        is another one only where a reset is given a seed.
+
+        Args:
+            processes: How many, at least 1; they end with `close`, with this object or with this process.
+        """
+        self.plant_batch.growers = PlantGrowers(self.plant_batch.spec, processes, self.scene.prepare)
+
+    def close(self) -> None:
+        """Ends the processes of `grow_ahead`, if there are any."""
+        if self.plant_batch.growers is not None:
+            self.plant_batch.growers.close()
+            self.plant_batch.growers = None
+
+    def _expect_plants(self, indices: Sequence[int]) -> None:
+        """Has the next plants of some environments grown, if anybody grows plants ahead."""
+        if self.plant_batch.growers is None:
+            return
+        seeds, ahead = {}, np.random.RandomState(0)
+        for i in indices:
+            ahead.set_state(self.rngs[i].get_state())
+            seeds[i] = self.game.draw_plant(i, ahead, {})
+        self.plant_batch.growers.expect(seeds)
 
     def show_plants(self, seeds: Mapping[int, int]) -> None:
         """Shows the plants of other seeds, by the index of the environment."""
@@ -571,6 +600,7 @@ class World:
         for rng, state in zip(self.rngs, saved["generators"], strict=True):
             set_random_state(rng, state)
         self._recall(self.env_rows(None))
+        self._expect_plants(range(self.num_envs))
 
     def _recall(self, env_idx: Tensor) -> None:
         self.plant_batch.place(env_idx, self.state.plant_pose[env_idx])

@@ -24,13 +24,13 @@ from maniskill_tomato.experiments.training_study import Trial
 from maniskill_tomato.experiments.variants import Experiment
 from maniskill_tomato.learning.rl.envs import make_env
 from maniskill_tomato.learning.rl.history import load_history
+from maniskill_tomato.plants.growers import grow
 from maniskill_tomato.plants.organs import SemanticClass
 from maniskill_tomato.plants.spec import PlantPose, PlantSpec
 from maniskill_tomato.rendering import vulkan_probe
 from maniskill_tomato.report_design import CARD, INK, MUTED, TOMATO
 from maniskill_tomato.report_plots import PLOT_STYLE, label_ends, line_style, save_figure
 from maniskill_tomato.segmentation.datasets.picture_files import write_picture
-from maniskill_tomato.tasks.plant_batch import grow
 from maniskill_tomato.tasks.thesis.thesis_config import ViewpointTaskConfig, thesis_task
 
 THESIS_EPISODES = 6

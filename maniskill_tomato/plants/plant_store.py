@@ -1,9 +1,11 @@
 """Plants and what is made of them, kept for environments that show them again, within a number of bytes."""
 
+import contextlib
 import ctypes
 import os
 import sys
 import threading
+import weakref
 from collections import OrderedDict
 from collections.abc import Callable, Hashable
 from functools import cache
@@ -31,7 +33,10 @@ T = TypeVar("T")
 
 
 class ByteStore:
-    """Keeps things by their keys; what was asked for longest ago goes first."""
+    """Keeps things by their keys; what was asked for longest ago goes first.
+
+    What is not kept any more is found again for as long as somebody else holds on to it.
+    """
 
     def __init__(self, limit: Callable[[], int]) -> None:
         """Begins empty.
@@ -41,6 +46,7 @@ class ByteStore:
         """
         self._limit = limit
         self._kept: OrderedDict[Hashable, tuple[Any, int]] = OrderedDict()
+        self._elsewhere: weakref.WeakValueDictionary[Hashable, Any] = weakref.WeakValueDictionary()
         self._lock = threading.Lock()
         self._gone = 0
         self.size = 0
@@ -59,9 +65,12 @@ class ByteStore:
                 self._kept.move_to_end(key)
                 thing: T = self._kept[key][0]
                 return thing
-        thing = make()
+            held = self._elsewhere.get(key)
+        thing = make() if held is None else held
         size, limit = size_of(thing), self._limit()
         with self._lock:
+            with contextlib.suppress(TypeError):  # Such as numbers, which nobody else can hold.
+                self._elsewhere[key] = thing
             if key not in self._kept and size <= limit:
                 self._kept[key] = (thing, size)
                 self.size += size
@@ -74,6 +83,11 @@ class ByteStore:
         if give_back:
             _trim()
         return thing
+
+    def find(self, key: Hashable) -> Any:
+        """What `get` would find under a key without making it; else None."""
+        with self._lock:
+            return self._kept[key][0] if key in self._kept else self._elsewhere.get(key)
 
     def __len__(self) -> int:
         return len(self._kept)

@@ -118,6 +118,15 @@ class RayScene:
         for env_index, plant in plants.items():
             self._plants[env_index] = plant
 
+    def prepare(self, plant: Plant) -> object:
+        """Sorts the triangles of a plant that will be shown, in any thread.
+
+        Returns:
+            What `replace_plants` finds again for as long as somebody holds on to it; None where it has to sort them
+            itself, on CUDA.
+        """
+        return self._rays.prepare(plant)
+
     def visibility(
         self,
         T_w_camera: Tensor,

@@ -40,7 +40,7 @@ from maniskill_tomato.raycast.visibility import Visibility, ray_lattice
 from maniskill_tomato.robot.d435 import CAMERA_FAR, CameraIntrinsics
 from maniskill_tomato.robot.iiwa14 import LINK_NAMES
 from maniskill_tomato.robot.spheres import sphere_table
-from maniskill_tomato.warp_runtime import RecordedLaunch, start_warp
+from maniskill_tomato.warp_runtime import RecordedLaunch, room_for, start_warp
 
 VIEWS_AT_ONCE: Final = 512
 """`visible_fraction_from` casts more views than this in several parts."""
@@ -108,6 +108,15 @@ class WarpScene:
             self._allocate_tables()
         else:
             self._write_rows(list(meshes))
+
+    def prepare(self, plant: Plant) -> PlantMeshes | None:
+        """See `RayScene.prepare`."""
+        if self._device.type != "cpu":
+            return None
+        meshes = plant_meshes(plant, self._warp_device, self._backend)
+        if self._tells_distances:
+            _ = meshes.for_distances
+        return meshes
 
     def visibility(
         self,
@@ -219,14 +228,15 @@ class WarpScene:
         if not self._tells_distances:
             self._tells_distances = True
             self._write_rows(range(len(self._shown)))
-        recorded = self._recorded(self._record_clearance, paths, samples, farthest)
-        environments, plants, links, every = recorded.inputs
+        recorded = self._recorded(self._record_clearance, room_for(paths), samples, farthest)
+        environments, plants, links, every = (tensor[:paths] for tensor in recorded.inputs)
         links.copy_(T_w_links)
         plants.copy_(T_w_plant)
         environments.copy_(every if env_idx is None else env_idx)
-        recorded.outputs[0].fill_(farthest)
-        recorded.launch()
-        return recorded.outputs[0].clone()
+        clearance = recorded.outputs[0][:paths]
+        clearance.fill_(farthest)
+        recorded.launch(paths)
+        return clearance.clone()
 
     def _recorded(self, record: Callable[..., "_Recorded"], *arguments: Any) -> "_Recorded":
         """What a method recorded for its arguments, recorded now if it is not at hand."""

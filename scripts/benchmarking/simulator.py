@@ -112,9 +112,17 @@ def small_actions(size: int) -> np.ndarray[Any, Any]:
     return np.random.default_rng(0).uniform(-0.05, 0.05, (512, size)).astype(np.float32)
 
 
-def make_vector(env_id: str, envs: int, device: str) -> Any:
-    """Environments without a simulator, begun, that the caller resets; tensors in and out."""
-    options: dict[str, Any] = {"plant": POOL} if env_id == GENERAL else {}
+def make_vector(env_id: str, envs: int, device: str, **options: Any) -> Any:
+    """Environments without a simulator, begun, that the caller resets; tensors in and out.
+
+    Args:
+        env_id: The task.
+        envs: At once.
+        device: The torch device.
+        options: Of the task; the general one has the plants of `POOL` unless they say otherwise.
+    """
+    if env_id == GENERAL:
+        options = {"plant": POOL, **options}
     env = gym.make_vec(
         env_id,
         envs,

@@ -86,6 +86,11 @@ def test_any_number_of_paths_can_be_held_against_one_plant() -> None:
     start = torch.cat([joints(rng) for _ in range(4)])
     single = [scene.clearance_at(torch.stack([q, q]), T)[1] for q in start]
     together = scene.clearance_at(start, T[1].expand(8, 4, 4), torch.ones(8, dtype=torch.int64))
+    for count in (5, 3, 7):
+        some = scene.clearance_at(
+            start[:count], T[1].expand(count, 4, 4), torch.ones(count, dtype=torch.int64)
+        )
+        torch.testing.assert_close(some, together[:count], atol=0.0, rtol=0.0)
     torch.testing.assert_close(together, torch.stack(single))
     back = scene.clearance_at(start[:2], T)
     torch.testing.assert_close(back[1], single[1])
