@@ -89,10 +89,12 @@ def run_part(name: str, setting: Mapping[str, Any], limit: float) -> dict[str, A
             elif process.returncode > 0:
                 error = f"ended with status {process.returncode}; {_last_line(said)}"
         except subprocess.TimeoutExpired:
-            # With all that it has started.
-            os.killpg(process.pid, signal.SIGKILL)
-            process.communicate()
             error = f"took longer than its {limit:.0f} s"
+        finally:
+            if process.poll() is None:
+                # With all that it has started; Ctrl-C comes here as well.
+                os.killpg(process.pid, signal.SIGKILL)
+                process.communicate()
         lines = out.read_text().splitlines() if out.is_file() else []
         findings: dict[str, Any] = {}
         for line in lines:
