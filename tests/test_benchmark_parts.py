@@ -71,7 +71,7 @@ def test_one_command_tells_everything_that_a_cpu_can_tell(tmp_path: Path) -> Non
     """With `--device cuda` the same is asked of a GPU; the tests it runs are left out here."""
     out = tmp_path / "parts.json"
     parts = [name for name in LIMITS if name not in ("tests", "profiles")]
-    options = ["--envs", "1", "8", "--shells", "2", "--part-seconds", "0.1", "--limits-scale", "6"]
+    options = ["--envs", "1", "8", "--shells", "2", "--part-seconds", "0.2", "--limits-scale", "6"]
     script = [sys.executable, "-W", "ignore", str(ROOT / "scripts" / "benchmark.py"), "--parts", *parts]
     done = subprocess.run([*script, *options, "--out", str(out)], capture_output=True, text=True, timeout=580)
     run = json.loads(out.read_text())

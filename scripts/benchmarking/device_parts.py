@@ -321,9 +321,14 @@ def pixels(setting: Setting) -> Findings:
 def _training(preset: PresetName, setting: Setting) -> Findings:
     config = replace(get_preset(preset), max_minutes=setting.seconds / 2.0)
     if setting.device == "cpu":
-        # A large batch in the learner's place would say nothing about a CPU but its matrix products.
-        config = replace(config, num_envs=min(config.num_envs, max(setting.envs)), learning_starts=256)
-        config = replace(config, batch_size=min(config.batch_size, 256))
+        # Enough updates in a short time, which a GPU's batches would not leave.
+        config = replace(
+            config,
+            num_envs=min(config.num_envs, max(setting.envs)),
+            learning_starts=128,
+            batch_size=128,
+            updates_per_step=max(config.updates_per_step, 1 / 32),
+        )
     with tempfile.TemporaryDirectory() as folder:
         trained = train(GUIDED, config, Path(folder) / "run", 0, {}, show_progress=False)
         yield (
