@@ -255,7 +255,9 @@ def main(args: Args) -> int:
     if args.rivals:
         results |= rival_results(args.repeats, args.poses, args.counts, args.photos, args.yolo)
     elif args.plants:
-        results |= plants_and_processes(args.repeats)
+        for found in plants_and_processes(args.repeats):
+            results |= found
+            write()
     else:
         results |= own_results(args)
     sys.stdout.write(write())
