@@ -10,31 +10,10 @@ import time
 from pathlib import Path
 
 import pytest
+from process_watch import is_running, until
 
 from maniskill_tomato.errors import InvalidInputError
 from maniskill_tomato.worker_pool import run_jobs
-
-PATIENCE = 120.0
-"""Seconds that a busy machine may take to start or end two processes."""
-
-
-def until(condition: object) -> bool:
-    """Whether a condition comes true in time."""
-    assert callable(condition)
-    end = time.monotonic() + PATIENCE
-    while not condition():
-        if time.monotonic() > end:
-            return False
-        time.sleep(0.1)
-    return True
-
-
-def is_running(pid: int) -> bool:
-    """Whether a process exists and is not only waiting to be forgotten."""
-    try:
-        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
-    except OSError:
-        return False
 
 
 @pytest.mark.parametrize("processes", [1, 2])

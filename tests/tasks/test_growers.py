@@ -6,14 +6,14 @@ import os
 import signal
 import subprocess
 import sys
-import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
 import numpy as np
 import pytest
+from process_watch import is_running, until
 
 import maniskill_tomato  # noqa: F401
 from maniskill_tomato.errors import InvalidInputError
@@ -28,9 +28,6 @@ from maniskill_tomato.task_registry import TASK_IDS
 GUIDED, _, GENERAL, _ = TASK_IDS
 
 SPLIT = PlantSpec(seed="train")
-
-PATIENCE = 120.0
-"""Seconds that a busy machine may take to start or end a process."""
 
 NEEDS_PROC = pytest.mark.skipif(
     not Path("/proc/self/stat").exists(), reason="reads the states of processes from /proc"
@@ -48,24 +45,6 @@ def growers() -> Iterator[PlantGrowers]:
     made = PlantGrowers(SPLIT, 2)
     yield made
     made.close()
-
-
-def until(condition: Callable[[], bool]) -> bool:
-    """Whether a condition comes true in time."""
-    end = time.monotonic() + PATIENCE
-    while not condition():
-        if time.monotonic() > end:
-            return False
-        time.sleep(0.05)
-    return True
-
-
-def is_running(pid: int) -> bool:
-    """Whether a process exists and is not only waiting to be forgotten."""
-    try:
-        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
-    except OSError:
-        return False
 
 
 def assert_same_plant(plant: Plant, other: Plant) -> None:
