@@ -19,10 +19,12 @@ logger = logging.getLogger(__name__)
 
 SIMULTANEOUS_LANES: Final = (
     "-march=native -mllvm=-inline-threshold=9000 -mllvm=-inline-cold-callsite-threshold=3000 "
-    "-mllvm=-slp-recursion-max-depth=12"
+    "-mllvm=-slp-recursion-max-depth=12 -mprefer-vector-width=256"
 )
 """The module option `cpu_compiler_flags` of kernels that do the same for eight lanes: Warp's default flags but for the
-depth to which LLVM looks for operations to do at once. Warp's 4 saves compile time and splits such loops up again."""
+depth to which LLVM looks for operations to do at once, and the bits that it does them on. Warp's depth of 4 saves
+compile time and splits such loops up again. Wider than eight numbers of 32 bits LLVM joins what does not belong
+together, and shuffles it apart in every round."""
 
 CACHE_VARIABLE: Final = "WARP_CACHE_PATH"
 """Names the folder in which Warp keeps its kernels; by default it is one below the home."""

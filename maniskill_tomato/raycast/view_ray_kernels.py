@@ -20,6 +20,7 @@ from maniskill_tomato.raycast.kernels import (
     rotation,
     translation,
 )
+from maniskill_tomato.raycast.view_rays import PATTERN_HALF_WIDTH
 
 wp.set_module_options({"enable_backward": False})
 
@@ -29,6 +30,10 @@ TARGET = wp.constant(wp.int8(2))
 OTHER = wp.constant(wp.int8(3))
 
 SMALLEST = wp.constant(1.0e-6)
+PATTERN_REACH = wp.constant(2.0**0.5 * PATTERN_HALF_WIDTH)
+"""How far from the target the pattern's rays cross its plane at most, in [m]."""
+MARGIN = wp.constant(1.0e-4)
+"""Room for rounding, in [m]."""
 
 
 @wp.struct
@@ -55,6 +60,29 @@ def look_axes(position: wp.vec3, target: wp.vec3) -> wp.mat33:
     if length > SMALLEST:
         right = level / length
     return wp.matrix_from_cols(right, wp.cross(right, forward), forward)
+
+
+@wp.kernel
+def narrow_links(scene: Scene, views: Views, target_positions: wp.array[wp.vec3]):
+    """Leaves of the links in front of a camera those that a ray of the pattern can meet: the balls round their boxes
+    reach into the cone round the pattern."""
+    view = wp.tid()
+    if views.asked[view] == 0:
+        return
+    camera_pose = views.camera_poses[view]
+    ahead_c = wp.transpose(rotation(camera_pose)) * (target_positions[view] - translation(camera_pose))
+    distance = wp.length(ahead_c)
+    slant = wp.sqrt(distance * distance + PATTERN_REACH * PATTERN_REACH)
+    remaining = views.links_in_front[view]
+    for link in range(scene.link_lows.shape[0]):
+        low = scene.link_lows[link]
+        high = scene.link_highs[link]
+        middle = 0.5 * (low + high) - views.link_positions[view, link]
+        along = wp.dot(middle, views.link_rotations[view, link] * ahead_c) / wp.max(distance, SMALLEST)
+        aside = wp.sqrt(wp.max(wp.dot(middle, middle) - along * along, 0.0))
+        if aside * distance - along * PATTERN_REACH > (0.5 * wp.length(high - low) + MARGIN) * slant:
+            remaining = remaining & ~(1 << link)
+    views.links_in_front[view] = remaining
 
 
 @wp.kernel

@@ -328,13 +328,14 @@ class WarpScene:
         target_positions = self._zeros(b, 3)
         directions, distances = self._zeros(b, n, 3), self._zeros(b, n)
         labels = self._zeros(b, n, dtype=torch.int8)
+        targets = wp.from_torch(target_positions, dtype=wp.vec3)
         arguments = [
             self._scene,
             self._views.struct,
             self._camera,
             limits,
             self._points(ray_pattern()),
-            wp.from_torch(target_positions, dtype=wp.vec3),
+            targets,
             wp.from_torch(directions, dtype=wp.vec3),
             wp.from_torch(distances),
             wp.from_torch(labels),
@@ -342,6 +343,7 @@ class WarpScene:
         launch = RecordedLaunch(
             self._device,
             (kernels.prepare, b, [self._scene, self._views.struct]),
+            (view_ray_kernels.narrow_links, b, [self._scene, self._views.struct, targets]),
             (view_ray_kernels.trace_view_rays, (b, n), arguments),
         )
         return _Recorded(launch, inputs=(target_positions,), outputs=(directions, distances, labels))

@@ -30,7 +30,11 @@ BLOCK = wp.constant(4)
 """Voxels along each edge of the largest block whose density stands in for what is not seen of it."""
 BLOCKS = wp.constant(512)
 """Number of such blocks."""
-DISC_RAYS = wp.constant(8)
+LANES = wp.constant(8)
+"""Rays that go through the grid in step."""
+EDGE = wp.constant(1.0e-4)
+"""So near the grid's edge rounding may have taken a ray out of it."""
+DISC_RAYS = LANES
 """Rays from the target's disc towards a candidate."""
 MAX_VISITS = wp.constant(64)
 """Camera positions that are remembered; later ones replace the first."""
@@ -50,10 +54,6 @@ class Grid:
     """Length that rays went through the voxel, in `PASS_UNIT`. Shape (B, 32768)."""
     densities: wp.array2d[wp.float32]
     """Estimated hits per voxel edge, less than 0 (its negative) where the voxel is unknown. Shape (B, 32768)."""
-    hit_rows: wp.array2d[wp.vec4i]
-    """The same memory as `hits`, four voxels each. Shape (B, 8192)."""
-    pass_rows: wp.array2d[wp.vec4i]
-    density_rows: wp.array2d[wp.vec4]
     changed: wp.array2d[wp.int32]
     """1 for blocks whose densities are older than their hits and passes. Shape (B, 512)."""
     centres: wp.array[wp.vec3]
@@ -89,6 +89,18 @@ def inverse(x: float) -> float:
 
 
 @wp.func
+def smaller(a: float, b: float) -> float:
+    """The minimum of numbers, one instruction for many of them: `wp.min` looks for NaN first."""
+    return wp.where(a < b, a, b)
+
+
+@wp.func
+def larger(a: float, b: float) -> float:
+    """The maximum, likewise."""
+    return wp.where(a > b, a, b)
+
+
+@wp.func
 def inside_stretch(start: wp.vec3, inverse_direction: wp.vec3) -> wp.vec2:
     """Between which lengths along a ray it is inside the grid."""
     enter = wp.float32(0.0)
@@ -96,21 +108,20 @@ def inside_stretch(start: wp.vec3, inverse_direction: wp.vec3) -> wp.vec2:
     for axis in range(3):
         a = (0.0 - start[axis]) * inverse_direction[axis]
         b = (float(CELLS) - start[axis]) * inverse_direction[axis]
-        enter = wp.max(enter, wp.min(a, b))
-        leave = wp.min(leave, wp.max(a, b))
+        enter = larger(enter, smaller(a, b))
+        leave = smaller(leave, larger(a, b))
     return wp.vec2(enter, leave)
 
 
 @wp.struct
 class Walk:
-    """A ray on its way from voxel to voxel (Amanatides & Woo, Eurographics 1987)."""
+    """Where a ray begins its way from voxel to voxel (Amanatides & Woo, Eurographics 1987)."""
 
     x: wp.int32
     y: wp.int32
     z: wp.int32
     borders: wp.vec3
     """Length along the ray at which it leaves the voxel across each axis."""
-    travelled: wp.float32
 
 
 @wp.func
@@ -130,7 +141,6 @@ def begin_walk(start: wp.vec3, direction: wp.vec3, inverse_direction: wp.vec3, a
         if wp.abs(direction[axis]) < 1.0e-9:
             border = 1.0e9
         walk.borders[axis] = border
-    walk.travelled = at
     return walk
 
 
@@ -140,40 +150,49 @@ def voxel_of(walk: Walk) -> int:
 
 
 @wp.func
-def block_of(walk: Walk) -> int:
+def block_of(voxel: int) -> int:
     side = CELLS // BLOCK
-    return ((walk.x // BLOCK) * side + walk.y // BLOCK) * side + walk.z // BLOCK
+    x = voxel // (CELLS * CELLS * BLOCK)
+    y = voxel // (CELLS * BLOCK) & (side - 1)
+    return (x * side + y) * side + (voxel // BLOCK & (side - 1))
 
 
 @wp.func
-def is_in_grid(walk: Walk) -> bool:
-    return (
-        walk.x >= 0 and walk.x < CELLS and walk.y >= 0 and walk.y < CELLS and walk.z >= 0 and walk.z < CELLS
-    )
-
-
-@wp.func
-def next_voxel(walk: Walk, direction: wp.vec3, inverse_direction: wp.vec3) -> Walk:
-    """Across the nearest border."""
-    if walk.borders[0] <= walk.borders[1] and walk.borders[0] <= walk.borders[2]:
-        walk.travelled = wp.max(walk.travelled, walk.borders[0])
-        walk.borders[0] = walk.borders[0] + wp.abs(inverse_direction[0])
-        walk.x += wp.where(direction[0] > 0.0, 1, -1)
-    elif walk.borders[1] <= walk.borders[2]:
-        walk.travelled = wp.max(walk.travelled, walk.borders[1])
-        walk.borders[1] = walk.borders[1] + wp.abs(inverse_direction[1])
-        walk.y += wp.where(direction[1] > 0.0, 1, -1)
-    else:
-        walk.travelled = wp.max(walk.travelled, walk.borders[2])
-        walk.borders[2] = walk.borders[2] + wp.abs(inverse_direction[2])
-        walk.z += wp.where(direction[2] > 0.0, 1, -1)
-    return walk
+def crossings(start: wp.vec3, end: wp.vec3) -> int:
+    """Voxels on the way between two points, and one more for what rounding shifts."""
+    count = wp.int32(2)
+    for axis in range(3):
+        count += int(wp.abs(wp.floor(end[axis]) - wp.floor(start[axis])))
+    return count
 
 
 @wp.func
 def in_grid(point_w: wp.vec3, centre: wp.vec3) -> wp.vec3:
     half = 0.5 * float(CELLS)
     return (point_w - centre) / CELL_SIZE + wp.vec3(half, half, half)
+
+
+_ADD_PASSES = f"""
+    int* row = passes.data + size_t(env) * {VOXELS};
+    int* marks = changed.data + size_t(env) * {BLOCKS};
+    for (int ray = 0; ray < {LANES}; ++ray) {{
+        wp::atomic_add(row + voxels[ray], lengths[ray]);
+        marks[blocks[ray]] = 1;
+    }}
+"""
+
+
+@wp.func_native(_ADD_PASSES)
+def add_passes(
+    passes: wp.array2d[wp.int32],
+    changed: wp.array2d[wp.int32],
+    env: int,
+    voxels: ints8,
+    blocks: ints8,
+    lengths: ints8,
+):
+    """One stretch of each of eight rays, whose voxels' blocks are marked as changed."""
+    ...
 
 
 @wp.kernel
@@ -186,44 +205,119 @@ def integrate(
     fractions: wp.array[wp.float32],
     active: wp.array[wp.int32],
 ):
-    """One ray: the lengths that it went through voxels and, at its end, a hit."""
-    env, ray = wp.tid()
+    """Eight rays: the lengths that they went through voxels and, at their ends, hits."""
+    env, bundle = wp.tid()
     if active[env] == 0:
         return
     camera_position = translation(camera_poses[env])
-    if ray == 0:
+    if bundle == 0:
         grid.visited[env, grid.visits[env] % MAX_VISITS] = camera_position
         grid.fractions[env, grid.visits[env] % MAX_VISITS] = fractions[env]
         grid.visits[env] = grid.visits[env] + 1
-    label = labels[env, ray]
-    if label == OUTSIDE:
-        return
+    turn = rotation(camera_poses[env])
     start = in_grid(camera_position, grid.centres[env])
-    direction = rotation(camera_poses[env]) * directions[env, ray]
-    inverse_direction = wp.vec3(inverse(direction[0]), inverse(direction[1]), inverse(direction[2]))
-    stretch = inside_stretch(start, inverse_direction)
-    length = distances[env, ray] / CELL_SIZE
-    end = wp.min(stretch[1], length)
-    if end <= stretch[0]:
-        return
-    walk = begin_walk(start, direction, inverse_direction, stretch[0])
-    while is_in_grid(walk):
-        voxel = voxel_of(walk)
-        before = walk.travelled
-        grid.changed[env, block_of(walk)] = 1
-        walk = next_voxel(walk, direction, inverse_direction)
-        passed = wp.min(walk.travelled, end) - before
-        wp.atomic_add(grid.passes, env, voxel, int(passed * PASS_UNIT + 0.5))
-        if walk.travelled >= end:
-            if label == OTHER and length <= stretch[1]:
-                wp.atomic_add(grid.hits, env, voxel, 1)
-            return
+    borders_x = vec8()
+    borders_y = vec8()
+    borders_z = vec8()
+    across_x = vec8()
+    across_y = vec8()
+    across_z = vec8()
+    steps_x = ints8()
+    steps_y = ints8()
+    steps_z = ints8()
+    voxels = ints8()
+    last_voxels = ints8()
+    hits = ints8()
+    blocks = ints8()
+    lengths = ints8()
+    travelled = vec8()
+    ends = vec8()
+    visits = wp.int32(0)
+    for lane in range(LANES):
+        ray = wp.min(bundle * LANES + lane, labels.shape[1] - 1)
+        direction = turn * directions[env, ray]
+        inverse_direction = wp.vec3(inverse(direction[0]), inverse(direction[1]), inverse(direction[2]))
+        stretch = inside_stretch(start, inverse_direction)
+        length = distances[env, ray] / CELL_SIZE
+        end = wp.where(labels[env, ray] == OUTSIDE, 0.0, smaller(stretch[1], length))
+        end = wp.where(bundle * LANES + lane == ray, end, 0.0)
+        walk = begin_walk(start, direction, inverse_direction, stretch[0])
+        borders_x[lane] = walk.borders[0]
+        borders_y[lane] = walk.borders[1]
+        borders_z[lane] = walk.borders[2]
+        across_x[lane] = wp.abs(inverse_direction[0])
+        across_y[lane] = wp.abs(inverse_direction[1])
+        across_z[lane] = wp.abs(inverse_direction[2])
+        steps_x[lane] = wp.where(direction[0] > 0.0, CELLS * CELLS, -CELLS * CELLS)
+        steps_y[lane] = wp.where(direction[1] > 0.0, CELLS, -CELLS)
+        steps_z[lane] = wp.where(direction[2] > 0.0, 1, -1)
+        voxels[lane] = voxel_of(walk)
+        last_voxels[lane] = voxel_of(walk)
+        travelled[lane] = stretch[0]
+        ends[lane] = larger(end, stretch[0])
+        is_hit = wp.where(length < stretch[1] - EDGE, wp.where(labels[env, ray] == OTHER, 1, 0), 0)
+        hits[lane] = wp.where(end > stretch[0], is_hit, 0)
+        crossed = crossings(start + stretch[0] * direction, start + ends[lane] * direction)
+        visits = wp.max(visits, wp.where(end > stretch[0], crossed, 0))
+    while visits > 0:
+        visits -= 1
+        for ray in range(LANES):
+            x = borders_x[ray]
+            y = borders_y[ray]
+            z = borders_z[ray]
+            nearest = smaller(x, smaller(y, z))
+            border = smaller(larger(travelled[ray], nearest), ends[ray])
+            lengths[ray] = int((border - travelled[ray]) * PASS_UNIT + 0.5)
+            voxel = voxels[ray] & (VOXELS - 1)
+            last_voxels[ray] = wp.where(travelled[ray] < ends[ray], voxel, last_voxels[ray])
+            blocks[ray] = block_of(last_voxels[ray])
+            travelled[ray] = border
+            borders_x[ray] = x + wp.where(x <= nearest, across_x[ray], 0.0)
+            borders_y[ray] = y + wp.where(y <= nearest, across_y[ray], 0.0)
+            borders_z[ray] = z + wp.where(z <= nearest, across_z[ray], 0.0)
+            along = wp.where(x <= nearest, steps_x[ray], 0) + wp.where(y <= nearest, steps_y[ray], 0)
+            voxels[ray] = voxels[ray] + along + wp.where(z <= nearest, steps_z[ray], 0)
+        add_passes(grid.passes, grid.changed, env, last_voxels, blocks, lengths)
+    for ray in range(LANES):
+        if hits[ray] != 0:
+            wp.atomic_add(grid.hits, env, last_voxels[ray], 1)
 
 
 @wp.func
 def posterior(hits: float, passes: float, expected: float, weight: float) -> float:
     """Hits per length: the mean of a gamma posterior with a given prior mean."""
     return (hits + weight * expected) / (passes / PASS_UNIT + weight)
+
+
+# What Warp's own indexing allows, any stride and negative indices, costs as much as the estimate itself.
+_ROWS_AT = f"""
+    const int* first = values.data + size_t(env) * {VOXELS} + voxel;
+    wp::vec_t<8, int> rows;
+    for (int k = 0; k < 4; ++k) {{
+        rows[k] = first[k];
+        rows[4 + k] = first[{CELLS} + k];
+    }}
+    return rows;
+"""
+_PUT_ROWS = f"""
+    float* first = values.data + size_t(env) * {VOXELS} + voxel;
+    for (int k = 0; k < 4; ++k) {{
+        first[k] = rows[k];
+        first[{CELLS} + k] = rows[4 + k];
+    }}
+"""
+
+
+@wp.func_native(_ROWS_AT)
+def rows_at(values: wp.array2d[wp.int32], env: int, voxel: int) -> ints8:
+    """Four voxels along z, and the four beside them along y."""
+    ...
+
+
+@wp.func_native(_PUT_ROWS)
+def put_rows(values: wp.array2d[wp.float32], env: int, voxel: int, rows: vec8):
+    """Writes the same."""
+    ...
 
 
 @wp.func
@@ -241,19 +335,18 @@ def estimate(grid: Grid, foliage: Foliage):
     if grid.changed[env, block] == 0:
         return
     grid.changed[env, block] = 0
-    first = first_voxel(block) // BLOCK
-    half = BLOCK // 2
+    corner = first_voxel(block)
     hits = ints8()
     passes = ints8()
     for i in range(BLOCK):
-        for j in range(BLOCK):
-            row = first + (i * CELLS + j) * (CELLS // BLOCK)
-            hit = grid.hit_rows[env, row]
-            passed = grid.pass_rows[env, row]
-            part = (i // half) * 4 + (j // half) * 2
-            for k in range(half):
-                hits[part + k] = hits[part + k] + hit[k * half] + hit[k * half + 1]
-                passes[part + k] = passes[part + k] + passed[k * half] + passed[k * half + 1]
+        for j in range(2):
+            first = corner + (i * CELLS + 2 * j) * CELLS
+            hit = rows_at(grid.hits, env, first)
+            passed = rows_at(grid.passes, env, first)
+            for k in range(8):
+                part = i // 2 * 4 + j * 2 + k % 4 // 2
+                hits[part] = hits[part] + hit[k]
+                passes[part] = passes[part] + passed[k]
     all_hits = wp.float32(0.0)
     all_passes = wp.float32(0.0)
     for part in range(8):
@@ -264,19 +357,20 @@ def estimate(grid: Grid, foliage: Foliage):
     for part in range(8):
         around[part] = posterior(float(hits[part]), float(passes[part]), whole, foliage.block_weight)
     for i in range(BLOCK):
-        for j in range(BLOCK):
-            row = first + (i * CELLS + j) * (CELLS // BLOCK)
-            hit = grid.hit_rows[env, row]
-            passed = grid.pass_rows[env, row]
-            part = (i // half) * 4 + (j // half) * 2
-            densities = wp.vec4()
-            for k in range(BLOCK):
-                expected = around[part + k // half]
-                own = posterior(float(hit[k]), float(passed[k]), expected, foliage.voxel_weight)
-                density = wp.where(hit[k] == 0 and passed[k] == 0, expected, own)
-                is_unknown = hit[k] == 0 and passed[k] < KNOWN_LENGTH
-                densities[k] = wp.where(is_unknown, -density, density)
-            grid.density_rows[env, row] = densities
+        for j in range(2):
+            first = corner + (i * CELLS + 2 * j) * CELLS
+            hit = rows_at(grid.hits, env, first)
+            passed = rows_at(grid.passes, env, first)
+            densities = vec8()
+            for k in range(8):
+                expected = around[i // 2 * 4 + j * 2 + k % 4 // 2]
+                density = posterior(float(hit[k]), float(passed[k]), expected, foliage.voxel_weight)
+                densities[k] = wp.where(hit[k] * KNOWN_LENGTH + passed[k] < KNOWN_LENGTH, -density, density)
+            put_rows(grid.densities, env, first, densities)
+
+
+@wp.func_native(f"return values.data[size_t(env) * {VOXELS} + voxel];")
+def density_at(values: wp.array2d[wp.float32], env: int, voxel: int) -> float: ...
 
 
 @wp.func
@@ -311,7 +405,7 @@ def predicted_view(grid: Grid, foliage: Foliage, env: int, position: wp.vec3) ->
     depths = vec8()
     unknown = vec8()
     whole = wp.float32(0.0)
-    left = wp.float32(0.0)
+    visits = wp.int32(0)
     for ray in range(DISC_RAYS):
         point = foliage.radius * disc_point(ray)
         bulge = wp.sqrt(wp.max(foliage.radius * foliage.radius - wp.dot(point, point), 0.0))
@@ -332,29 +426,26 @@ def predicted_view(grid: Grid, foliage: Foliage, env: int, position: wp.vec3) ->
         voxels[ray] = voxel_of(walk)
         ends[ray] = wp.min(length, inside_stretch(start, inverse_direction)[1])
         whole += ends[ray]
-        left = wp.max(left, ends[ray])
-    while left > 0.0:
-        left = wp.float32(0.0)
+        visits = wp.max(visits, crossings(start, start + ends[ray] * direction))
+    while visits > 0:
+        visits -= 1
         for ray in range(DISC_RAYS):
             x = borders_x[ray]
             y = borders_y[ray]
             z = borders_z[ray]
-            goes_x = x <= y and x <= z
-            goes_y = y <= z and not goes_x
-            goes_z = not (goes_x or goes_y)
-            border = wp.min(wp.max(travelled[ray], wp.min(x, wp.min(y, z))), ends[ray])
+            nearest = smaller(x, smaller(y, z))
+            border = smaller(larger(travelled[ray], nearest), ends[ray])
             stretch = border - travelled[ray]
             # Rounding may take a ray that ends on the grid's edge one voxel further, for a length of nothing.
-            density = grid.densities[env, voxels[ray] & (VOXELS - 1)]
+            density = density_at(grid.densities, env, voxels[ray] & (VOXELS - 1))
             depths[ray] = depths[ray] + wp.abs(density) * stretch
             unknown[ray] = unknown[ray] + wp.where(density < 0.0, stretch, 0.0)
             travelled[ray] = border
-            left = wp.max(left, ends[ray] - border)
-            borders_x[ray] = x + wp.where(goes_x, across_x[ray], 0.0)
-            borders_y[ray] = y + wp.where(goes_y, across_y[ray], 0.0)
-            borders_z[ray] = z + wp.where(goes_z, across_z[ray], 0.0)
-            along = wp.where(goes_y, steps_y[ray], steps_z[ray])
-            voxels[ray] = voxels[ray] + wp.where(goes_x, steps_x[ray], along)
+            borders_x[ray] = x + wp.where(x <= nearest, across_x[ray], 0.0)
+            borders_y[ray] = y + wp.where(y <= nearest, across_y[ray], 0.0)
+            borders_z[ray] = z + wp.where(z <= nearest, across_z[ray], 0.0)
+            along = wp.where(x <= nearest, steps_x[ray], 0) + wp.where(y <= nearest, steps_y[ray], 0)
+            voxels[ray] = voxels[ray] + along + wp.where(z <= nearest, steps_z[ray], 0)
     seen = wp.float32(0.0)
     hidden = wp.float32(0.0)
     for ray in range(DISC_RAYS):

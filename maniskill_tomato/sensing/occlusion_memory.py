@@ -83,12 +83,6 @@ class OcclusionMemory:
         grid.hits = wp.from_torch(self._hits)
         grid.passes = wp.from_torch(self._passes)
         grid.densities = wp.from_torch(self._densities)
-        for name, tensor, dtype in (
-            ("hit_rows", self._hits, wp.vec4i),
-            ("pass_rows", self._passes, wp.vec4i),
-            ("density_rows", self._densities, wp.vec4),
-        ):
-            setattr(grid, name, wp.from_torch(tensor.view(num_envs, -1, 4), dtype=dtype))
         grid.changed = wp.from_torch(self._changed)
         grid.centres = wp.from_torch(self._centres, dtype=wp.vec3)
         grid.visited = wp.from_torch(self._visited, dtype=wp.vec3)
@@ -307,7 +301,9 @@ class _Integration:
             wp.from_torch(self._fractions),
             wp.from_torch(self._active),
         ]
-        self._launch = RecordedLaunch(device, (memory_kernels.integrate, (b, count), arguments))
+        self._launch = RecordedLaunch(
+            device, (memory_kernels.integrate, (b, -(-count // int(memory_kernels.LANES))), arguments)
+        )
 
     def run(
         self, T_world_camera: Tensor, rays: ViewRays, mask: Tensor | None, visible_fraction: Tensor | None

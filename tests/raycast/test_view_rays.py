@@ -181,6 +181,43 @@ def test_the_robots_links_leave_rays_without_an_answer(device: str) -> None:
     assert_close(scene.view_rays(*given, links).label[0].cpu(), without)
 
 
+def test_turned_links_anywhere_near_the_pattern_cover_the_rays_that_meet_them(device: str) -> None:
+    plant = ball_plant([(0.5, 0.0, 0.0)])
+    half = np.array([0.01, 0.03, 0.09])
+    rod = trimesh.creation.box(extents=2 * half)
+    meshes = {"link_3": (np.asarray(rod.vertices), np.asarray(rod.faces))}
+    scene = RayScene([plant], WIDE, robot_meshes=meshes, device=device)
+    target = torch.tensor([[0.5, 0.0, 0.0]])
+    pose = look_at_pose(torch.zeros(1, 3), target, 0.4)
+    given = tuple(t.to(device) for t in (pose, torch.zeros(1), target, torch.eye(4)[None]))
+    seen = scene.view_rays(*given)
+    free = seen.label[0].cpu().numpy() == RayLabel.FREE
+    rays_w = seen.direction_c[0].cpu().double().numpy() @ pose[0, :3, :3].double().numpy().T
+    rng = np.random.default_rng(0)
+    covered = []
+    for _ in range(60):
+        # Many stand across the rim of the pattern, where x is depth; some beside or behind the camera.
+        depth = rng.uniform(-0.3, 1.2)
+        aside = rng.uniform(0.3, 1.0) * (abs(depth) * 0.56 * 2**0.5 + 0.1)
+        angle = rng.uniform(-np.pi, np.pi)
+        place = np.array([depth, aside * np.cos(angle), aside * np.sin(angle)])
+        if np.linalg.norm(place) < 0.2:
+            continue
+        turn = trimesh.transformations.random_rotation_matrix(rng.random(3))[:3, :3]
+        links = torch.eye(4).repeat(1, len(LINK_NAMES), 1, 1)
+        links[0, LINK_NAMES.index("link_3"), :3, :3] = torch.from_numpy(turn)
+        links[0, LINK_NAMES.index("link_3"), :3, 3] = torch.from_numpy(place)
+        ray, start = rays_w @ turn, -place @ turn
+        first, last = np.sort(np.stack([(-half - start) / ray, (half - start) / ray]), axis=0)
+        enter, leave = first.max(axis=-1), last.min(axis=-1)
+        is_clear = free & (np.abs(leave - enter) > 1e-3) & (np.abs(enter - RANGE) > 1e-3)
+        expected = (enter < leave) & (leave > 0.0) & (enter < RANGE)
+        label = scene.view_rays(*given, links.to(device)).label[0].cpu().numpy()
+        np.testing.assert_array_equal((label == RayLabel.OUTSIDE)[is_clear], expected[is_clear])
+        covered.append(int(expected[is_clear].sum()))
+    assert len(covered) > 50 and 15 < np.count_nonzero(covered) < len(covered) - 10
+
+
 def test_a_grown_plant_agrees_with_a_plain_loop_over_its_triangles() -> None:
     plant = generate_plant("full", 3, "training")
     target = next(i for i, fruit in enumerate(plant.fruits) if fruit.ripeness == "ripe")

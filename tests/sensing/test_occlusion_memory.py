@@ -99,6 +99,26 @@ def test_only_what_is_not_the_target_leaves_hits_and_only_where_it_is(device: st
     assert_close(memory.hits[0].cpu(), expected)
 
 
+@pytest.mark.parametrize("count", [1, 7, 8, 21])
+def test_rays_taken_in_together_leave_what_each_leaves_by_itself(device: str, count: int) -> None:
+    points, T_world_camera, label = random_view(count, count)
+    together, alone = (begun((0.7, 0.1, 1.0), device) for _ in range(2))
+    pose = T_world_camera[None].to(device)
+    together.integrate(pose, rays_to(points, T_world_camera, label, device))
+    for k in range(count):
+        alone.integrate(pose, rays_to(points[k : k + 1], T_world_camera, label[k : k + 1], device))
+    assert_close(together.hits, alone.hits)
+    assert_close(together.passed_length, alone.passed_length)
+    assert together.visits.tolist() == [1] and alone.visits.tolist() == [count]
+    # Which densities are out of date is noted ray by ray.
+    afresh = begun((0.0, 0.0, 0.0), device)
+    afresh.load_state(together.state())
+    together.begin(torch.tensor([0], device=device), torch.tensor([[0.7, 0.1, 1.0]], device=device))
+    together.estimate()
+    together.integrate(pose, rays_to(points, T_world_camera, label, device))
+    assert torch.equal(together.density, afresh.density) and torch.equal(together.known, afresh.known)
+
+
 def test_axis_parallel_rays_on_voxel_borders_and_rays_past_the_grid_are_no_trouble(device: str) -> None:
     target = torch.zeros(3)
     starts = [(-0.5, 0.0, 0.0), (0.0, 0.5, 0.0), (0.0, 0.0, -0.5), (-0.5, 0.4, 0.0)]
@@ -236,6 +256,18 @@ def test_predictions_are_those_of_a_plain_loop() -> None:
         expected = plain_prediction(memory, camera, -math.log(0.98), 0.4, 1.5)
         # The fixed points of 1/256 voxel edge and the samples of the loop.
         assert found.tolist() == pytest.approx(expected, abs=4e-3)
+
+
+def test_every_voxel_has_the_density_of_a_plain_loop(device: str) -> None:
+    memory = begun((0.7, 0.1, 1.0), device, unknown_probability=0.02, voxel_weight=0.4, block_weight=1.5)
+    points, T_world_camera, label = random_view(600, 4)
+    memory.integrate(T_world_camera[None].to(device), rays_to(points, T_world_camera, label, device))
+    hits, passed = memory.hits[0].cpu().double(), memory.passed_length[0].cpu().double()
+    expected = plain_density(hits, passed, -math.log(0.98), {4: 1.5, 2: 1.5, 1: 0.4}) / CELL_SIZE
+    assert_close(memory.density[0].cpu().double(), expected, rtol=2e-6, atol=0.0)
+    is_known = (hits > 0) | (passed >= 0.25)
+    assert torch.equal(memory.known[0].cpu(), is_known)
+    assert 0.05 < float(is_known.double().mean()) < 0.95
 
 
 def test_densities_that_are_read_between_views_are_those_of_all_views_at_once(device: str) -> None:
