@@ -1,11 +1,12 @@
 """The reward learned from demonstrations, beside the designed one, behaviour cloning and constant rewards.
 
-`designed` is the reward of the preset `td3`, which all trainings share, and `cloned` fits its actor to the demonstrated
-moves. All others have the same demonstrated moves beside their own in every batch. `learned` is what `--reward-from`
-does. `told` pays 1 for demonstrated moves and 0 for the learner's own, as in SQIL (Reddy et al., ICLR 2020). A constant
-reward shows what the moves and the end of episodes teach by themselves: `plus` and `minus` take the last view of an
-episode to stay, as the learned reward does (`learning/rl/demonstrated_reward.py`), and `bare-plus` and `bare-minus` let
-an episode end without a value, as is usual.
+`designed` is the reward of the preset `td3`, whose settings all trainings share, but with one environment and an update
+every second step. `cloned` fits its actor to the demonstrated moves. All others have the same demonstrated moves beside
+their own in every batch. `learned` is what `--reward-from` does. `told` pays 1 for demonstrated moves and 0 for the
+learner's own, as in SQIL (Reddy et al., ICLR 2020). A constant reward shows what the moves and the end of episodes
+teach by themselves: `plus` and `minus` take the last view of an episode to stay, as the learned reward does
+(`learning/rl/demonstrated_reward.py`), and `bare-plus` and `bare-minus` let an episode end without a value, as is
+usual.
 
 Usage:
     maniskill-tomato demonstrations TomatoViewpointGuided-v1 --episodes 20 --out runs/shown/guided
@@ -113,7 +114,12 @@ class FixedReward:
 def train(env_id: str, teacher: Teacher, file: Path, run_dir: Path, seed: int, steps: int) -> None:
     """Trains with a reward model."""
     config = dataclasses.replace(
-        get_preset("td3"), total_timesteps=steps, exploration_steps=steps * 5 // 8, checkpoint_seconds=None
+        get_preset("td3"),
+        num_envs=1,
+        updates_per_step=0.5,
+        total_timesteps=steps,
+        exploration_steps=steps * 5 // 8,
+        checkpoint_seconds=None,
     )
     model = None
     if teacher != "designed":

@@ -13,9 +13,9 @@ from maniskill_tomato.learning.rl.presets import PRESETS
 ENV_ID: Final = "TomatoViewpoint-v1"
 
 TRAINING: Final = dataclasses.replace(
-    PRESETS["general-td3"], total_timesteps=12_000, learning_starts=1000, exploration_steps=6000
+    PRESETS["general-td3"], total_timesteps=20_000, learning_starts=1000, exploration_steps=10_000
 )
-"""A fifth of the preset's length: what can be learned while one waits."""
+"""Half the preset's length: what can be learned while one waits."""
 
 TRAINING_PLANTS: Final[dict[str, Any]] = {"seed": "train", "pool": 60}
 """Few plants, since every new one must grow first."""

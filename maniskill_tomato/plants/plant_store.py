@@ -17,8 +17,8 @@ from maniskill_tomato.plants.organs import Plant
 LIMIT_VARIABLE: Final = "TOMATO_PLANT_STORE_MB"
 """Environment variable with the most that one process keeps, in megabytes."""
 
-DEFAULT_LIMIT_MB: Final = 512
-"""Some 50 plants with their neighbours in the row, or 190 alone, with the meshes that rays are cast against."""
+DEFAULT_LIMIT_MB: Final = 1536
+"""The general tasks' pool of 100 plants with their neighbours in the row takes 1.2 GiB with its meshes for rays."""
 
 BYTES_OF_A_VERTEX: Final = 64
 """Position, normal and texture coordinates, and the positions of its organ and its plant once more."""

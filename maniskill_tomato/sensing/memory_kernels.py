@@ -1,6 +1,6 @@
 # mypy: ignore-errors
 # pyright: reportArgumentType=false, reportAssignmentType=false, reportAttributeAccessIssue=false
-# pyright: reportCallIssue=false, reportGeneralTypeIssues=false, reportIndexIssue=false
+# pyright: reportCallIssue=false, reportGeneralTypeIssues=false, reportIndexIssue=false, reportInvalidTypeForm=false
 # pyright: reportOperatorIssue=false, reportReturnType=false
 # Warp's stubs describe calls from outside, not what stands inside a kernel.
 """Warp kernels that fill a voxel grid around the target from view rays and predict from it what other views see.

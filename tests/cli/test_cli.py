@@ -32,6 +32,8 @@ from maniskill_tomato.tasks import THESIS_IDS
 ROOT = Path(__file__).resolve().parents[2]
 GUIDED, SPARSE = THESIS_IDS
 SHORT = (
+    "--num-envs",
+    "1",
     "--total-timesteps",
     "100",
     "--learning-starts",

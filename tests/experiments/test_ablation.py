@@ -50,7 +50,7 @@ def test_the_plan_leaves_out_what_makes_no_sense_and_names_what_it_does_not_know
 
 
 def short(out: Path, *variants: str, **changes: Any) -> AblationConfig:
-    options = {"env_ids": (GUIDED,), "seeds": (3,), "episodes": 2, "total_timesteps": 60, **changes}
+    options = {"env_ids": (GUIDED,), "seeds": (3,), "episodes": 2, "total_timesteps": 64, **changes}
     return AblationConfig(variants=variants, out=out, **options)
 
 
@@ -64,7 +64,7 @@ def test_a_run_is_done_once_and_kept(tmp_path: Path) -> None:
     )
     assert lines[0].startswith(f"1 of 1: {GUIDED} base, seed 3: success ")
     (result,) = json.loads((tmp_path / "ablation.json").read_text())["runs"]
-    assert result["training_steps"] == 60 and result["updates"] == 0
+    assert result["training_steps"] == 64 and result["updates"] == 0
     assert result["training_cpu_seconds"] > 0.0 and 0.0 <= result["success_rate"] <= 1.0
     (trial,) = plan_trials(config, choose_variants(["base"]))
     written = (trial.folder / "policy.pt").stat().st_mtime_ns

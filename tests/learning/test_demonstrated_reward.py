@@ -150,6 +150,8 @@ def toy_config(**changes: Any) -> TrainConfig:
         get_preset("td3"),
         **{
             "total_timesteps": 3000,
+            "num_envs": 1,
+            "updates_per_step": 0.5,
             "learning_starts": 200,
             "batch_size": 64,
             "tau": 0.02,

@@ -132,6 +132,7 @@ def config(preset: str = "td3", **changes: Any) -> TrainConfig:
         "exploration_steps": 200,
         "actor_hidden": (16, 16),
         "critic_hidden": (16, 16),
+        "num_envs": 1,
         "checkpoint_every": 50,
         "checkpoint_seconds": None,
     }

@@ -101,6 +101,7 @@ def small_config(**changes: Any) -> TrainConfig:
         exploration_steps=1000,
         action_scale=(0.25, 0.25, 0.25, 0.35, 0.35, 0.35),
         updates_per_step=1.0,
+        num_envs=1,
         step_cost=0.02,
     )
     return replace(base, **changes)

@@ -26,7 +26,14 @@ GUIDED = THESIS_IDS[0]
 
 
 def short_config(**changes: Any) -> TrainConfig:
-    short = {"total_timesteps": 250, "learning_starts": 50, "batch_size": 32, "wandb_project": "tomato"}
+    short = {
+        "num_envs": 1,
+        "updates_per_step": 0.5,
+        "total_timesteps": 250,
+        "learning_starts": 50,
+        "batch_size": 32,
+        "wandb_project": "tomato",
+    }
     return dataclasses.replace(get_preset("td3"), **{**short, **changes})
 
 

@@ -189,7 +189,12 @@ def test_turned_links_anywhere_near_the_pattern_cover_the_rays_that_meet_them(de
     scene = RayScene([plant], WIDE, robot_meshes=meshes, device=device)
     target = torch.tensor([[0.5, 0.0, 0.0]])
     pose = look_at_pose(torch.zeros(1, 3), target, 0.4)
-    given = tuple(t.to(device) for t in (pose, torch.zeros(1), target, torch.eye(4)[None]))
+    given = (
+        pose.to(device),
+        torch.zeros(1, device=device),
+        target.to(device),
+        torch.eye(4, device=device)[None],
+    )
     seen = scene.view_rays(*given)
     free = seen.label[0].cpu().numpy() == RayLabel.FREE
     rays_w = seen.direction_c[0].cpu().double().numpy() @ pose[0, :3, :3].double().numpy().T

@@ -96,7 +96,8 @@ def make_simulated_env(env_id: str, num_envs: int = 1, **options: Any) -> gym.En
     find_task(env_id)
     if num_envs > 1 and not torch.cuda.is_available():
         raise InvalidInputError(
-            f"num_envs must be 1 without a CUDA device, where ManiSkill simulates on the CPU; got {num_envs}"
+            f"num_envs must be 1 without a CUDA device, where ManiSkill simulates on the CPU, got {num_envs}; give "
+            "--num-envs 1, or leave out what needs the simulator"
         )
     options = {"obs_mode": "state", "render_backend": "none", "num_envs": num_envs, **options}
     return gym.make(find_task(env_id).env_id, **options)

@@ -42,7 +42,7 @@ _TD3 = TrainConfig(
     batch_size=256,
     buffer_size=100_000,
     learning_starts=1500,
-    updates_per_step=0.5,
+    updates_per_step=0.25,
     actor_learning_rate=1e-3,
     critic_learning_rate=1e-3,
     twin_critics=True,
@@ -60,6 +60,7 @@ _TD3 = TrainConfig(
     exploration_noise=0.3,
     exploration_noise_end=0.1,
     exploration_goal_share=0.1,
+    num_envs=32,
 )
 
 _FAST_TD3 = dataclasses.replace(
@@ -87,13 +88,13 @@ _FAST_TD3 = dataclasses.replace(
 )
 
 _GENERAL_TD3 = TrainConfig(
-    total_timesteps=60_000,
+    total_timesteps=40_000,
     gamma=0.95,
     tau=0.005,
     batch_size=256,
     buffer_size=100_000,
     learning_starts=2000,
-    updates_per_step=0.5,
+    updates_per_step=0.125,
     actor_learning_rate=5e-4,
     critic_learning_rate=5e-4,
     twin_critics=True,
@@ -109,10 +110,14 @@ _GENERAL_TD3 = TrainConfig(
     exploration_steps=20_000,
     exploration_noise=1.0,
     exploration_noise_end=0.15,
+    num_envs=16,
 )
 
 _GENERAL_DDPG = dataclasses.replace(
     _GENERAL_TD3,
+    total_timesteps=60_000,
+    updates_per_step=0.5,
+    num_envs=1,
     gamma=0.99,
     tau=0.001,
     batch_size=64,
@@ -135,6 +140,9 @@ _GENERAL_FAST_TD3 = dataclasses.replace(
 
 _PIXELS: dict[str, Any] = {
     "obs_mode": "depth+segmentation",
+    "total_timesteps": 15_000,
+    "exploration_steps": 10_000,
+    "updates_per_step": 0.5,
     "batch_size": 128,
     "buffer_size": 30_000,
     "num_envs": 8,
@@ -149,9 +157,7 @@ _SINGLE_CRITIC: dict[str, Any] = {"twin_critics": False, "policy_frequency": 1, 
 """DDPG."""
 
 _PIXEL_TD3 = dataclasses.replace(_TD3, **_PIXELS)
-_GENERAL_PIXEL_TD3 = dataclasses.replace(
-    _GENERAL_TD3, **_PIXELS, total_timesteps=15_000, exploration_steps=10_000
-)
+_GENERAL_PIXEL_TD3 = dataclasses.replace(_GENERAL_TD3, **_PIXELS)
 
 PRESETS: dict[PresetName, TrainConfig] = {
     "td3": _TD3,

@@ -75,7 +75,7 @@ class TrainConfig:
     total_episodes: int | None = None
     """Stop after this many episodes; the thesis's M."""
     total_timesteps: int | None = None
-    """Stop after this many environment steps, counted over all environments."""
+    """Stop after this many environment steps, counted over all environments; they all make the last one."""
     max_minutes: float | None = None
     """Stop after this much training time, in [min]."""
 
