@@ -4,9 +4,11 @@ Needs Vulkan (lavapipe on a CPU will do). Examples:
 
     python tools/gallery.py
     python tools/gallery.py --view close --preset full --seed 3 --out close.jpg
+    python tools/gallery.py --mesh foreign --out docs/images/foreign.jpg
 """
 
 import logging
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
@@ -22,6 +24,7 @@ from numpy.typing import NDArray
 from maniskill_tomato.errors import RenderingUnavailableError
 from maniskill_tomato.plants.generator import Detail, generate_plant
 from maniskill_tomato.plants.hiding import view_direction
+from maniskill_tomato.plants.mesh_set import ALL, MeshSource
 from maniskill_tomato.plants.organs import Plant
 from maniskill_tomato.rendering.plant_actors import make_render_shape
 
@@ -54,8 +57,14 @@ class Args:
     """Elevation of the camera seen from the fruit, in [deg]."""
     detail: Detail = "picture"
     """Level of detail of the plant."""
+    mesh: Path | None = None
+    """A folder of mesh files: the sheet shows six of its plants, from all over its list, in place of ours."""
     out: Path = Path("docs/images/gallery.jpg")
     """File to write; its ending chooses the format."""
+
+
+Column = tuple[Plant, int, tuple[float, float] | None]
+"""A plant, the fruit that is looked at, and azimuth and elevation of the nearer view in [deg]; None looks for them."""
 
 
 class Greenhouse:
@@ -194,21 +203,17 @@ def clearest_view(house: Greenhouse, plant: Plant, fruit: int) -> tuple[float, f
     return max(((a, e) for a in (-58.0, -42.0, 42.0, 58.0) for e in (-28.0, -14.0)), key=red)
 
 
-def sheet(detail: Detail) -> UInt8:
-    """Whole plants, the wrist camera's view of a fruit below, the view that shows it below that; 1,600 wide."""
-    presets = ("one_tomato", "three_tomatoes", "full")
-    columns = [(preset, seed) for preset in presets for seed in (1, 2)]
+def sheet(columns: Sequence[Column]) -> UInt8:
+    """Whole plants, the wrist camera's view of a fruit below, a nearer view of it below that; 1,600 wide for six."""
     tile, gap = 264, 4
     rows: list[list[UInt8]] = [[], [], []]
-    for preset, seed in columns:
-        plant = generate_plant(preset, seed, detail)
+    for plant, fruit, near in columns:
         house = Greenhouse(plant)
-        fruit = len(plant.fruits) // 2 if preset == "three_tomatoes" else min(3, len(plant.fruits) - 1)
         rows[0].append(whole(house, (tile, 480)))
         rows[1].append(at_fruit(house, plant, fruit, (tile, 220), 0.65, -8.0, 10.0))
-        view = (15.0, -10.0) if preset == "full" else clearest_view(house, plant, fruit)
+        view = clearest_view(house, plant, fruit) if near is None else near
         rows[2].append(at_fruit(house, plant, fruit, (tile, 220), 0.33, *view))
-        logger.info("rendered %s %d", preset, seed)
+        logger.info("rendered %s %d", plant.preset, plant.seed)
     bands = []
     for row in rows:
         padded = [np.pad(image, ((0, gap), (0, gap), (0, 0)), constant_values=255) for image in row]
@@ -216,10 +221,29 @@ def sheet(detail: Detail) -> UInt8:
     return np.vstack(bands)[:-gap, :-gap]
 
 
+def our_columns(detail: Detail) -> Iterator[Column]:
+    """Two plants of each preset of the tasks."""
+    for preset in ("one_tomato", "three_tomatoes", "full"):
+        for seed in (1, 2):
+            plant = generate_plant(preset, seed, detail)
+            fruit = len(plant.fruits) // 2 if preset == "three_tomatoes" else min(3, len(plant.fruits) - 1)
+            yield plant, fruit, (15.0, -10.0) if preset == "full" else None
+
+
+def mesh_columns(folder: Path, count: int = 6) -> Iterator[Column]:
+    """Plants of a folder of mesh files, each with the ripe fruit that is nearest to the robot."""
+    plants = MeshSource.parse(folder).plants
+    seeds = plants.seeds(ALL)
+    for k in np.unique(np.linspace(0, len(seeds) - 1, count).round().astype(int)):
+        plant = plants.grow(seeds[k])
+        ripe = [i for i, fruit in enumerate(plant.fruits) if fruit.ripeness == "ripe"]
+        yield plant, min(ripe, key=lambda i: float(plant.fruits[i].centre[0])), None
+
+
 def main(args: Args) -> None:
     """Renders and writes what was asked for."""
     if args.view == "sheet":
-        image = sheet(args.detail)
+        image = sheet(list(our_columns(args.detail) if args.mesh is None else mesh_columns(args.mesh)))
     else:
         plant = generate_plant(args.preset, args.seed, args.detail)
         house = Greenhouse(plant)
