@@ -26,7 +26,7 @@ pytestmark = pytest.mark.usefixtures("extras")
 def test_train_and_eval_take_its_task_plants_and_policy(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    few = ["--total-timesteps", "10", "--learning-starts", "8", "--batch-size", "8"]
+    few = ["--num-envs", "1", "--total-timesteps", "10", "--learning-starts", "8", "--batch-size", "8"]
     main(["train", TASK, "--plant", "potted", *few, "--out", str(tmp_path / "run")])
     policy = tmp_path / "run" / "policy.pt"
     assert load_actor(policy).env_id == TASK

@@ -178,11 +178,12 @@ def test_workers_end_with_their_environment() -> None:
 
 
 SCRIPT = """
-import sys, time
+import signal, sys, time
 from maniskill_tomato.plants.growers import PlantGrowers
 from maniskill_tomato.plants.spec import PlantSpec
 
 if __name__ == "__main__":
+    signal.signal(signal.SIGINT, signal.default_int_handler)  # A shell in the background leaves it ignored.
     growers = PlantGrowers(PlantSpec(seed="train"), 2)
     growers.expect(dict(enumerate(range(1000))))
     print(*growers.process_ids, flush=True)

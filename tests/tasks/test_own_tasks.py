@@ -251,7 +251,18 @@ def test_a_run_on_plants_of_a_module_goes_on_where_the_command_names_it(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     name, out = "tomato_extras.potted_plant:potted_plant", str(tmp_path / "run")
-    few = ["--total-timesteps", "10", "--learning-starts", "8", "--batch-size", "8", "--out", out]
+    few = [
+        "--num-envs",
+        "1",
+        "--total-timesteps",
+        "10",
+        "--learning-starts",
+        "8",
+        "--batch-size",
+        "8",
+        "--out",
+        out,
+    ]
     main(["train", "--plant", name, GUIDED, *few])
     extension_points._loaded.clear()  # As in a process of its own.
     with pytest.raises(SystemExit):
