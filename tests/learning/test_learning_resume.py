@@ -541,7 +541,7 @@ def start(*arguments: str) -> Any:
 
 REAL = (
     *("--total-timesteps", "300", "--learning-starts", "60", "--batch-size", "32"),
-    *("--checkpoint-every", "41", "--seed", "2"),
+    *("--num-envs", "1", "--updates-per-step", "0.5", "--checkpoint-every", "41", "--seed", "2"),
 )
 
 
