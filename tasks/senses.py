@@ -440,10 +440,8 @@ class CameraSenses:
             mask = last.measurement.mask(k)
             is_measured = last.measurement.fruits[k].is_depth_measured
             if number != NO_TRACK and is_measured and frame.shown_fruit(mask) == target:
-                held[number] = int(np.count_nonzero(mask & true))
-        if not held:
-            return False
-        return self._perception.name(env_index, max(held, key=lambda number: held[number]))
+                held[k] = int(np.count_nonzero(mask & true))
+        return bool(held) and self._perception.point(env_index, max(held, key=lambda k: held[k]))
 
     def _shown_fruit(self, env_index: int) -> int:
         """The fruit that the target's detection in the last view shows."""

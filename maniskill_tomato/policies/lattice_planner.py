@@ -16,7 +16,7 @@ REFUSED_ANGLE = math.radians(30.0)
 """Moves from one place within this angle of a refused one are taken to be refused too."""
 
 FOLLOWED = 8
-"""Candidates to which the way is followed at most."""
+"""Candidates to which the way is followed at most, once the arm gets to one of them."""
 
 
 def distance_to_taken(belief: Belief, positions: Tensor) -> Tensor:
@@ -165,9 +165,10 @@ class LatticePlanner(Planner):
             self._ways = WayFollower(worth.device, belief.lattice.model)
         straight = moves_needed(way_to(belief, views))
         followed, rest = torch.full_like(worth, -math.inf), worth.clone()
-        for _ in range(FOLLOWED):
+        for count in range(views.shape[1]):
             hope, best = rest.max(dim=1)
-            rows = (hope > followed.amax(dim=1)).nonzero()[:, 0]
+            found = followed.amax(dim=1)
+            rows = ((hope > found) & ((found == -math.inf) | (count < FOLLOWED))).nonzero()[:, 0]
             if not len(rows):
                 break
             chosen = best[rows]

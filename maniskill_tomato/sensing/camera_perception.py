@@ -5,7 +5,7 @@ Simulated worlds and the robot use the same class; what differs is who takes the
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Final
 
 import numpy as np
@@ -25,6 +25,7 @@ from maniskill_tomato.sensing.measurement import Measurement, Position
 from maniskill_tomato.sensing.observation import ViewpointObserver
 from maniskill_tomato.sensing.occlusion_memory import CELL_SIZE
 from maniskill_tomato.sensing.perception_kinds import MAP_NOISE
+from maniskill_tomato.sensing.pointed_fruit import PointedFruit, identified
 from maniskill_tomato.sensing.posed_frame import PosedFrame
 
 RECENTRE: Final = CELL_SIZE / 4
@@ -71,6 +72,8 @@ class _Search:
     threshold: float = 1.0
     """A fruit with a larger V_f is fully seen."""
     target: int | None = None
+    pointed: list[PointedFruit] = field(default_factory=list)
+    """Where somebody pointed at it."""
     ruled_out: frozenset[int] = frozenset()
     """Tracks that cannot be the target, or were given up."""
     looks_at: Position | None = None
@@ -133,7 +136,7 @@ class CameraPerception:
 
         Args:
             env_index: Which environment's.
-            place_w: Where the target is said to be, world frame, in [m]; None if `name` or `chooses` tells which it is.
+            place_w: Where the target is said to be, world frame, in [m]; None if `point` or `chooses` tells which it is.
                 Shape (3,).
             place_error: Standard deviation of its coordinates, in [m].
             hidden_below: The first view shows less of the target than this V_f; None if that is not known.
@@ -153,14 +156,27 @@ class CameraPerception:
             centre=None if place_w is None else np.array(place_w, dtype=np.float64),
         )
 
-    def name(self, env_index: int, number: int | None) -> bool:
-        """Makes a track the target.
+    def point(self, env_index: int, fruit: int) -> bool:
+        """Makes a fruit of the last view the target, as somebody does who points at it in the picture.
+
+        Its pixels are kept: when the map knows better which track fills them, that one is the target.
+
+        Args:
+            env_index: Which environment.
+            fruit: Index in the fruits of the last view. It has a track and a depth of its own.
 
         Returns:
             Whether memory and rays must be centred anew, with `recall`.
+
+        Raises:
+            InvalidInputError: There is no view yet.
         """
         search = self._searches[env_index]
-        search.target = number
+        if not search.views:
+            raise InvalidInputError("there is no fruit to point at before the first view")
+        view = search.views[-1]
+        search.pointed.append(PointedFruit.of(view, fruit))
+        search.target = identified(search.pointed, search.map, view.tracks[fruit])
         return self._aim(search)
 
     def turn_to(self, env_index: int, number: int | None, place_w: Position) -> bool:
@@ -234,6 +250,8 @@ class CameraPerception:
         search.views = [*(_slimmed(earlier) for earlier in search.views or []), view]
         if search.target is not None:
             search.target = search.map.current(search.target)
+        if search.pointed:
+            search.target = identified(search.pointed, search.map, search.target)
         if search.place is not None:
             self._find(search, view, first)
         elif search.chooses:

@@ -115,7 +115,7 @@ class FruitDetector:
     ) -> tuple[DetectedFruit, ...]:
         depth = frame.measured_m
         if self._segmenter is not None or frame.told_fruits is not None:
-            masks = own_pixels(masks, depth, frame.filled_m, crop.largest_radius_m)
+            masks = own_pixels(masks, depth, crop.largest_radius_m)
         rgb = np.zeros((*depth.shape, 3), np.uint8) if frame.rgb is None else frame.rgb
         view = SegmentedImage(
             rgb=rgb,

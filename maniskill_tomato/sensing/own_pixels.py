@@ -22,15 +22,14 @@ SMALLEST_PATCH: Final = 3
 """Strips thinner than this stay: masks and depth disagree by a pixel or two at edges, in [px]."""
 
 
-def own_pixels(
-    masks: tuple[BinaryMask, ...], depth_m: Float64, filled_m: Float64, radius_m: float
-) -> tuple[BinaryMask, ...]:
-    """The pixels of each mask that lie at the depth of most of it.
+def own_pixels(masks: tuple[BinaryMask, ...], depth_m: Float64, radius_m: float) -> tuple[BinaryMask, ...]:
+    """The pixels of each mask that lie at the depth of most of it, and those that have none.
+
+    A leaf's stereo shadow falls on the fruit behind it: where nothing was measured, the depth beside it says nothing.
 
     Args:
         masks: A segmenter's. Each of shape (H, W).
         depth_m: In [m], 0 where there is no measurement. Shape (H, W).
-        filled_m: The same without holes (`filled_depth`). Shape (H, W).
         radius_m: Of a large fruit, in [m].
 
     Returns:
@@ -45,12 +44,12 @@ def own_pixels(
             slice(max(left - SMALLEST_PATCH, 0), left + width + SMALLEST_PATCH),
         )
         own = mask.copy()
-        own[window] = _own(mask[window], depth_m[window], filled_m[window], SURFACE_SPAN * radius_m)
+        own[window] = _own(mask[window], depth_m[window], SURFACE_SPAN * radius_m)
         kept.append(own)
     return tuple(kept)
 
 
-def _own(mask: BinaryMask, depth_m: Float64, filled: Float64, span: float) -> BinaryMask:
+def _own(mask: BinaryMask, depth_m: Float64, span: float) -> BinaryMask:
     values = np.sort(depth_m[mask])
     values = values[values > 0]
     if not len(values) or len(values) < LEAST_MEASURED_SHARE * np.count_nonzero(mask):
@@ -58,7 +57,7 @@ def _own(mask: BinaryMask, depth_m: Float64, filled: Float64, span: float) -> Bi
     ends = values if values[-1] - values[0] > span else values[:1]
     held = np.searchsorted(values, ends + span, side="right") - np.arange(len(ends))
     near = float(ends[int(np.argmax(held))])
-    others = mask & (filled > 0) & ((filled < near) | (filled > near + span))
+    others = mask & (depth_m > 0) & ((depth_m < near) | (depth_m > near + span))
     patch = np.ones((SMALLEST_PATCH, SMALLEST_PATCH), np.uint8)
     own: BinaryMask = mask & (cv2.morphologyEx(others.view(np.uint8), cv2.MORPH_OPEN, patch) == 0)
     return own

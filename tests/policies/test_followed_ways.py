@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from maniskill_tomato.policies.followed_ways import SAME_PLACE, WayFollower
-from maniskill_tomato.policies.lattice_planner import LatticePlanner, way_to
+from maniskill_tomato.policies.lattice_planner import FOLLOWED, LatticePlanner, way_to
 from maniskill_tomato.policies.moves import move_towards, moves_needed
 from maniskill_tomato.robot.inverse_kinematics import Reach
 from maniskill_tomato.robot.look_at_move import MAX_MOVE
@@ -82,3 +82,36 @@ def test_a_planner_spends_no_move_on_a_way_that_the_arm_cannot_go(world: World) 
         planner.act(belief)
         assert (int(planner.tried.chosen[0]) == wish) is is_taken
         assert math.isfinite(float(moves[planner.tried.chosen[0]]))
+
+
+class Wishes(LatticePlanner):
+    """Wants some candidates more than all others."""
+
+    name = "wishes"
+
+    def __init__(self, wishes: torch.Tensor) -> None:
+        super().__init__()
+        self._wishes = wishes
+
+    def worth(self, belief: Belief, views: torch.Tensor) -> torch.Tensor:
+        worth = -moves_needed(way_to(belief, views))
+        worth[:, self._wishes] += 100.0
+        return worth
+
+
+def test_a_planner_looks_for_a_way_that_the_arm_can_go_however_many_it_cannot(world: World) -> None:
+    for seed in range(40):
+        world.reset(seed)
+        belief = world.belief
+        views = belief.lattice.positions(belief.target_position)
+        now = (world.state.qpos, belief.camera_position, belief.target_position)
+        qpos, position, target = (tensor.expand(belief.lattice.size, -1) for tensor in now)
+        moves = WayFollower().moves_along(qpos, position, target, views[0])
+        blocked = (belief.reachable[0] & moves.isinf() & (way_to(belief, views)[0] > 0.06)).nonzero()[:, 0]
+        if len(blocked) > 2 * FOLLOWED:
+            break
+    assert len(blocked) > 2 * FOLLOWED
+    planner = Wishes(blocked)
+    planner.begin(belief, ONE)
+    planner.act(belief)
+    assert math.isfinite(float(moves[planner.tried.chosen[0]]))

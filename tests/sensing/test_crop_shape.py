@@ -1,5 +1,8 @@
 """What fruits that are seen whole tell about the size and shape of the others of their crop."""
 
+from dataclasses import replace
+
+import cv2
 import numpy as np
 import pytest
 from scipy import stats
@@ -55,6 +58,17 @@ def test_a_whole_fruit_tells_its_size_and_shape(radius: float, flatness: float) 
 
 def test_a_half_hidden_fruit_tells_neither() -> None:
     (estimate,) = SphereModel()(view_of(0.03, 0.85, leaf=True))
+
+    assert estimate.seen_whole is None
+
+
+def test_a_fruit_without_depth_of_its_own_tells_neither() -> None:
+    seen = view_of(0.03, 0.85)
+    (mask,) = seen.masks
+    # A gap in leaves, through which the wall is seen round the fruit.
+    gap = cv2.dilate(mask.astype(np.uint8), np.ones((13, 13), np.uint8)) > 0
+    shadowed = replace(seen, depth_m=np.where(mask, 0.0, np.where(gap, 1.2, 0.45)))
+    (estimate,) = SphereModel()(shadowed)
 
     assert estimate.seen_whole is None
 

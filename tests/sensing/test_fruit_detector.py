@@ -105,6 +105,26 @@ def test_a_mask_that_spills_over_to_neighbours_keeps_the_pixels_of_its_own_surfa
     assert mask[unmeasured].all()
 
 
+def test_a_fruit_keeps_its_pixels_in_the_stereo_shadow_of_a_leaf() -> None:
+    rows, columns = np.mgrid[:60, :80]
+    square = (rows - 30) ** 2 + (columns - 40) ** 2
+    disc = square < 15**2
+    depth = np.full((60, 80), 0.9, np.float32)
+    depth[disc] = 0.40 - 0.029 * np.sqrt(1.0 - square[disc] / 15**2)
+    # The shadow reaches from inside the fruit to what stands far behind it.
+    depth[(columns > 44) & (columns < 62)] = 0.0
+    found = Instances.from_masks(disc[None], np.ones(1, np.float32), ("tomato_ripe",))
+    seen = PosedFrame(
+        depth_m=depth,
+        intrinsics=color_intrinsics(80, 60),
+        T_world_camera=np.eye(4),
+        rgb=np.zeros((60, 80, 3), np.uint8),
+    )
+    measured = FruitDetector(lambda image, depth_m=None: found).measure(seen)
+    np.testing.assert_array_equal(measured.mask(0), disc)
+    assert measured.fruits[0].visible_fraction > 0.9
+
+
 def test_what_segmentation_needs_must_be_in_the_frame() -> None:
     with pytest.raises(InvalidInputError, match="choose a segmenter"):
         FruitDetector(None).measure(frame())

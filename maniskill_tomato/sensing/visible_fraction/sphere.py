@@ -226,7 +226,7 @@ class _Fit:
         focal = view.intrinsics.fx
         box = (slice(first_y, first_y + height), slice(first_x, first_x + width))
         own = fruit_depth(view.depth_m[box], mask[box])
-        measured = bool(np.isfinite(own))
+        own_depth = measured = bool(np.isfinite(own))
         if not measured:
             # Nearer than the camera measures, where the mask's own extent stands for the size; or in a stereo shadow.
             own = config.radius_m * focal / (0.5 * (max(width, height) + 1))
@@ -245,7 +245,7 @@ class _Fit:
         stretch = round_outline(view.up_optical, ray, flatness)
         inside = first_x > 0 and first_y > 0 and first_x + width < i.width and first_y + height < i.height
         whole = None
-        if measured and inside and open_share >= OPEN_SHARE and view.up_optical is not None:
+        if own_depth and inside and open_share >= OPEN_SHARE and view.up_optical is not None:
             whole = _whole_fruit(mask[box], view.up_optical, ray, own, focal)
         return cls(mask, evidence.stretched(stretch), (left, top), own, measured, focal, stretch, whole)
 
