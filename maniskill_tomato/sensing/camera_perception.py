@@ -136,7 +136,7 @@ class CameraPerception:
 
         Args:
             env_index: Which environment's.
-            place_w: Where the target is said to be, world frame, in [m]; None if `point` or `chooses` tells which it is.
+            place_w: Where the target is said to be, world frame, in [m]; None if `point` or `chooses` tells it.
                 Shape (3,).
             place_error: Standard deviation of its coordinates, in [m].
             hidden_below: The first view shows less of the target than this V_f; None if that is not known.

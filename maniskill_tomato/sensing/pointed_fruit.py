@@ -1,7 +1,7 @@
 """A fruit that somebody pointed at in a picture, and which track of the map it is.
 
-The pixels that were pointed at stay true when the map changes its mind: a sliver behind a leaf may be placed wrongly, or
-taken for the fruit beside it, but the fruit that it belongs to lies on the rays through its pixels.
+The pixels that were pointed at stay true when the map changes its mind: a sliver behind a leaf may be placed wrongly,
+or taken for the fruit beside it, but the fruit that it belongs to lies on the rays through its pixels.
 """
 
 from collections.abc import Sequence
