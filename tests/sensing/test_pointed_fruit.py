@@ -75,8 +75,9 @@ def test_a_badly_placed_sliver_gives_the_target_to_the_well_known_track_on_its_p
 
 
 def test_a_well_known_track_on_the_pixels_stays_the_target_whatever_stands_before_it() -> None:
-    before = TARGET - np.array([0.0, 0.0, 0.05])
-    fruits = map_of((TARGET, 0.002), (before, 0.006))
+    before = TARGET - np.array([0.0, 0.0, 0.03])
+    fruits = map_of((TARGET, 0.002), (before, 0.004))
+    assert identified([pointed(SLIVER, (7, 8))], fruits, None) == 1
     assert identified([pointed(SLIVER, (0, 7))], fruits, 0) == 0
 
 

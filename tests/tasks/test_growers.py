@@ -189,7 +189,8 @@ if __name__ == "__main__":
     print(*growers.process_ids, flush=True)
     if sys.argv[1] == "return":
         sys.exit()
-    time.sleep(3600)
+    while True:
+        time.sleep(0.1)  # One long sleep would go on after a signal that arrives just before it.
 """
 
 
